@@ -98,23 +98,23 @@ def soft_matches(descriptors0, descriptors1, keypoints1, scores1, temperature):
     rows0, rows1 = _rows(descriptors0), _rows(descriptors1)
     if not rows0:
         return np.zeros((0, 5))
-    cosine = [[math.fsum(a * b for a, b in zip(one, two, strict=True)) for two in rows1] for one in rows0]
+    cosine = [[math.fsum(a * b for a, b in zip(row0, row1, strict=True)) for row1 in rows1] for row0 in rows0]
     by_row = [_softmax([value / temperature for value in row]) for row in cosine]
     by_column = [_softmax([row[j] / temperature for row in cosine]) for j in range(len(rows1))]
-    found = []
+    rows = []
     for i, chances in enumerate(by_row):
         mean = lambda values, chances=chances: math.fsum(p * v for p, v in zip(chances, values, strict=True))  # noqa: E731
         squared = mean([2 - 2 * value for value in cosine[i]])
         confidence = math.fsum(p * by_column[j][i] for j, p in enumerate(chances))
         columns = [mean([float(point[axis]) for point in keypoints1]) for axis in range(2)]
-        found.append([*columns, mean(_values(scores1)), math.sqrt(max(squared, 0.0)), confidence])
-    return np.array(found)
+        rows.append([*columns, mean(_values(scores1)), math.sqrt(max(squared, 0.0)), confidence])
+    return np.array(rows)
 
 
 def ratios(descriptors0, descriptors1):
     """Distance to the nearest descriptor over that to the second nearest; 1 where there is none, or both are 0."""
-    found = []
-    for one in _rows(descriptors0):
-        distances = sorted(math.dist(one, two) for two in _rows(descriptors1))
-        found.append(distances[0] / distances[1] if len(distances) > 1 and distances[1] > 0 else 1.0)
-    return np.array(found)
+    quotients = []
+    for row0 in _rows(descriptors0):
+        distances = sorted(math.dist(row0, row1) for row1 in _rows(descriptors1))
+        quotients.append(distances[0] / distances[1] if len(distances) > 1 and distances[1] > 0 else 1.0)
+    return np.array(quotients)

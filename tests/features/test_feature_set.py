@@ -53,10 +53,10 @@ def on_device(slots, rows):
 
 
 def assert_are(got, images, rows):
-    for one, row in zip(got, rows, strict=True):
-        expected = jax.tree.map(lambda leaf: leaf[0], stack_features([images[row]], len(one.mask)))
+    for features, row in zip(got, rows, strict=True):
+        expected = jax.tree.map(lambda leaf: leaf[0], stack_features([images[row]], len(features.mask)))
         for part in fields(Features):
-            np.testing.assert_array_equal(getattr(one, part.name), getattr(expected, part.name))
+            np.testing.assert_array_equal(getattr(features, part.name), getattr(expected, part.name))
 
 
 # Own features
@@ -65,27 +65,27 @@ def assert_are(got, images, rows):
 def test_own_features_lose_their_padding_and_nothing_else():
     rng = np.random.default_rng(0)
     images = [make_features(rng, count, capacity=9) for count in (9, 0, 4)]
-    found = FeatureSet.of(images)
-    assert len(found) == 3
-    assert found.counts.tolist() == [9, 0, 4]
-    assert found.bad == {}
-    assert [row for row, _ in found.read(range(3))] == [0, 2]
+    feature_set = FeatureSet.of(images)
+    assert len(feature_set) == 3
+    assert feature_set.counts.tolist() == [9, 0, 4]
+    assert feature_set.bad == {}
+    assert [row for row, _ in feature_set.read(range(3))] == [0, 2]
     for name in ("keypoints", "descriptors", "scores"):
-        np.testing.assert_array_equal(getattr(found[2], name), getattr(images[2], name)[:4])
-    assert found[2].mask.all()
-    assert found.keypoint_bytes == KEYPOINT
+        np.testing.assert_array_equal(getattr(feature_set[2], name), getattr(images[2], name)[:4])
+    assert feature_set[2].mask.all()
+    assert feature_set.keypoint_bytes == KEYPOINT
 
 
 def test_own_features_of_any_type_are_matched_in_single_precision():
     [image] = images_of([5])
-    whole = replace(
+    integers = replace(
         image, keypoints=np.round(image.keypoints).astype(int), descriptors=image.descriptors.astype(np.float64)
     )
-    found = FeatureSet.of([whole, image])
+    feature_set = FeatureSet.of([integers, image])
     for row in range(2):
-        dtypes = {part.name: getattr(found[row], part.name).dtype for part in fields(Features)}
+        dtypes = {part.name: getattr(feature_set[row], part.name).dtype for part in fields(Features)}
         assert set(dtypes.values()) == {np.dtype(np.float32), np.dtype(bool)}
-    assert_are(on_device(Slots(found, np.arange(2), 10**6, DEVICE), [1]), [whole, image], [1])
+    assert_are(on_device(Slots(feature_set, np.arange(2), 10**6, DEVICE), [1]), [integers, image], [1])
 
 
 def spoiled(**changes):
@@ -106,9 +106,9 @@ def spoiled(**changes):
     ],
 )
 def test_own_features_that_do_not_fit_are_refused(images, message):
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as error:
         FeatureSet.of(images)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
 
 
 def test_lengths_are_free_where_said():
@@ -118,10 +118,10 @@ def test_lengths_are_free_where_said():
 
 def test_rows_that_are_not_there_have_no_keypoints():
     [image] = images_of([5])
-    found = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})
-    assert found.counts.tolist() == [0, 0, 5, 0]
-    assert [row for row, _ in found.read(range(4))] == [2]
-    assert [row for row, _ in found.source.read()] == [2]
+    feature_set = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})
+    assert feature_set.counts.tolist() == [0, 0, 5, 0]
+    assert [row for row, _ in feature_set.read(range(4))] == [2]
+    assert [row for row, _ in feature_set.source.read()] == [2]
 
 
 # Memory
@@ -146,14 +146,14 @@ def test_processors_share_what_is_given_and_accelerators_have_their_own():
 
 
 @given(st.lists(st.lists(st.integers(0, 9), max_size=4, unique=True), max_size=12))
-def test_what_was_used_longest_ago_makes_room(asked):
+def test_what_was_used_longest_ago_makes_room(requests):
     recent, last_use, places = Recent(4), {}, {}
-    for time, rows in enumerate(asked):
+    for time, rows in enumerate(requests):
         slots, new = recent.take(rows)
         assert new == [row for row in rows if row not in places]
         for row in new:
             if len(places) == 4:
-                oldest = min((one for one in places if one not in rows), key=lambda one: last_use[one])
+                oldest = min(places.keys() - rows, key=last_use.__getitem__)
                 del places[oldest]
             places[row] = slots[rows.index(row)]
         last_use |= {row: (time, row in new, number) for number, row in enumerate(rows)}
@@ -176,7 +176,7 @@ def test_rows_lie_there_as_they_are(rows):
     slots = Slots(FeatureSet.of(images), np.arange(10), 10**9, DEVICE)
     got = on_device(slots, rows)
     assert_are(got, images, rows)
-    assert {len(one.mask) for one in got} <= {32, 224}
+    assert {len(features.mask) for features in got} <= {32, 224}
     assert_are(on_device(slots, [*rows, 7]), images, [*rows, 7])
 
 
@@ -205,10 +205,10 @@ def test_few_slots_hold_the_rows_in_use_and_reads_are_as_few_as_can_be():
         rows = np.unique(rng.integers(0, 100, WRITTEN))
         assert_are(on_device(slots, rows), images, rows)
         for capacity, order in there.items():
-            asked = [row for row in rows.tolist() if (counts[row] > 30) == (capacity == 224)]
-            reads += len(set(asked) - set(order))
-            used = [row for row in asked if row in order] + [row for row in asked if row not in order]
-            order[:] = ([row for row in order if row not in asked] + used)[-WRITTEN:]
+            wanted = [row for row in rows.tolist() if (counts[row] > 30) == (capacity == 224)]
+            reads += len(set(wanted) - set(order))
+            used = [row for row in wanted if row in order] + [row for row in wanted if row not in order]
+            order[:] = ([row for row in order if row not in wanted] + used)[-WRITTEN:]
     assert sum(source.reads.values()) == reads
     assert reads > 250
 
@@ -216,20 +216,20 @@ def test_few_slots_hold_the_rows_in_use_and_reads_are_as_few_as_can_be():
 def test_slots_and_what_is_on_its_way_stay_within_the_budget():
     features, _ = counted([200] * 190 + [30] * 210)
     rows = np.arange(400)
-    everything = (190 * 224 + 210 * 32) * KEYPOINT
+    total_bytes = (190 * 224 + 210 * 32) * KEYPOINT
     for share in (1, 3):
-        budget = share * everything
+        budget = share * total_bytes
         slots = Slots(features, rows, int(budget), DEVICE)
         staged = [slots.stage(part) for part in slots.parts(rows)]
         assert len(next(slots.parts(rows))) > (WRITTEN if share >= 1.5 else 0)
-        largest = max(sum(leaf.nbytes for *_, new in one.new for leaf in jax.tree.leaves(new)) for one in staged)
-        for one in staged:
-            arrays = slots.put(one)
+        largest = max(sum(leaf.nbytes for *_, new in part.new for leaf in jax.tree.leaves(new)) for part in staged)
+        for part in staged:
+            arrays = slots.put(part)
         taken = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays))
-        assert 0.45 * min(budget, everything) < taken < 1.25 * everything
+        assert 0.45 * min(budget, total_bytes) < taken < 1.25 * total_bytes
         assert taken + 6 * largest < budget + 6 * WRITTEN * (224 + 32) * KEYPOINT  # of each capacity, `WRITTEN` rows
         again = [slots.stage(part) for part in slots.parts(rows)]
-        assert any(one.new for one in again) == (share < 1 / KEPT)
+        assert any(part.new for part in again) == (share < 1 / KEPT)
 
 
 def test_parts_are_what_can_be_asked_for_at_the_same_time():
@@ -245,10 +245,10 @@ def test_parts_are_what_can_be_asked_for_at_the_same_time():
 def test_rows_are_written_by_one_program_for_each_capacity(compilations):
     rng = np.random.default_rng(5)
 
-    def use(counts, asked, budget):
+    def use(counts, num_rows, budget):
         features = FeatureSet.of([make_features(rng, count, dimension=24) for count in counts])
         slots = Slots(features, np.arange(len(counts)), budget, DEVICE)
-        for part in slots.parts(rng.permutation(len(counts))[:asked]):
+        for part in slots.parts(rng.permutation(len(counts))[:num_rows]):
             jax.block_until_ready(slots.put(slots.stage(part)))
 
     for budget in (0, 10**8):

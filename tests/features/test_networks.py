@@ -22,7 +22,7 @@ def system(name, street, out, *more):
 
 @pytest.fixture
 def evaluate(weights, monkeypatch, capsys):
-    """Evaluates by the weights at hand; what was told comes back."""
+    """Run an evaluation with the weights at hand; return the messages."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
 
     def evaluate(*arguments):
@@ -52,19 +52,19 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
     assert "matches: all 10 queries from" in again
     assert "images to do" not in again
     for name in ("filter", "histogram", "histogram_filter"):
-        one, two = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
-        assert one.read_text() == two.read_text()
+        earlier, later = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
+        assert earlier.read_text() == later.read_text()
 
 
 def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, small_street, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     few = ("features.max_images=3", "retrieval.max_images=4", "features.dimension=20", "retrieval.dimension=30")
     more = ("scorer.side=18", "previous_queries=2", "candidates=4", *few)
-    told = evaluate(*system("ssm_vpr", small_street, tmp_path / "out", *more))
-    made = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
+    stderr = evaluate(*system("ssm_vpr", small_street, tmp_path / "out", *more))
+    stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
     learned = ["SsmCells-whitening", "SsmWindows-whitening"]
-    assert made == ["SsmCells", "SsmCells", learned[0], "SsmWindows", "SsmWindows", learned[1], "matches"]
-    assert "SsmWindows: whitening of 30 dimensions: " in told
+    assert stores == ["SsmCells", "SsmCells", learned[0], "SsmWindows", "SsmWindows", learned[1], "matches"]
+    assert "SsmWindows: whitening of 30 dimensions: " in stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     parameters = {row["system"]: row["parameters"] for row in rows}
     assert list(parameters) == ["filter", "grid", "grid + filter", "grid + frames"]
@@ -92,13 +92,13 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, small_s
     folders = [f"dataset.{side}={small_street}/{side}" for side in ("database", "queries")]
     places = ("dataset=folder", *folders, "dataset.ground_truth=order", "candidates=3", "figures=0")
     features = ("features=aliked", "features.image_size=[160,160]", "retrieval.num_words=8")
-    told, seen = [], {}
+    messages, seen = [], {}
     for name in ("neighbors", "lightglue", "lightglue"):
-        out = tmp_path / f"out{len(told)}"
-        told.append(evaluate(*places, *features, f"matching={name}", f"out={out}"))
+        out = tmp_path / f"out{len(seen)}"
+        messages.append(evaluate(*places, *features, f"matching={name}", f"out={out}"))
         seen[name] = json.loads((out / "results.json").read_text())
-    assert "10 of 10 queries to match" in told[1]
-    assert "matches: all 10 queries from" in told[2]
+    assert "10 of 10 queries to match" in messages[1]
+    assert "matches: all 10 queries from" in messages[2]
     assert seen["lightglue"][0]["matching"]["weights"] == "aliked_lightglue"
     assert len([*(tmp_path / "cache" / "features").glob("matches-*")]) == 2
     recall = {
@@ -112,7 +112,7 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, small_s
 
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capsys):
-    """What a command line is answered with, one line, by the weights in a folder."""
+    """The error of a command line, one line, with the weights in a folder."""
 
     def refused(weights, *arguments):
         monkeypatch.chdir(tmp_path)
@@ -178,9 +178,9 @@ def test_global_descriptors_of_networks_are_filters(
 ):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
-    told = evaluate("dataset=folder", *folders, "dataset.ground_truth=order", f"retrieval={name}", *options,
+    stderr = evaluate("dataset=folder", *folders, "dataset.ground_truth=order", f"retrieval={name}", *options,
                     "retrieval.image_size=[96,64]", "candidates=3", "figures=0", f"out={tmp_path}/out")  # fmt: skip
-    assert "note: R@5 and R@10 are R@3, of the filter too" in told
+    assert "note: R@5 and R@10 are R@3, of the filter too" in stderr
     stores = {path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*")}
     assert "GlobalDescriptor" in stores
     model, components = load_model(options[0].partition("=")[2], weights), 32 if name == "netvlad" else None
@@ -188,7 +188,7 @@ def test_global_descriptors_of_networks_are_filters(
     for side in ("queries", "database"):
         images = image_folder(small_street / side)
         resized = [resize(images.read(row), (96, 64), "pil_bilinear") for row in range(len(images))]
-        vectors.append(np.array([one.vector for one in extractor(np.array(resized))]))
+        vectors.append(np.array([description.vector for description in extractor(np.array(resized))]))
     nearest = np.argsort(-(vectors[0] @ vectors[1].T), axis=1)[:, :3]
     lines = (tmp_path / "out" / "predictions" / "filter.csv").read_text().splitlines()[1:]
     assert [line.split(",")[2] for line in lines] == [f"{row:04d}.png" for row in nearest.reshape(-1)]
@@ -202,9 +202,9 @@ def test_global_descriptors_of_networks_are_filters(
 def test_mistakes_with_them_are_one_line(weights, monkeypatch, capsys, small_street, tmp_path, options, words):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
     folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
-    own = ("retrieval.weights=patchnetvlad_mapillary_128",) if "weights" not in " ".join(options) else ()
-    own = ("retrieval.weights=cosplace_vgg16_512",) if "retrieval=gem" in options else own
+    default_weights = ("retrieval.weights=patchnetvlad_mapillary_128",) if "weights" not in " ".join(options) else ()
+    default_weights = ("retrieval.weights=cosplace_vgg16_512",) if "retrieval=gem" in options else default_weights
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
-                            options[0], *own, *options[1:], f"out={tmp_path}/out")  # fmt: skip
+                            options[0], *default_weights, *options[1:], f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
     assert words in stderr.splitlines()[-1]

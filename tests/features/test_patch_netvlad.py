@@ -66,10 +66,10 @@ def test_patches_are_where_the_public_code_has_them(model, position):
 @pytest.mark.slow
 def test_one_pass_gives_what_the_network_gives(model):
     extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=(1, 3))
-    [found] = extractor(image(SIZE))
-    whole, patches = model.with_patches(model.preprocess(image(SIZE)), (1, 3))
-    np.testing.assert_allclose(found.vector, whole[0], atol=1e-6)
-    for local, expected in zip(found.local, patches, strict=True):
+    [description] = extractor(image(SIZE))
+    vectors, patches = model.with_patches(model.preprocess(image(SIZE)), (1, 3))
+    np.testing.assert_allclose(description.vector, vectors[0], atol=1e-6)
+    for local, expected in zip(description.local, patches, strict=True):
         np.testing.assert_allclose(local.descriptors, expected[0], atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
 
@@ -99,19 +99,20 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     lines = []
     cache = partial(FeatureCache, tmp_path, tell=lines.append)
     options = {"candidates": 6, "cache": cache()}
-    found = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
+    report = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
     assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches
     single = []
     for size in sizes:  # out of stores as well, which round descriptors
-        one, kept = replace(extractor, patch_sizes=(size,), scale_weights=None), FeatureCache(tmp_path / str(size))
-        single.append(mfvpr.evaluate(dataset, one, Retrieval(one), SCORERS, candidates=6, cache=kept))
+        alone = replace(extractor, patch_sizes=(size,), scale_weights=None)
+        scale_cache = FeatureCache(tmp_path / str(size))
+        single.append(mfvpr.evaluate(dataset, alone, Retrieval(alone), SCORERS, candidates=6, cache=scale_cache))
     for scorer in SCORERS:
         expected = 0.0
         for weight, alone in zip(weights, single, strict=True):
             [ranked] = alone.systems[scorer]
             scores = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1).astype(np.float64)
             expected += weight * (scores - scores.mean(axis=1, keepdims=True)) / scores.std(axis=1, keepdims=True)
-        [ranked] = found.systems[scorer]
+        [ranked] = report.systems[scorer]
         actual = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1)
         np.testing.assert_allclose(actual, expected, atol=1e-4)
     again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, cache=cache())
@@ -119,8 +120,8 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, cache=cache())
     assert sum("images to do" in line for line in lines) == 2  # weights are no part of what is kept
     for scorer in SCORERS:
-        np.testing.assert_array_equal(again.systems[scorer][0].scores, found.systems[scorer][0].scores)
-        assert np.abs(changed.systems[scorer][0].scores - found.systems[scorer][0].scores).max() > 0.1
+        np.testing.assert_array_equal(again.systems[scorer][0].scores, report.systems[scorer][0].scores)
+        assert np.abs(changed.systems[scorer][0].scores - report.systems[scorer][0].scores).max() > 0.1
 
 
 @pytest.mark.parametrize(("images", "size", "patch_sizes", "outputs", "printed"), [
@@ -145,7 +146,7 @@ def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs,
     ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
 ])  # fmt: skip
 def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
-    """Of every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
+    """Every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
 
     Where few patches show a place, RANSAC finds one more or less by luck; here most do.
     """
@@ -156,15 +157,16 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
         query, candidates = patch_scores.descriptors(patch)
         everywhere = jax.tree.map(partial(np.repeat, repeats=len(candidates), axis=0),
                                   jax.tree.map(lambda field: field[None], places.features))  # fmt: skip
-        sides = (replace(side, descriptors=own) for side, own in ((places.features, query), (everywhere, candidates)))
-        matches = mfvpr.match_candidates(*sides)
+        matches = mfvpr.match_candidates(
+            replace(places.features, descriptors=query), replace(everywhere, descriptors=candidates)
+        )
         scores.append(np.asarray(mfvpr.score_candidates(scorer(patch), matches)) / unit)
-    found, real = np.stack(scores, axis=1), np.ones(len(scores[0]), bool)
-    np.testing.assert_allclose(found, -golden[f"{matcher}/scales"], rtol=1e-4)
+    fused_scores, real = np.stack(scores, axis=1), np.ones(len(scores[0]), bool)
+    np.testing.assert_allclose(fused_scores, -golden[f"{matcher}/scales"], rtol=1e-4)
     weights = np.array(patch_scores.WEIGHTS)
-    pairs = fuse_scales(found, real, weights, normalize="none")
+    pairs = fuse_scales(fused_scores, real, weights, normalize="none")
     np.testing.assert_allclose(pairs, -golden[f"{matcher}/pairs"], rtol=1e-4)
-    fused = fuse_scales(found, real, weights)
+    fused = fuse_scales(fused_scores, real, weights)
     np.testing.assert_allclose(fused, -golden[f"{matcher}/fused"], atol=1e-4)
     np.testing.assert_array_equal(mfvpr.rerank(fused).order, np.argsort(golden[f"{matcher}/fused"]))
 
@@ -177,8 +179,8 @@ def program(weights, small_street, tmp_path, monkeypatch, capsys):
 
     def run(kind, *more, last=()):
         out = tmp_path / str(len([*tmp_path.iterdir()]))
-        own = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}", *last)
-        code, stdout, stderr = typed(monkeypatch, capsys, kind, *own)
+        options = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}", *last)
+        code, stdout, stderr = typed(monkeypatch, capsys, kind, *options)
         return out, code, stdout, stderr
 
     return run

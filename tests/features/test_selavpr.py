@@ -17,7 +17,7 @@ from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_
 
 
 def training(tensors):
-    """What the public code's training writes: the optimizer's notes as well."""
+    """The public code's training checkpoint, with the optimizer's notes."""
     moments = [{"step": 7, "exp_avg": np.zeros(3, np.float32), "exp_avg_sq": np.ones(3, np.float32)}]
     groups = [{"lr": 1e-5, "betas": (0.9, 0.999), "weight_decay": 0, "amsgrad": False, "params": [0, 1]}]
     optimizer = {"state": dict(enumerate(moments)), "param_groups": groups}
@@ -51,8 +51,8 @@ def program(small_street, tmp_path, monkeypatch, capsys):
     def run(kind, *more):
         if kind == "weights":
             return converted(*more)
-        own = ("dataset=folder", *folders, "dataset.ground_truth=order", f"out={tmp_path}/out", *more)
-        return typed(monkeypatch, capsys, kind, *own)
+        options = ("dataset=folder", *folders, "dataset.ground_truth=order", f"out={tmp_path}/out", *more)
+        return typed(monkeypatch, capsys, kind, *options)
 
     return run
 
@@ -91,14 +91,14 @@ def test_its_positions_serve_the_scores_of_shifts(program, tmp_path):
 
 
 def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_path):
-    without, own = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
+    without, with_registers = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
     code, _, stderr = program("weights", "convert", without, "--as", "selavpr_msls_registers")
     assert code == 2
     assert "1 missing (backbone.registers); use the official SelaVPR_reg4_msls.pth" in stderr
-    code, _, stderr = program("weights", "convert", own, "--as", "selavpr_msls")
+    code, _, stderr = program("weights", "convert", with_registers, "--as", "selavpr_msls")
     assert code == 2
     assert "register_tokens" in stderr
-    assert program("weights", "convert", own)[0] == 0
+    assert program("weights", "convert", with_registers)[0] == 0
     small = "features.image_size=[28,28]", "candidates=3", "figures=0"
     code, _, stderr = program("evaluate", "system=selavpr_msls", "features.weights=selavpr_msls_registers", *small)
     assert code == 0, stderr
@@ -110,13 +110,13 @@ def test_dinov2_is_a_filter(program, tmp_path, pooling):
     tensors = transformer_checkpoint(dinov2_shapes(64, 1))
     path = write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors)
     assert program("weights", "convert", path)[0] == 0
-    own = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
+    options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
     small = "features.max_keypoints=50", "candidates=5", "figures=0"
-    code, _, stderr = program("evaluate", *own, f"retrieval.pooling={pooling}", *small)
+    code, _, stderr = program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
     assert code == 0, stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     assert {row["filter"]["pooling"] for row in rows} == {pooling}
-    code, _, stderr = program("evaluate", *own, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2")
+    code, _, stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2")
     assert code == 2
     assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
 

@@ -20,8 +20,8 @@ def image():
 
 def test_rootsift_is_opencvs_sift_with_the_square_root(image):
     features = Sift(max_keypoints=200)(image[None])[0].features
-    found, descriptors = cv2.SIFT_create(200).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    by_place = {tuple(k.pt): (d, k.response) for k, d in zip(found, descriptors, strict=True)}
+    keypoints, descriptors = cv2.SIFT_create(200).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    by_place = {tuple(k.pt): (d, k.response) for k, d in zip(keypoints, descriptors, strict=True)}
     assert 100 < len(features.mask) <= 200
     assert features.mask.all()
     np.testing.assert_array_equal(features.image_size, [336, 336])
@@ -45,8 +45,8 @@ def test_an_image_without_keypoints_gives_empty_features():
 
 def test_clahe_finds_more_in_the_dark(image):
     dark = (image // 16)[None]
-    more, some = (len(sift(dark)[0].features.mask) for sift in (Sift(clahe_clip=3.0), Sift()))
-    assert more > 1.2 * some
+    more, fewer = (len(sift(dark)[0].features.mask) for sift in (Sift(clahe_clip=3.0), Sift()))
+    assert more > 1.2 * fewer
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 7, 40]), max_size=4), st.sampled_from([0.5, 1.0]))
@@ -66,10 +66,10 @@ def test_vocabulary_is_reproducible_and_finds_clusters():
     members = unit(np.repeat(true, 50, axis=0) + 0.01 * rng.normal(size=(200, 16)))
     features = make_features(rng, 200)
     features.descriptors[:] = members
-    one, two = (VladFitting(num_words=4, seed=0).fit(FeatureSet.of([features])) for _ in range(2))
-    np.testing.assert_array_equal(one.centers, two.centers)
-    found = np.linalg.norm(one.centers[:, None] - true, axis=-1).min(axis=0) < 0.05
-    assert found.sum() >= 2  # a start at random may put two words into one cluster
+    first, second = (VladFitting(num_words=4, seed=0).fit(FeatureSet.of([features])) for _ in range(2))
+    np.testing.assert_array_equal(first.centers, second.centers)
+    is_near = np.linalg.norm(first.centers[:, None] - true, axis=-1).min(axis=0) < 0.05
+    assert is_near.sum() >= 2  # a start at random may put two words into one cluster
 
 
 def test_last_bits_and_one_keypoint_less_hardly_move_the_words():
@@ -91,10 +91,10 @@ def test_a_vocabulary_of_some_images_knows_no_others():
     before = VladFitting(num_words=4, max_samples=30).fit(FeatureSet.of(images)).centers
     unseen = 0
     for features in images:
-        kept = features.descriptors.copy()
-        features.descriptors[:] = kept[0]
+        original = features.descriptors.copy()
+        features.descriptors[:] = original[0]
         unseen += np.array_equal(VladFitting(num_words=4, max_samples=30).fit(FeatureSet.of(images)).centers, before)
-        features.descriptors[:] = kept
+        features.descriptors[:] = original
     assert unseen == 3
 
 

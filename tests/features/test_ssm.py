@@ -64,25 +64,25 @@ def dataset(small_street):
 
 @pytest.mark.parametrize(("shape", "size", "stride"), [((5, 7, 2), 3, 1), ((8, 5, 3), 3, 2), ((4, 4, 1), 4, 1)])
 def test_windows_are_those_of_the_loops(shape, size, stride):
-    one, found = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
+    image_map, positions = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
     expected = [
-        one[row : row + size, column : column + size].reshape(-1)
+        image_map[row : row + size, column : column + size].reshape(-1)
         for row in range(0, shape[0] - size + 1, stride)
         for column in range(0, shape[1] - size + 1, stride)
     ]
-    assert found.count == len(expected) == np.prod(found.grid)
-    np.testing.assert_array_equal(found.take(one, np.arange(found.count)), expected)
+    assert positions.count == len(expected) == np.prod(positions.grid)
+    np.testing.assert_array_equal(positions.take(image_map, np.arange(positions.count)), expected)
     np.testing.assert_array_equal(
-        found.take(one, np.array([1, 0]) % found.count), np.take(expected, [1, 0], 0, mode="wrap")
+        positions.take(image_map, np.array([1, 0]) % positions.count), np.take(expected, [1, 0], 0, mode="wrap")
     )
 
 
 def test_a_convolution_is_the_whitening_of_every_window():
     rng = np.random.default_rng(1)
-    maps, found = rng.normal(size=(2, 6, 7, 4)).astype(np.float32), Windows((6, 7, 4), 3, 2)
-    sample = np.concatenate([found.take(one, np.arange(found.count)) for one in maps])
+    maps, positions = rng.normal(size=(2, 6, 7, 4)).astype(np.float32), Windows((6, 7, 4), 3, 2)
+    sample = np.concatenate([positions.take(image_map, np.arange(positions.count)) for image_map in maps])
     learned = fit_whitening(np.concatenate([sample, rng.normal(size=(40, 36))]), 5)
-    got = jax.jit(partial(whiten_windows, stride=2))(maps, *kernels(learned, found))
+    got = jax.jit(partial(whiten_windows, stride=2))(maps, *kernels(learned, positions))
     expected = (sample - learned.mean) @ learned.components.T
     np.testing.assert_allclose(np.reshape(got, (-1, 5)), expected, atol=1e-5)
 
@@ -96,14 +96,14 @@ def test_maps_are_of_unit_length_where_there_is_something():
 
 @pytest.mark.parametrize(("windows_at_most", "zero_row"), [(None, False), (None, True), (30, False), (30, True)])
 def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, zero_row):
-    rng, found = np.random.default_rng(3), Windows((6, 6, 2), 3)
+    rng, positions = np.random.default_rng(3), Windows((6, 6, 2), 3)
     how = WindowFitting(4, 5, windows_at_most, zero_row, "float64", seed=7)
     rows = how.drawn(9)
     assert rows == sorted(set(rows))
     assert len(rows) == 5
     maps = {row: rng.normal(size=(6, 6, 2)) for row in rows}
-    learned = how.fit([{rows[0]: maps[rows[0]]}, {row: maps[row] for row in rows[1:]}], found, rows)
-    every = np.concatenate([found.take(maps[row], np.arange(16)) for row in rows])
+    learned = how.fit([{rows[0]: maps[rows[0]]}, {row: maps[row] for row in rows[1:]}], positions, rows)
+    every = np.concatenate([positions.take(maps[row], np.arange(16)) for row in rows])
     chosen = np.arange(80) if windows_at_most is None else np.random.default_rng([7, 1]).choice(80, 30, replace=False)
     sample = np.concatenate([every[np.sort(chosen)], np.zeros((int(zero_row), 18))])
     expected = fit_whitening(sample, 4)
@@ -114,10 +114,10 @@ def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, ze
 
 
 def test_images_that_cannot_be_read_have_no_windows():
-    rng, found, how = np.random.default_rng(4), Windows((4, 4, 2), 3), WindowFitting(3, dtype="float64")
+    rng, positions, how = np.random.default_rng(4), Windows((4, 4, 2), 3), WindowFitting(3, dtype="float64")
     maps = {row: rng.normal(size=(4, 4, 2)) for row in range(6) if row != 2}
-    learned = how.fit([maps], found, how.drawn(6))
-    expected = fit_whitening(np.concatenate([found.take(one, np.arange(4)) for one in maps.values()]), 3)
+    learned = how.fit([maps], positions, how.drawn(6))
+    expected = fit_whitening(np.concatenate([positions.take(values, np.arange(4)) for values in maps.values()]), 3)
     np.testing.assert_array_equal(learned.components, expected.components)
 
 
@@ -129,12 +129,12 @@ def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
 
 
 def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
-    one = ImageFolder(dataset.database.root, dataset.database.names[:1])
+    single_image = ImageFolder(dataset.database.root, dataset.database.names[:1])
     few = replace(cells, whitening=WindowFitting(12))
     with pytest.raises(InputError, match=r"12 descriptors .*got 12 .*4608"):
-        fit_to_database(few, one, FeatureCache())
+        fit_to_database(few, single_image, FeatureCache())
     assert np.isfinite(
-        fit_to_database(replace(cells, whitening=WindowFitting(11)), one, FeatureCache()).whitening.components
+        fit_to_database(replace(cells, whitening=WindowFitting(11)), single_image, FeatureCache()).whitening.components
     ).all()
 
 
@@ -144,12 +144,12 @@ def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
 def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
     learned = fit_to_database(cells, dataset.database, FeatureCache())
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
-    maps = [one.vector.reshape(5, 6, 512).astype(np.float64) for one in SsmMaps(model, 2, SMALL)(images)]
-    found = Windows((5, 6, 512), 3)
+    maps = [image_map.vector.reshape(5, 6, 512).astype(np.float64) for image_map in SsmMaps(model, 2, SMALL)(images)]
+    windows_of_map = Windows((5, 6, 512), 3)
     assert cells.scales == learned.scales == ((6, 12, 1.0),)
-    for features, one in zip(local(learned(images)), maps, strict=True):
+    for features, image_map in zip(local(learned(images)), maps, strict=True):
         whitening = learned.whitening
-        expected = (found.take(one, np.arange(12)) - whitening.mean) @ whitening.components.T
+        expected = (windows_of_map.take(image_map, np.arange(12)) - whitening.mean) @ whitening.components.T
         np.testing.assert_allclose(features.descriptors, expected, atol=1e-4 * np.abs(expected).max())
         assert features.descriptors.dtype == features.keypoints.dtype == np.float32
         # The middle of 8 x 8 px is between two of them.
@@ -189,12 +189,12 @@ def test_databases_are_of_the_published_size(model, images, printed, tmp_path):
     """In MiB: vectors of both stages in float32, and both whitenings, the second in float64."""
     arrays, whitenings = 0, 0
     for extractor, vectors in ((SsmWindows(model), 36), (SsmCells(model), 1600)):
-        how, found = extractor.whitening, extractor.windows
+        how, positions = extractor.whitening, extractor.windows
         learned = Whitening(
-            *(np.zeros(shape, how.dtype) for shape in (found.dimension, (how.dimension, found.dimension)))
+            *(np.zeros(shape, how.dtype) for shape in (positions.dimension, (how.dimension, positions.dimension)))
         )
-        assert found.count == vectors
-        arrays += np.zeros((found.count, learned.dimension), np.float32).nbytes
+        assert positions.count == vectors
+        arrays += np.zeros((positions.count, learned.dimension), np.float32).nbytes
         whitenings += learned.mean.nbytes + learned.components.nbytes
     assert (images * arrays + whitenings) / 2**20 == pytest.approx(printed, rel=0.01)
     assert whitenings / 2**20 == pytest.approx(19.93 + 3.55, rel=0.01)
@@ -203,12 +203,12 @@ def test_databases_are_of_the_published_size(model, images, printed, tmp_path):
 def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
     """Directions of cells in float16, beside their lengths, places and scores."""
     cache = FeatureCache(tmp_path)
-    [found] = cache.local(
+    [store] = cache.local(
         dataset.database, fit_to_database(replace(cells, whitening=WindowFitting(100)), dataset.database, cache)
     )
-    [(_, one)] = found.read([0])
-    parts = pack_features(one)
-    assert one.descriptors.nbytes == 12 * 100 * 4
+    [(_, features)] = store.read([0])
+    parts = pack_features(features)
+    assert features.descriptors.nbytes == 12 * 100 * 4
     assert sum(part.nbytes for part in parts.values()) == 12 * (100 * 2 + 4 + 8 + 4) + 8
     assert forecast_bytes(1, 1600, 100) / (1600 * 100 * 4) == pytest.approx(0.55, abs=0.01)
 
@@ -248,9 +248,9 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     cache, how, other = FeatureCache(tmp_path), cells.whitening, network(1)
     learned = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
     assert len(kept(tmp_path)) == 2
-    assert not np.array_equal(*(one.whitening.components for one in learned))
+    assert not np.array_equal(*(extractor.whitening.components for extractor in learned))
     # A hash of it is part of all that is computed with it.
-    recipes = [cache.recipe(dataset.database, replace(cells, whitening=one.whitening)) for one in learned]
+    recipes = [cache.recipe(dataset.database, replace(cells, whitening=extractor.whitening)) for extractor in learned]
     assert "whitening" in difference(*recipes)
     variants = [
         cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
@@ -260,7 +260,7 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
             {"dtype": "float64"},
         )),
     ]  # fmt: skip
-    recipes = [whitening_recipe(one, one.whitening, dataset.database, cache) for one in variants]
+    recipes = [whitening_recipe(extractor, extractor.whitening, dataset.database, cache) for extractor in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
     same = replace(cells, batch_size=1)
     assert whitening_recipe(same, how, dataset.database, cache) == recipes[0]
@@ -289,9 +289,9 @@ def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_pat
     content = path.read_bytes()
     for wrong in (other.read_bytes(), content[:-100] + bytes(100), b""):
         path.write_bytes(wrong)
-        with pytest.raises(InputError, match="expected arrays as they were written here") as told:
+        with pytest.raises(InputError, match="expected arrays as they were written here") as error:
             fit_to_database(cells, dataset.database, FeatureCache(tmp_path))
-        assert "\n" not in str(told.value)
+        assert "\n" not in str(error.value)
 
 
 def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, dataset, tmp_path):
@@ -335,11 +335,11 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     root = small_street / "queries"
     several = sequences_dataset(small_street / "database", [root, small_street / "database"], ground_truth="none")
     options = {"candidates": 3, "matching": CANDIDATE, "cache": cache}
-    found = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
+    report = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
-    [first, second] = found.matched
+    [first, second] = report.matched
     assert (first.matches[0].counts == 12).all()
-    np.testing.assert_array_equal(found.systems["count"][1].scores, np.full((10, 3), 12))
+    np.testing.assert_array_equal(report.systems["count"][1].scores, np.full((10, 3), 12))
     assert second.matches[0].counts.shape == (10, 3)
     with pytest.raises(InputError, match=r"^grid: .*NaN"):  # of 4 x 3 cells
         mfvpr.evaluate(several, cells, FILTER, {"grid": GridAnchors(3)}, **options)
@@ -349,14 +349,14 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
 def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
-    own = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
+    self_dataset = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
     options = {"matching": CANDIDATE, "cache": FeatureCache(tmp_path)}
-    found = mfvpr.evaluate(own, square, FILTER, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
-    [ranked] = found.systems["grid"]
+    report = mfvpr.evaluate(self_dataset, square, FILTER, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
+    [ranked] = report.systems["grid"]
     np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
     np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
-    recipes = [matches_recipe(own, own.only, square, FILTER, 4, CANDIDATE, FeatureCache(tmp_path))]
-    recipes.append(recipes[0] | {"database": FeatureCache().recipe(own.database, square)})
+    recipes = [matches_recipe(self_dataset, self_dataset.only, square, FILTER, 4, CANDIDATE, FeatureCache(tmp_path))]
+    recipes.append(recipes[0] | {"database": FeatureCache().recipe(self_dataset.database, square)})
     assert "whitening" in difference(*recipes)
 
 
@@ -368,5 +368,5 @@ def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset,
     [candidates] = filter.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
     assert len(kept(tmp_path)) == 1
-    found = match_sequence(replace(dataset, database=few), sequence, FILTER.describer.extractor, filter, 3)
-    np.testing.assert_array_equal(found.candidates.scores.sum(1), [36 * 3])
+    matched = match_sequence(replace(dataset, database=few), sequence, FILTER.describer.extractor, filter, 3)
+    np.testing.assert_array_equal(matched.candidates.scores.sum(1), [36 * 3])

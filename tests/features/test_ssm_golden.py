@@ -46,14 +46,14 @@ def golden():
 
 def described(maps, stage, num_database):
     """Whitened windows `[V, D']` of maps, learned from the first, those of the database."""
-    found, how = Windows(maps.shape[1:], SIZES[stage - 1]), FITTINGS[stage - 1]
-    learned = how.fit([dict(enumerate(maps[:num_database]))], found, how.drawn(num_database))
-    vectors = np.asarray(project(maps, *kernels(learned, found), stride=1))
+    positions, how = Windows(maps.shape[1:], SIZES[stage - 1]), FITTINGS[stage - 1]
+    learned = how.fit([dict(enumerate(maps[:num_database]))], positions, how.drawn(num_database))
+    vectors = np.asarray(project(maps, *kernels(learned, positions), stride=1))
     return vectors[:num_database], vectors[num_database:]
 
 
 def of_maps(seed, stage):
-    """Of the made-up ones."""
+    """Whitened windows of the made-up maps."""
     rows = [(row, False) for row in range(DATABASE)] + [(row, True) for row in range(QUERIES)]
     return described(
         np.asarray(normalize_maps(np.stack([made_up_map(seed, stage, *row) for row in rows]))), stage, DATABASE
@@ -103,7 +103,7 @@ def image(vectors):
 
 @pytest.mark.parametrize("case", [*MAPS, *IMAGES])
 def test_scores_are_equal_as_whole_numbers(golden, case):
-    """Of the program's own matches; with its padding on a CPU, and on a GPU."""
+    """For the program's own matches; with its padding on a CPU, and on a GPU."""
     index = golden[f"{case}/index"]
     side = index.shape[-1]
     cells = np.arange(side**2)
@@ -136,7 +136,7 @@ def of_images():
         rows = [(row, False) for row in range(num_database)] + [(row, True) for row in range(num_queries)]
         maps = SsmMaps(model, stage, (pixels, pixels))
         computed = maps(np.stack([resize(picture(*row), (pixels, pixels)) for row in rows]))
-        return described(np.stack([one.vector.reshape(maps.shape) for one in computed]), stage, num_database)
+        return described(np.stack([result.vector.reshape(maps.shape) for result in computed]), stage, num_database)
 
     return of_images
 
@@ -146,8 +146,8 @@ def of_images():
 def test_images_get_the_votes_of_the_public_program(golden, of_images, case):
     database, queries = of_images(case, 1)
     assert_same_space(database, golden[f"{case}/windows"], 1e-4)
-    found = vote(queries, database, min(CANDIDATES, len(database)))
-    assert_votes(found, golden[f"{case}/votes"], golden[f"{case}/candidates"])
+    shortlist = vote(queries, database, min(CANDIDATES, len(database)))
+    assert_votes(shortlist, golden[f"{case}/votes"], golden[f"{case}/candidates"])
 
 
 @pytest.mark.slow

@@ -54,27 +54,27 @@ def shapes(variant: str) -> dict[str, tuple[int, ...]]:
     """The tensors of a checkpoint."""
     widths, positions = WIDTHS.get(variant, (16, 32, 64, 128)), POSITIONS.get(variant, 16)
     dimension = widths[-1]
-    found: dict[str, tuple[int, ...]] = {}
+    tensors: dict[str, tuple[int, ...]] = {}
     for block, (inputs, outputs) in enumerate(zip((3, *widths), widths, strict=False), start=1):
         for place, channels in ((1, inputs), (2, outputs)):
             conv = f"block{block}.conv{place}"
             if block > 2:
-                found |= {f"{conv}.offset_conv.weight": (18, channels, 3, 3), f"{conv}.offset_conv.bias": (18,)}
+                tensors |= {f"{conv}.offset_conv.weight": (18, channels, 3, 3), f"{conv}.offset_conv.bias": (18,)}
                 conv += ".regular_conv"
-            found[f"{conv}.weight"] = (outputs, channels, 3, 3)
+            tensors[f"{conv}.weight"] = (outputs, channels, 3, 3)
             names = ("weight", "bias", "running_mean", "running_var")
-            found |= {f"block{block}.bn{place}.{name}": (outputs,) for name in names}
-            found[f"block{block}.bn{place}.num_batches_tracked"] = ()
+            tensors |= {f"block{block}.bn{place}.{name}": (outputs,) for name in names}
+            tensors[f"block{block}.bn{place}.num_batches_tracked"] = ()
         if block > 1:
-            found[f"block{block}.downsample.weight"] = (outputs, inputs, 1, 1)
-            found[f"block{block}.downsample.bias"] = (outputs,)
-        found[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
+            tensors[f"block{block}.downsample.weight"] = (outputs, inputs, 1, 1)
+            tensors[f"block{block}.downsample.bias"] = (outputs,)
+        tensors[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
     for place, size in {0: (8, dimension, 1, 1), 2: (4, 8, 3, 3), 4: (4, 4, 3, 3), 6: (1, 4, 3, 3)}.items():
-        found[f"score_head.{place}.weight"] = size
+        tensors[f"score_head.{place}.weight"] = size
     head = "desc_head.offset_conv"
-    found |= {f"{head}.0.weight": (2 * positions, dimension, 3, 3), f"{head}.0.bias": (2 * positions,)}
-    found |= {f"{head}.2.weight": (2 * positions, 2 * positions, 1, 1), f"{head}.2.bias": (2 * positions,)}
-    return found | {
+    tensors |= {f"{head}.0.weight": (2 * positions, dimension, 3, 3), f"{head}.0.bias": (2 * positions,)}
+    tensors |= {f"{head}.2.weight": (2 * positions, 2 * positions, 1, 1), f"{head}.2.bias": (2 * positions,)}
+    return tensors | {
         "desc_head.sf_conv.weight": (dimension, dimension, 1, 1),
         "desc_head.agg_weights": (positions, dimension, dimension),
     }
@@ -133,9 +133,9 @@ def _stubs() -> None:
     from torch import nn
 
     def module(name: str, **contents: object) -> ModuleType:
-        sys.modules[name] = made = ModuleType(name)
-        made.__dict__.update(contents)
-        return made
+        sys.modules[name] = stub = ModuleType(name)
+        stub.__dict__.update(contents)
+        return stub
 
     def conv(inputs: int, outputs: int, size: int) -> nn.Module:
         return nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=False)
@@ -166,17 +166,17 @@ def main(clone: str, weights: str, images: str) -> None:
         network.load_state_dict({name: torch.from_numpy(np.array(tensor)) for name, tensor in values.items()})
         network.eval()
         image = picture(case, Path(images))
-        found = network.run(image)
+        result = network.run(image)
         with torch.no_grad():
             dense, _ = network.extract_dense_map(torch.from_numpy(image.copy()).permute(2, 0, 1)[None] / 255)
         golden |= {
             f"{case}/features": samples(dense[0].permute(1, 2, 0).numpy()),
-            f"{case}/score_map": samples(found["score_map"][..., None]),
-            f"{case}/keypoints": found["keypoints"],
-            f"{case}/scores": found["scores"],
-            f"{case}/projections": projections(found["descriptors"]),
+            f"{case}/score_map": samples(result["score_map"][..., None]),
+            f"{case}/keypoints": result["keypoints"],
+            f"{case}/scores": result["scores"],
+            f"{case}/projections": projections(result["descriptors"]),
         }
-        print(f"{case}: {len(found['scores'])} keypoints")
+        print(f"{case}: {len(result['scores'])} keypoints")
     np.savez_compressed(GOLDEN, **golden)
 
 

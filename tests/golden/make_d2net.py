@@ -16,7 +16,7 @@ SAMPLES = 1000
 
 
 class Case(NamedTuple):
-    """How an image is processed."""
+    """An image and its processing."""
 
     width: int
     height: int

@@ -73,9 +73,9 @@ def _computed(clone, tensors, features, **options) -> tuple[np.ndarray, int]:
         head.register_forward_hook(lambda _, __, result: read.append(result[0]))
     sides = as_tensors(features)
     with torch.inference_mode():
-        found = network({"image0": sides[0], "image1": sides[1]})
+        result = network({"image0": sides[0], "image1": sides[1]})
     [scores] = read
-    return scores[0, :-1, :-1].numpy(), found["stop"]
+    return scores[0, :-1, :-1].numpy(), result["stop"]
 
 
 def public(clone, tensors, **options):
@@ -95,12 +95,10 @@ def public(clone, tensors, **options):
 
 
 def as_tensors(features):
-    """What the public matcher takes of each image."""
+    """Inputs of the public matcher for each image."""
     import torch
 
-    sides = [
-        {"keypoints": one.keypoints, "descriptors": one.descriptors, "image_size": one.image_size} for one in features
-    ]
+    sides = [{name: getattr(image, name) for name in ("keypoints", "descriptors", "image_size")} for image in features]
     return [{name: torch.tensor(array)[None].double() for name, array in side.items()} for side in sides]
 
 

@@ -27,14 +27,14 @@ PAIRS = [f"{place}/{query}" for place in FOLDERS for query in QUERIES]
 
 
 def features(golden: dict[str, np.ndarray], pair: str) -> list[Features]:
-    """Of both images."""
-    made = []
+    """Features of both images."""
+    images = []
     for side in "01":
         keypoints, descriptors = (golden[f"{pair}/{name}{side}"] for name in ("keypoints", "descriptors"))
         ones = np.ones(len(keypoints), np.float32)
         size = np.array(SIZE, np.float32)
-        made.append(Features(keypoints, descriptors.astype(np.float32), ones, ones.astype(bool), size))
-    return made
+        images.append(Features(keypoints, descriptors.astype(np.float32), ones, ones.astype(bool), size))
+    return images
 
 
 def main(clone: str, weights: str, data: str) -> None:
@@ -43,15 +43,11 @@ def main(clone: str, weights: str, data: str) -> None:
     for pair in PAIRS:
         place, query = pair.split("/")
         for side, folder in zip("01", reversed(FOLDERS[place]), strict=True):
-            path = sorted((Path(data) / place / folder).iterdir(), key=lambda one: (len(one.name), one.name))[
-                int(query)
-            ]
-            [described] = extractor(resize(read_image(path), SIZE)[None])
-            found = described.features
-            golden[f"{pair}/keypoints{side}"] = np.asarray(found.keypoints)[np.asarray(found.mask)]
-            golden[f"{pair}/descriptors{side}"] = np.asarray(found.descriptors)[np.asarray(found.mask)].astype(
-                np.float16
-            )
+            paths = sorted((Path(data) / place / folder).iterdir(), key=lambda path: (len(path.name), path.name))
+            [described] = extractor(resize(read_image(paths[int(query)]), SIZE)[None])
+            real = np.asarray(described.features.mask)
+            golden[f"{pair}/keypoints{side}"] = np.asarray(described.features.keypoints)[real]
+            golden[f"{pair}/descriptors{side}"] = np.asarray(described.features.descriptors)[real].astype(np.float16)
         matched = as_tensors(features(golden, pair))
         result = network({"image0": matched[0], "image1": matched[1]})
         golden[f"{pair}/matches"] = result["matches"][0].numpy().astype(np.int32)

@@ -46,7 +46,7 @@ def samples(values: np.ndarray) -> np.ndarray:
 
 
 def name(*case: Any) -> str:
-    """Of a case in the file."""
+    """Name of a case in the file."""
     return "/".join(map(str, case))
 
 
@@ -54,7 +54,7 @@ def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None
     import torch
 
     _torchvision(torchvision)
-    sys.modules["sklearn"], sys.modules["sklearn.neighbors"] = (types.ModuleType(one) for one in ("sklearn", "nothing"))
+    sys.modules["sklearn"] = sys.modules["sklearn.neighbors"] = types.ModuleType("sklearn")
     sys.modules["sklearn.neighbors"].NearestNeighbors = None  # pyright: ignore  (for training)
     with torch.inference_mode():
         golden = dict(_patches(patch_netvlad)) | dict(_positions())
@@ -117,14 +117,14 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
         model.load_state_dict(_tensors(netvlad_checkpoint(clusters, outputs, seed)))
         model.double().eval()
         torch.set_default_dtype(torch.float64)
-        found = model.pool(model.encoder(normalized(size)))  # pyright: ignore
+        encoded = model.pool(model.encoder(normalized(size)))  # pyright: ignore
         torch.set_default_dtype(torch.float32)
         case = name("patch", clusters, outputs, size, seed)
         if outputs is None:
-            yield f"{case}/global", samples(found.numpy())
+            yield f"{case}/global", samples(encoded.numpy())
             continue
-        local, whole = found
-        yield f"{case}/global", get_pca_encoding(model, whole).numpy()[0]
+        local, descriptor = encoded
+        yield f"{case}/global", get_pca_encoding(model, descriptor).numpy()[0]
         for patch, descriptors in zip(PATCHES[outputs], local, strict=True):
             _, inputs, count = descriptors.shape
             rows = descriptors.permute(2, 0, 1).reshape(-1, inputs)

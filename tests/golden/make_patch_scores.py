@@ -44,7 +44,7 @@ def main(clone: str) -> None:
 
 
 def _scores() -> Iterator[tuple[str, np.ndarray]]:
-    """By matcher the scores `[C, S]` of all scales, their sums `[C]` for pairs, and over the candidates `[C]`."""
+    """Yield by matcher the scores `[C, S]` of all scales, their sums `[C]` for pairs, and over the candidates `[C]`."""
     import torch
 
     for unused in ("patchnetvlad.tools.datasets", "patchnetvlad.models.models_generic"):
@@ -56,15 +56,15 @@ def _scores() -> Iterator[tuple[str, np.ndarray]]:
     config = {"imageresizeH": 16 * MAP[0], "imageresizeW": 16 * MAP[1]}
     keypoints, indices = zip(*(calc_keypoint_centers_from_patches(config, p, p, 1, 1) for p in PATCHES), strict=True)
     features = [descriptors(patch) for patch in PATCHES]
-    query = [torch.from_numpy(one) for one, _ in features]
+    query = [torch.from_numpy(of_query) for of_query, _ in features]
     for name in MATCHERS:
         matcher = PatchMatcher(name, PATCHES, [1] * len(PATCHES), keypoints, indices)
         scores = np.array([
-            matcher.match(query, [torch.from_numpy(others[candidate].T) for _, others in features])[0]
+            matcher.match(query, [torch.from_numpy(of_candidates[candidate].T) for _, of_candidates in features])[0]
             for candidate in range(len(CANDIDATES))
         ])  # fmt: skip
         yield f"{name}/scales", scores
-        yield f"{name}/pairs", np.array([apply_patch_weights(one, len(PATCHES), WEIGHTS) for one in scores])
+        yield f"{name}/pairs", np.array([apply_patch_weights(of_pair, len(PATCHES), WEIGHTS) for of_pair in scores])
         yield f"{name}/fused", normalise_func(scores, len(PATCHES), WEIGHTS)
 
 

@@ -117,11 +117,11 @@ def _lost(clone: str) -> dict[str, np.ndarray]:
             np.savez(f"{path}0000000.npz", maps.T.reshape(-1, *LAYOUT))
         for mirrored in (False, True):
             for form, files in (("weighted", paths), ("unweighted", {})):
-                found = match_lost_kc.getSpatialCheckMat(
+                matrix = match_lost_kc.getSpatialCheckMat(
                     labels, labels, reference[None], query[None], 1, np.ones((1, 1)), flipFlag=mirrored,
                     preLoadDenseDescRef=False, **files,
                 )  # fmt: skip
-                golden[f"lost/{form}/{mirrored}"] = found[0, 1]
+                golden[f"lost/{form}/{mirrored}"] = matrix[0, 1]
     return golden
 
 

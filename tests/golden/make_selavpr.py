@@ -32,11 +32,11 @@ MATCHES = ((61, 4, 8), (9, 12, 9), (1, 2, 10))
 def maps(side: int, candidates: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Local maps of unit length, `[side, side, 128]` of a query and `[C, side, side, 128]`, alike more and more."""
     rng = np.random.default_rng(seed)
-    query, others = rng.normal(size=(side, side, 128)), rng.normal(size=(candidates, side, side, 128))
+    query, similar = rng.normal(size=(side, side, 128)), rng.normal(size=(candidates, side, side, 128))
     share = np.linspace(0, 0.9, candidates)[:, None, None, None]
-    others = share * query.reshape(-1, 128)[rng.permutation(side**2)].reshape(query.shape) + (1 - share) * others
-    query, others = (values / np.linalg.norm(values, axis=-1, keepdims=True) for values in (query, others))
-    return query.astype(np.float32), others.astype(np.float32)
+    similar = share * query.reshape(-1, 128)[rng.permutation(side**2)].reshape(query.shape) + (1 - share) * similar
+    query, similar = (values / np.linalg.norm(values, axis=-1, keepdims=True) for values in (query, similar))
+    return query.astype(np.float32), similar.astype(np.float32)
 
 
 def main(clone: str) -> None:
@@ -77,9 +77,9 @@ def _networks() -> Iterator[tuple[str, np.ndarray]]:
         network.get_backbone = lambda _, depth=depth, registers=registers: _transformer(1024, depth, 16, registers)
         checkpoint = transformer_checkpoint(selavpr_shapes(1024, depth, registers, prefix=""), seed)
         model = _filled(network.GeoLocalizationNet(types.SimpleNamespace()), checkpoint)
-        local, whole = model(normalized(SIZE))
+        local, global_descriptor = model(normalized(SIZE))
         case = name("network", depth, registers, seed)
-        yield f"{case}/global", whole.numpy()[0]
+        yield f"{case}/global", global_descriptor.numpy()[0]
         yield f"{case}/local", samples(local.numpy())
         yield f"{case}/means", local.numpy()[0].mean(axis=(0, 1))
 
@@ -89,10 +89,10 @@ def _backbones() -> Iterator[tuple[str, np.ndarray]]:
     for depth, registers, adapted, size, seed in BACKBONES:
         model = _transformer(WIDTH, depth, 4, registers)
         checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=adapted), seed)
-        nothing = {
+        zeros = {
             key: np.zeros(value.shape, np.float32) for key, value in model.state_dict().items() if "adapter" in key
         }
-        tokens = _filled(model, nothing | checkpoint)(normalized(size))
+        tokens = _filled(model, zeros | checkpoint)(normalized(size))
         case = name("backbone", depth, registers, adapted, *size, seed)
         yield f"{case}/whole", tokens["x_norm_clstoken"].numpy()[0]
         yield f"{case}/maps", samples(tokens["x_norm_patchtokens"].numpy())

@@ -55,9 +55,9 @@ def main(clone: str) -> None:
     for case, seed in MAPS.items():
         golden |= {f"{case}/{name}": array for name, array in _run(program, seed, None, DATABASE, QUERIES).items()}
     for case, (seed, pixels, *numbers) in IMAGES.items():
-        found = _run(program, seed, pixels, *numbers)
-        del found["cells"]  # hundreds of kB
-        golden |= {f"{case}/{name}": array for name, array in found.items()}
+        computed = _run(program, seed, pixels, *numbers)
+        del computed["cells"]  # hundreds of kB
+        golden |= {f"{case}/{name}": array for name, array in computed.items()}
     np.savez_compressed(GOLDEN, **golden)
 
 
@@ -86,7 +86,7 @@ def _run(program: type, seed: int, pixels: int | None, num_database: int, num_qu
     return {
         "windows": stage1, "cells": stage2, "candidates": np.array(run.candidates).astype(np.int8),
         "votes": votes.astype(np.int16), "index": index.astype(np.int16), "scores": np.array(run.scores),
-        "zero_scores": np.array([[_padded_by_zeros(one) for one in of_query] for of_query in index]),
+        "zero_scores": np.array([[_padded_by_zeros(query_index) for query_index in of_query] for of_query in index]),
         "weights": np.array(run.weights),
     }  # fmt: skip
 
@@ -131,7 +131,8 @@ def _program(clone: str) -> Any:
             )
             to_pixels = [transforms.ToTensor(), transforms.Normalize((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))]
             self.preprocess1, self.preprocess2 = (  # as by the program's button that makes the database
-                transforms.Compose([transforms.Resize(one), *to_pixels]) for one in (self.image_size1, self.image_size2)
+                transforms.Compose([transforms.Resize(side), *to_pixels])
+                for side in (self.image_size1, self.image_size2)
             )
             self.model_stage1 = self.model_stage2 = self.retrieve_model("VGG16")
             self.candidates, self.votes, self.index, self.scores, self.weights = [], [], [], [], []
@@ -202,10 +203,10 @@ def _without_windows() -> None:
     import torch
 
     def module(name: str, **members: Any) -> ModuleType:
-        sys.modules[name] = made = ModuleType(name)
+        sys.modules[name] = stub = ModuleType(name)
         for member, value in members.items():
-            setattr(made, member, value)
-        return made
+            setattr(stub, member, value)
+        return stub
 
     class Window:
         pass

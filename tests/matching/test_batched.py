@@ -67,16 +67,16 @@ alone = jax.jit(mfvpr.match, static_argnames=("cross_check", "with_ratio"))
 
 
 def expected_of(queries, database, candidates, *, max_distance=None, max_matches=None, **options):
-    """Of each query and candidate, the matches of the two images by themselves, as rows; None where there are none."""
-    found = {}
+    """Rows of matches of the two images by themselves, by query and candidate."""
+    rows = {}
     for query, row in np.ndindex(candidates.indices.shape):
         index = candidates.indices[query, row]
         if index >= 0 and queries.counts[query] and database.counts[index]:
             matches = alone(queries[query], database[index], with_ratio=True, **options)
             matches = filter_matches(matches, max_distance=max_distance, max_matches=max_matches)
             real = np.asarray(matches.mask)
-            found[query, row] = {name: np.asarray(values)[real] for name, values in per_match(matches).items()}
-    return found
+            rows[query, row] = {name: np.asarray(values)[real] for name, values in per_match(matches).items()}
+    return rows
 
 
 def assert_as_alone(match_set, queries, database, candidates, expected):
@@ -99,10 +99,10 @@ def assert_as_alone(match_set, queries, database, candidates, expected):
         assert flat.mask.all()
 
 
-def assert_same(one, other):
-    np.testing.assert_array_equal(one.counts, other.counts)
-    assert one.capacity == other.capacity
-    for left, right in zip(one.matches, other.matches, strict=True):
+def assert_same(first, second):
+    np.testing.assert_array_equal(first.counts, second.counts)
+    assert first.capacity == second.capacity
+    for left, right in zip(first.matches, second.matches, strict=True):
         for part in fields(Matches):
             np.testing.assert_array_equal(getattr(left, part.name), getattr(right, part.name), err_msg=part.name)
 
@@ -127,96 +127,96 @@ def assert_same(one, other):
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
     candidates = shortlist_of()
-    found = stages.match(queries, database, candidates, Matching(**options), memory=memory)
+    match_set = stages.match(queries, database, candidates, Matching(**options), memory=memory)
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
-    assert found.counts.sum() > 300
-    assert_as_alone(found, queries, database, candidates, expected)
+    assert match_set.counts.sum() > 300
+    assert_as_alone(match_set, queries, database, candidates, expected)
 
 
 def test_descriptors_need_not_be_of_unit_length():
     queries, database = sets(3.0)
     candidates = shortlist_of(1)
-    found = stages.match(queries, database, candidates, memory=SMALL)
-    assert max(one.distance.max(initial=0) for one in found.matches) > 2
-    assert_as_alone(found, queries, database, candidates, expected_of(queries, database, candidates))
+    match_set = stages.match(queries, database, candidates, memory=SMALL)
+    assert max(matches.distance.max(initial=0) for matches in match_set.matches) > 2
+    assert_as_alone(match_set, queries, database, candidates, expected_of(queries, database, candidates))
 
 
 @pytest.mark.optimized
 def test_stored_features_are_matched_as_those_in_memory(tmp_path):
     """And rows that are there are not read again."""
-    candidates, stored, kept = shortlist_of(), [], []
-    for name, some in zip(("queries", "database"), sets(), strict=True):
-        with open_store(tmp_path / name, {}, num_images=len(some)) as store:
-            images = dict(some.source.read())
+    candidates, stored, in_memory = shortlist_of(), [], []
+    for name, side in zip(("queries", "database"), sets(), strict=True):
+        with open_store(tmp_path / name, {}, num_images=len(side)) as store:
+            images = dict(side.source.read())
             store.write({row: image for row, image in images.items() if row % 10 != 4})
         stored.append(FeatureSet(Counting(store), {4: "bad"}))
-        kept.append(FeatureSet(InMemory(dict(store.read()), len(some)), {4: "bad"}))
-    found = stages.match(*stored, candidates, memory=1)
-    assert_same(found, stages.match(*kept, candidates))
-    assert_as_alone(found, *kept, candidates, expected_of(*kept, candidates))
+        in_memory.append(FeatureSet(InMemory(dict(store.read()), len(side)), {4: "bad"}))
+    match_set = stages.match(*stored, candidates, memory=1)
+    assert_same(match_set, stages.match(*in_memory, candidates))
+    assert_as_alone(match_set, *in_memory, candidates, expected_of(*in_memory, candidates))
     # Each side looks at its first image once more, for the size of a keypoint.
     pairs = candidates.mask & (stored[0].counts > 0)[:, None] & (stored[1].counts[candidates.indices] > 0)
-    for side, asked in zip(stored, (np.nonzero(pairs)[0], candidates.indices[pairs]), strict=True):
-        some = set(asked.tolist())
+    for side, requested_rows in zip(stored, (np.nonzero(pairs)[0], candidates.indices[pairs]), strict=True):
+        requested = set(requested_rows.tolist())
         reads = side.source.reads
         first = int(np.argmax(side.counts > 0))
-        assert set(reads) == some | {first}
-        assert sum(reads.values()) == len(some) + 1
+        assert set(reads) == requested | {first}
+        assert sum(reads.values()) == len(requested) + 1
     for side in stored:
         side.source.reads.clear()
-    assert_same(stages.match(*stored, candidates, memory=SMALL), found)
+    assert_same(stages.match(*stored, candidates, memory=SMALL), match_set)
     assert max(stored[1].source.reads.values()) > 1
 
 
 def test_queries_may_be_of_several_capacities():
     database, queries = sets()
     candidates = shortlist_of(2, len(queries), len(database))
-    found = stages.match(queries, database, candidates, memory=SMALL)
-    assert_as_alone(found, queries, database, candidates, expected_of(queries, database, candidates))
+    match_set = stages.match(queries, database, candidates, memory=SMALL)
+    assert_as_alone(match_set, queries, database, candidates, expected_of(queries, database, candidates))
 
 
 @pytest.mark.parametrize("number", [0, 1, QUERIES, QUERIES + 1])
 def test_any_number_of_queries(number):
-    """What is matched with a query changes nothing of it."""
+    """Other queries do not change the matches of a query."""
     (queries, database), candidates = sets(), shortlist_of()
-    some = FeatureSet(InMemory({row: queries[row] for row in range(number)}, number), {})
+    subset = FeatureSet(InMemory({row: queries[row] for row in range(number)}, number), {})
     few = jax.tree.map(lambda leaf: leaf[:number], candidates)
     if number:
-        found = stages.match(some, database, few)
-        assert_same(found, stages.match(queries, database, candidates).take(range(number)))
+        match_set = stages.match(subset, database, few)
+        assert_same(match_set, stages.match(queries, database, candidates).take(range(number)))
     else:
         with unchecked_shapes():  # counts without a row have no columns
-            assert list(stages.match(some, database, few).matches) == []
+            assert list(stages.match(subset, database, few).matches) == []
 
 
 def test_nothing_to_match():
     """Images without keypoints, and queries without candidates."""
     queries, database = sets()
     empty = FeatureSet.of(images_of([0, 0], 0))
-    for one, other, indices in ((empty, database, [[0, 1]] * 2), (queries, empty, [[1, 0]] * len(queries)),
+    for side0, side1, indices in ((empty, database, [[0, 1]] * 2), (queries, empty, [[1, 0]] * len(queries)),
                                 (empty, empty, [[-1, -1]] * 2)):  # fmt: skip
         indices = np.array(indices, np.int32)
-        found = stages.match(one, other, Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0))
-        assert found.counts.shape == indices.shape
-        assert not found.counts.any()
-        assert found[0].mask.shape == (2, 64)
+        match_set = stages.match(side0, side1, Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0))
+        assert match_set.counts.shape == indices.shape
+        assert not match_set.counts.any()
+        assert match_set[0].mask.shape == (2, 64)
 
 
 def test_a_candidate_that_comes_twice_is_matched_twice():
     queries, database = sets()
     indices = np.array([[3, 3, 1]] * len(queries), np.int32)
     twice = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
-    found = stages.match(queries, database, twice)
-    assert (found.counts[:, 0] == found.counts[:, 1]).all()
-    assert_as_alone(found, queries, database, twice, expected_of(queries, database, twice))
+    match_set = stages.match(queries, database, twice)
+    assert (match_set.counts[:, 0] == match_set.counts[:, 1]).all()
+    assert_as_alone(match_set, queries, database, twice, expected_of(queries, database, twice))
 
 
 def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
     def matched(seed, change):
         counts0, counts1 = ([max(0, count - change) for count in counts] for counts in (COUNTS0, COUNTS1))
-        some = (FeatureSet.of(images_of(counts, seed)) for counts in (counts0, counts1))
-        return stages.match(*some, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
+        sides = (FeatureSet.of(images_of(counts, seed)) for counts in (counts0, counts1))
+        return stages.match(*sides, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
 
     matched(0, 0)
     compilations.reset()
@@ -238,9 +238,9 @@ def on_devices(out):
     queries, database, candidates = for_devices()
     results = []
     for devices, memory in ((jax.devices(), SMALL), (jax.devices()[-1:], SMALL), (None, None)):
-        found = stages.match(queries, database, candidates, devices=devices, memory=memory)
-        scores = stages.score({"histogram": mfvpr.HistogramOfShifts()}, found, candidates)["histogram"]
-        content = [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(found.matches))]
+        match_set = stages.match(queries, database, candidates, devices=devices, memory=memory)
+        scores = stages.score({"histogram": mfvpr.HistogramOfShifts()}, match_set, candidates)["histogram"]
+        content = [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(match_set.matches))]
         results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": content})
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))
 
@@ -256,9 +256,9 @@ def test_eight_devices_give_what_one_gives(tmp_path):
     assert done.returncode == 0, done.stderr
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["devices"] == 8
-    first, *others = content["results"]
-    assert len(others) == 2
-    assert all(other == first for other in others)
+    first, *rest = content["results"]
+    assert len(rest) == 2
+    assert all(other == first for other in rest)
     here = stages.match(*for_devices())
     leaves = jax.tree.leaves(list(here.matches))
     assert first["matches"] == [np.asarray(leaf).tobytes().hex() for leaf in leaves]
@@ -292,10 +292,10 @@ def test_a_querys_matches_are_padded_to_the_capacity(match_set):
 
 
 def test_some_queries(match_set):
-    some = match_set.take([5, 0])
-    assert len(some) == 2
-    assert some.capacity == match_set.capacity
-    for got, query in zip((some[0], some[1]), (5, 0), strict=True):
+    subset = match_set.take([5, 0])
+    assert len(subset) == 2
+    assert subset.capacity == match_set.capacity
+    for got, query in zip((subset[0], subset[1]), (5, 0), strict=True):
         jax.tree.map(np.testing.assert_array_equal, got, match_set[query])
 
 
@@ -311,13 +311,13 @@ def test_batches_have_every_pair_with_matches_once(match_set):
         assert matches.mask.sum(axis=1).tolist() == [*counts.reshape(-1)[places], *[0] * (pairs - len(places))]
         for number, place in enumerate(places.tolist()):
             query, candidate = divmod(place, CANDIDATES)
-            one = match_set[query + 3]
+            of_query = match_set[query + 3]
             real = matches.mask[number]
             for name, values in per_match(matches).items():
                 np.testing.assert_array_equal(
-                    values[number][real], per_match(one)[name][candidate][one.mask[candidate]]
+                    values[number][real], per_match(of_query)[name][candidate][of_query.mask[candidate]]
                 )
-            np.testing.assert_array_equal(matches.image_size1[number], one.image_size1[candidate])
+            np.testing.assert_array_equal(matches.image_size1[number], of_query.image_size1[candidate])
     np.testing.assert_array_equal(seen, counts.reshape(-1) > 0)
     assert (slots(match_set) >= match_set.counts).all()
 
@@ -351,9 +351,9 @@ def test_some_queries_are_matched_as_all_of_them():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batched, "match_pairs", counted)
-        whole = dict(batched.match_queries(queries, database, listed, [0, 1, 2], **options))
+        together = dict(batched.match_queries(queries, database, listed, [0, 1, 2], **options))
         of_all, sizes[:] = {*sizes}, []
         alone = dict(batched.match_queries(queries, database, listed, [0], **options))
     assert {*sizes} < of_all
-    for one, other in zip(jax.tree.leaves(whole[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
-        np.testing.assert_array_equal(one, other)
+    for expected, actual in zip(jax.tree.leaves(together[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
+        np.testing.assert_array_equal(expected, actual)

@@ -63,10 +63,10 @@ def rows(matches):
     return {name: np.asarray(values)[real] for name, values in per_match(matches).items()}
 
 
-def assert_same_rows(found, expected):
-    assert found.keys() == expected.keys()
+def assert_same_rows(actual, expected):
+    assert actual.keys() == expected.keys()
     for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=0, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(actual[name], values, rtol=0, atol=1e-5, err_msg=name)
 
 
 @pytest.mark.optimized
@@ -79,18 +79,18 @@ def test_matches_are_the_largest_of_their_row_and_column_and_above_the_threshold
         for row, column in np.ndindex(assigned.shape)
         if assigned[row, column] == max(assigned[row].max(), assigned[:, column].max()) and assigned[row, column] > 1e-3
     ]
-    found = rows(matches)
+    matched_rows = rows(matches)
     assert len(expected) > 3
-    assert [*zip(found["index0"], found["index1"], strict=True)] == expected
+    assert [*zip(matched_rows["index0"], matched_rows["index1"], strict=True)] == expected
     row, column = np.array(expected).T
-    np.testing.assert_allclose(found["confidence"], assigned[row, column], rtol=1e-6)
-    np.testing.assert_array_equal(found["points1"], features1.keypoints[column])
-    np.testing.assert_array_equal(found["scores0"], features0.scores[row])
+    np.testing.assert_allclose(matched_rows["confidence"], assigned[row, column], rtol=1e-6)
+    np.testing.assert_array_equal(matched_rows["points1"], features1.keypoints[column])
+    np.testing.assert_array_equal(matched_rows["scores0"], features0.scores[row])
     difference = features0.descriptors[row] - features1.descriptors[column]
-    np.testing.assert_allclose(found["distance"], np.linalg.norm(difference, axis=1), atol=1e-6)
+    np.testing.assert_allclose(matched_rows["distance"], np.linalg.norm(difference, axis=1), atol=1e-6)
     alone = jax.jit(partial(mfvpr.match, with_ratio=True))(features0, features1)
     np.testing.assert_array_equal(matches.ratio, alone.ratio)
-    fewer = rows(matched(matcher(filter_threshold=float(np.median(found["confidence"]))), features0, features1))
+    fewer = rows(matched(matcher(filter_threshold=float(np.median(matched_rows["confidence"]))), features0, features1))
     assert 0 < len(fewer["index0"]) < len(expected)
 
 
@@ -103,23 +103,23 @@ def test_a_pair_depends_neither_on_its_batch_nor_on_its_padding(chunk_size):
     numbers = np.array([(0, 1), (2, 3), (4, 5), (0, 3), (2, 1), (4, 1), (0, 5)], np.int32)
     sure = matcher(0, depth_confidence=0.95, chunk_size=chunk_size)
     for capacity, garbage in ((31, np.nan), (64, np.inf)):
-        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(slots(one, capacity, garbage) for one in images))
-        found = mfvpr.match_pairs(batch, batch, numbers, 6, sure)
-        assert found.mask.sum() > 10
-        assert not found.mask[6].any()
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(slots(image, capacity, garbage) for image in images))
+        matches = mfvpr.match_pairs(batch, batch, numbers, 6, sure)
+        assert matches.mask.sum() > 10
+        assert not matches.mask[6].any()
         for place, (query, candidate) in enumerate(numbers[:6]):
             alone = rows(matched(sure, slots(images[query], 40, -1e9), slots(images[candidate], 40, 0)))
-            one = jax.tree.map(lambda leaf, place=place: np.asarray(leaf)[place], found)
-            assert_same_rows(rows(one), alone)
-            assert (one.count0, one.count1) == (len(images[query].mask), len(images[candidate].mask))
+            image = jax.tree.map(lambda leaf, place=place: np.asarray(leaf)[place], matches)
+            assert_same_rows(rows(image), alone)
+            assert (image.count0, image.count1) == (len(images[query].mask), len(images[candidate].mask))
 
 
 def test_images_without_keypoints_have_no_matches():
     features0, features1 = pair(COUNTS, INPUTS, 0)
     nobody = replace(features1, mask=np.zeros(COUNTS[1], bool))
-    for some in (nobody, empty(features1)):
-        assert not matched(matcher(), features0, some).mask.any()
-        assert not matched(matcher(), some, features0).mask.any()
+    for unmatchable in (nobody, empty(features1)):
+        assert not matched(matcher(), features0, unmatchable).mask.any()
+        assert not matched(matcher(), unmatchable, features0).mask.any()
 
 
 # In evaluations and stores
@@ -142,31 +142,31 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
     queries, database = sets()
     in_memory = stages.match(queries, database, shortlist(), matcher())
     with open_match_store(tmp_path / "m", {"of": "any"}, num_queries=4, num_candidates=2) as store:
-        kept = stages.match(queries, database, shortlist(), matcher(), store=store)
-    for match_set in (in_memory, kept):
+        stored = stages.match(queries, database, shortlist(), matcher(), store=store)
+    for match_set in (in_memory, stored):
         assert match_set.counts[:2].all()
         assert not match_set.counts[2:].any()
         for query, place in np.ndindex(2, 2):
             row = shortlist().indices[query, place]
             alone = rows(matched(matcher(), slots(queries[query], 32), slots(database[row], 32)))
-            found = ragged.split(per_match(match_set.matches[query]), match_set.counts[query])[place]
-            assert_same_rows(found, alone)
-        sure = replace(match_set, matches=[replace(one, confidence=None) for one in match_set.matches])
+            in_set = ragged.split(per_match(match_set.matches[query]), match_set.counts[query])[place]
+            assert_same_rows(in_set, alone)
+        sure = replace(match_set, matches=[replace(matches, confidence=None) for matches in match_set.matches])
         scorers = {"histogram": mfvpr.HistogramOfShifts()}
-        found, more = (stages.score(scorers, one, shortlist())["histogram"] for one in (match_set, sure))
-        assert (found[:2] < more[:2]).all()
+        less, more = (stages.score(scorers, matches, shortlist())["histogram"] for matches in (match_set, sure))
+        assert (less[:2] < more[:2]).all()
 
 
 def test_what_changes_matches_changes_their_recipe():
-    others = [
+    matchers = [
         Matching(),
         matcher(),
         LightGlueMatching.of(network(1), **OPTIONS),
         matcher(filter_threshold=0.2),
         matcher(depth_confidence=0.9),
     ]
-    recipes = [str(recipe_of(one)) for one in others]
-    assert len({*recipes}) == len(others)
+    recipes = [str(recipe_of(matcher_of_recipe)) for matcher_of_recipe in matchers]
+    assert len({*recipes}) == len(matchers)
     assert recipes[1] == str(recipe_of(matcher(chunk_size=5)))
     assert recipes[1] == str(recipe_of(LightGlueMatching.of(network(), **OPTIONS)))
 
@@ -215,9 +215,10 @@ class InOrder:
 
 def test_a_matcher_of_ones_own_matches_whole_shortlists():
     queries, database = sets()
-    found = stages.match(queries, database, shortlist(), InOrder(4.0))
-    np.testing.assert_array_equal(found.counts, [[4, 4], [4, 4], [0, 0], [0, 0]])
-    assert all(one.confidence is None and one.ratio is None and one.index0 is None for one in found.matches)
-    np.testing.assert_array_equal(found.matches[1].points1[:4], database[1].keypoints[:4])
-    scores = stages.score({"count": mfvpr.MatchCount()}, found, shortlist())["count"]
-    np.testing.assert_array_equal(scores[shortlist().mask], found.counts[shortlist().mask])
+    match_set = stages.match(queries, database, shortlist(), InOrder(4.0))
+    np.testing.assert_array_equal(match_set.counts, [[4, 4], [4, 4], [0, 0], [0, 0]])
+    for name in ("confidence", "ratio", "index0"):
+        assert all(getattr(matches, name) is None for matches in match_set.matches)
+    np.testing.assert_array_equal(match_set.matches[1].points1[:4], database[1].keypoints[:4])
+    scores = stages.score({"count": mfvpr.MatchCount()}, match_set, shortlist())["count"]
+    np.testing.assert_array_equal(scores[shortlist().mask], match_set.counts[shortlist().mask])

@@ -69,11 +69,11 @@ def test_an_image_matched_with_itself_is_at_distance_zero(mode):
 
 def test_first_index_wins_on_both_sides():
     rng = np.random.default_rng(1)
-    one = make_features(rng, 3)
-    one.descriptors[:] = one.descriptors[0]
-    slots, points1, _ = found(match_once(one, one))
+    copies = make_features(rng, 3)
+    copies.descriptors[:] = copies.descriptors[0]
+    slots, points1, _ = found(match_once(copies, copies))
     assert list(slots) == [0]
-    np.testing.assert_array_equal(points1[0], one.keypoints[0])
+    np.testing.assert_array_equal(points1[0], copies.keypoints[0])
 
 
 @pytest.mark.parametrize("chunk_size", [None, 1, 2, 3, 5, 50])
@@ -131,10 +131,10 @@ def test_filter_keeps_the_closest(seed, max_distance, max_matches):
 def test_compact_moves_real_matches_to_the_front_in_order():
     matches = random_matches(np.random.default_rng(4), 60)
     scattered = filter_matches(matches, max_distance=1.0)
-    kept = np.flatnonzero(scattered.mask)
-    for capacity in (len(kept), len(kept) + 5, 10):
+    real_slots = np.flatnonzero(scattered.mask)
+    for capacity in (len(real_slots), len(real_slots) + 5, 10):
         tight = compact_once(scattered, capacity)
-        real = kept[:capacity]
+        real = real_slots[:capacity]
         assert tight.mask.sum() == len(real)
         assert tight.points0.shape == (capacity, 2)
         np.testing.assert_array_equal(tight.points1[: len(real)], matches.points1[real])
@@ -219,7 +219,7 @@ def test_numbers_that_do_not_come_out_even_in_blocks(mode, counts):
 def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
     rng = np.random.default_rng(7)
     features0, features1 = make_features(rng, 12), make_features(rng, 10)
-    whole = match_once(features0, features1, cross_check=mode)
+    unbroken = match_once(features0, features1, cross_check=mode)
     features1.descriptors[4, 2] = value
     features0.descriptors[3, 0] = value
     slots, points1, _ = found(match_once(features0, features1, cross_check=mode))
@@ -227,7 +227,7 @@ def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
     expected = oracles.nearest(rest0, rest1, mode)
     assert list(slots) == [i + (i >= 3) for i, _, _ in expected]
     np.testing.assert_array_equal(points1, [features1.keypoints[j + (j >= 4)] for _, j, _ in expected])
-    assert whole.mask.sum() >= len(slots)
+    assert unbroken.mask.sum() >= len(slots)
 
 
 def test_numpy_features_may_stand_in_a_compiled_closure():
@@ -250,26 +250,27 @@ def test_options_without_meaning_are_refused():
 def test_real_size_agrees_with_a_vectorised_check():
     """700 x 700 x 512 non-negative descriptors, as D2-Net's, against float32 argmax."""
     rng = np.random.default_rng(5)
-    one, two = (make_features(rng, 700, dimension=512) for _ in range(2))
-    descriptors = [unit(np.abs(f.descriptors)) for f in (one, two)]
-    one, two = (Features(f.keypoints, d, f.scores, f.mask, f.image_size) for f, d in zip((one, two), descriptors))  # noqa: B905
-    similarity = descriptors[0].astype(np.float64) @ descriptors[1].T.astype(np.float64)
+    first, second = (
+        replace(features, descriptors=unit(np.abs(features.descriptors)))
+        for features in (make_features(rng, 700, dimension=512) for _ in range(2))
+    )
+    similarity = first.descriptors.astype(np.float64) @ second.descriptors.T.astype(np.float64)
     mutual = similarity.argmax(0)[similarity.argmax(1)] == np.arange(700)
-    matches = match_once(one, two)
+    matches = match_once(first, second)
     assert (np.asarray(matches.mask) == mutual).mean() > 0.998  # float32 rounding may flip a near-tie
     agree = mutual & np.asarray(matches.mask)
-    np.testing.assert_array_equal(np.asarray(matches.points1)[agree], two.keypoints[similarity.argmax(1)][agree])
+    np.testing.assert_array_equal(np.asarray(matches.points1)[agree], second.keypoints[similarity.argmax(1)][agree])
 
 
 @pytest.mark.optimized
 def test_half_precision_gives_what_single_precision_of_the_same_values_gives():
     rng = np.random.default_rng(4)
     pair = [make_features(rng, 60, dimension=64) for _ in range(2)]
-    half = [replace(one, descriptors=one.descriptors.astype(np.float16)) for one in pair]
-    single = [replace(one, descriptors=one.descriptors.astype(np.float32)) for one in half]
+    half = [replace(features, descriptors=features.descriptors.astype(np.float16)) for features in pair]
+    single = [replace(features, descriptors=features.descriptors.astype(np.float32)) for features in half]
     for got, expected in zip(jax.tree.leaves(match_once(*half)), jax.tree.leaves(match_once(*single)), strict=True):
         np.testing.assert_array_equal(got, expected)
-    descriptors = [one.descriptors for one in half]
+    descriptors = [features.descriptors for features in half]
     lists = [retrieve(*(values.astype(kind) for values in descriptors), num_candidates=9) for kind in ("f2", "f4")]
     np.testing.assert_array_equal(lists[0].indices, lists[1].indices)
     np.testing.assert_array_equal(lists[0].scores, lists[1].scores)
@@ -285,8 +286,8 @@ def test_a_distance_at_the_limit_is_near_enough():
 
 def test_whoever_calls_it_matching_compiles_once(compilations):
     rng = np.random.default_rng(6)
-    query, *others = (make_features(rng, 20) for _ in range(5))
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *others)
+    query, *candidates = (make_features(rng, 20) for _ in range(5))
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
     calls = [
         lambda limit: match_candidates(query, batch),
         lambda limit: match_candidates(query, batch, with_ratio=True),
@@ -355,7 +356,7 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
 def test_all_fields_of_half_precision_are_matched_in_single():
     rng = np.random.default_rng(9)
     pair = [make_features(rng, 20) for _ in range(2)]
-    half = [jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), one) for one in pair]
+    half = [jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), side) for side in pair]
     for name in ("points0", "points1", "distance", "scores0", "scores1", "image_size0"):
         assert getattr(match_once(*half), name).dtype == jnp.float32
     with pytest.raises(ValueError, match=r"query \[N0\] .*candidates \[C, N1\]"):

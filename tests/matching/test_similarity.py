@@ -41,10 +41,10 @@ def test_neighbors_are_those_of_a_stable_sort(rows, columns, kind):
             assert (np.asarray(index) == 0).all()
             assert (np.asarray(largest) == -np.inf).all()
             continue
-        some = np.asarray(largest) > -np.inf
+        has_neighbor = np.asarray(largest) > -np.inf
         np.testing.assert_array_equal(largest, along.max(axis=1))
-        np.testing.assert_array_equal(np.asarray(index)[some], ordered(along)[some, 0])
-        assert (np.asarray(index)[~some] == 0).all()
+        np.testing.assert_array_equal(np.asarray(index)[has_neighbor], ordered(along)[has_neighbor, 0])
+        assert (np.asarray(index)[~has_neighbor] == 0).all()
 
 
 @pytest.mark.parametrize("kind", ["random", "ties", "peaks", "holes"])
@@ -57,5 +57,5 @@ def test_the_two_nearest_are_the_first_of_a_stable_sort(rows, columns, kind):
             continue
         expected = np.take_along_axis(values, ordered(values), 1)[:, place]
         np.testing.assert_array_equal(largest, expected)
-        some = expected > -np.inf
-        np.testing.assert_array_equal(np.asarray(index)[some], ordered(values)[some, place])
+        has_neighbor = expected > -np.inf
+        np.testing.assert_array_equal(np.asarray(index)[has_neighbor], ordered(values)[has_neighbor, place])

@@ -48,7 +48,7 @@ def usable(features):
 
 
 @given(feature_pairs(), st.sampled_from([0.01, 0.1, 2.0]))
-def test_soft_matches_agree_with_the_loop(pair, temperature):
+def test_smooth_agree_with_the_loop(pair, temperature):
     features0, features1 = pair
     rows0, rows1 = usable(features0), usable(features1)
     got = soft(features0, features1, temperature=temperature)
@@ -59,9 +59,9 @@ def test_soft_matches_agree_with_the_loop(pair, temperature):
             features0.descriptors[rows0], features1.descriptors[rows1], features1.keypoints[rows1],
             features1.scores[rows1], temperature,
         )  # fmt: skip
-        found = np.column_stack([got.points1, got.scores1, got.distance**2, got.confidence])[rows0]
+        columns = np.column_stack([got.points1, got.scores1, got.distance**2, got.confidence])[rows0]
         expected[:, 3] **= 2  # the root of a float32 near 0 has no digits left
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-6 + 2e-7 / temperature)
+        np.testing.assert_allclose(columns, expected, rtol=1e-4, atol=2e-6 + 2e-7 / temperature)
         np.testing.assert_array_equal(got.points0, features0.keypoints)
 
 
@@ -75,12 +75,12 @@ def test_soft_becomes_hard(seed):
         cool = [soft(*pair, temperature=t) for t in (1.0, 0.1, 1e-2, 1e-3, 1e-7)]
         mutual = hard["mutual"].mask.astype(float)
         real, errors = hard["none"].mask, []
-        for one in cool:
+        for smooth in cool:
             gaps = [
-                jnp.max(jnp.abs(getattr(one, name) - getattr(hard["none"], name))[real])
+                jnp.max(jnp.abs(getattr(smooth, name) - getattr(hard["none"], name))[real])
                 for name in ("points1", "distance", "scores1")
             ]
-            errors.append([float(jnp.mean(jnp.abs(one.confidence - mutual)[real])), *map(float, gaps)])
+            errors.append([float(jnp.mean(jnp.abs(smooth.confidence - mutual)[real])), *map(float, gaps)])
     errors = np.array(errors)
     np.testing.assert_array_equal(cool[0].mask, real)
     assert (np.diff(errors[:, 0]) < 0).all()
@@ -122,8 +122,9 @@ def test_degenerate_images_have_finite_gradients(kind):
     def total(temperature, descriptors0, descriptors1, keypoints1, scores1):
         image0 = replace(features0, descriptors=descriptors0)
         image1 = replace(features1, descriptors=descriptors1, keypoints=keypoints1, scores=scores1)
-        one = soft_match(image0, image1, temperature=temperature)
-        return jnp.sum(jnp.where(one.mask, one.confidence * one.distance + one.scores1 + one.points1[:, 0], 0.0))
+        smooth = soft_match(image0, image1, temperature=temperature)
+        terms = smooth.confidence * smooth.distance + smooth.scores1 + smooth.points1[:, 0]
+        return jnp.sum(jnp.where(smooth.mask, terms, 0.0))
 
     inputs = features0.descriptors, features1.descriptors, features1.keypoints, features1.scores
     gradients = jax.jit(jax.grad(total, argnums=range(5)))

@@ -46,7 +46,7 @@ def deformed(dense: np.ndarray, kernel: np.ndarray, offsets: np.ndarray) -> np.n
 
 
 def _highest(scores: np.ndarray, row: int, column: int) -> float:
-    """Of the 5 x 5 neighborhood."""
+    """Maximum of the 5 x 5 neighborhood."""
     return scores[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].max()
 
 
@@ -54,26 +54,26 @@ def peaks(scores: np.ndarray) -> list[tuple[int, int]]:
     """(row, column) of the maxima, in three rounds."""
     height, width = scores.shape
     places = [(row, column) for row in range(height) for column in range(width)]
-    found = {place for place in places if scores[place] == _highest(scores, *place)}
+    maxima = {place for place in places if scores[place] == _highest(scores, *place)}
     for _ in range(2):
-        near = {(y, x) for row, column in found for y in range(row - 2, row + 3) for x in range(column - 2, column + 3)}
-        others = scores.copy()
+        near = {(row + down - 2, column + right - 2) for row, column in maxima for down, right in np.ndindex(5, 5)}
+        remaining = scores.copy()
         for place in near.intersection(places):
-            others[place] = 0
-        found |= {place for place in places if place not in near and others[place] == _highest(others, *place)}
-    return sorted((row, column) for row, column in found if 2 <= row < height - 2 and 2 <= column < width - 2)
+            remaining[place] = 0
+        maxima |= {place for place in places if place not in near and remaining[place] == _highest(remaining, *place)}
+    return sorted((row, column) for row, column in maxima if 2 <= row < height - 2 and 2 <= column < width - 2)
 
 
 def keypoints(scores: np.ndarray, threshold: float, limit: int) -> np.ndarray:
     """Rows of x, y, score."""
-    found = [place for place in peaks(scores) if scores[place] > threshold]
-    if not found:
-        found = [place for place in peaks(scores) if scores[place] > scores.mean()]
-    if len(found) > limit:
-        found = sorted(found, key=lambda place: -scores[place])[:limit]
+    places = [place for place in peaks(scores) if scores[place] > threshold]
+    if not places:
+        places = [place for place in peaks(scores) if scores[place] > scores.mean()]
+    if len(places) > limit:
+        places = sorted(places, key=lambda place: -scores[place])[:limit]
     padded = np.pad(scores, 2)
     rows = []
-    for row, column in found:
+    for row, column in places:
         patch = padded[row : row + 5, column : column + 5]
         weights = np.exp((patch - patch.max()) / 0.1)
         x = column + sum(weights[i, j] * (j - 2) for i in range(5) for j in range(5)) / weights.sum()

@@ -21,7 +21,7 @@ class Found(NamedTuple):
 def detected(dense: np.ndarray) -> list[tuple[int, int, int]]:
     """(channel, row, column) that pass the three tests, in this order, of a map `[h, w, C]`."""
     height, width, channels = dense.shape
-    found = []
+    positions = []
     for channel in range(channels):
         for row in range(height):
             for column in range(width):
@@ -34,14 +34,14 @@ def detected(dense: np.ndarray) -> list[tuple[int, int, int]]:
                     and value == dense[rows, columns, channel].max()
                     and not _is_edge(dense, channel, row, column)
                 ):
-                    found.append((channel, row, column))
-    return found
+                    positions.append((channel, row, column))
+    return positions
 
 
 def keypoints(dense: np.ndarray, banned: np.ndarray | None = None) -> list[Found]:
-    """What is detected where nothing is `banned` `[h, w]`, moved to the maximum of a parabola."""
+    """Detections where nothing is `banned` `[h, w]`, moved to the maximum of a parabola."""
     height, width, _ = dense.shape
-    found = []
+    detections = []
     for channel, row, column in detected(dense):
         if banned is not None and banned[row, column]:
             continue
@@ -55,13 +55,13 @@ def keypoints(dense: np.ndarray, banned: np.ndarray | None = None) -> list[Found
         descriptor = _bilinear(dense, at_row, at_column)
         descriptor = descriptor / max(np.linalg.norm(descriptor), 1e-12)
         score = dense[row, column, channel]
-        found.append(Found(channel, row, column, 4 * at_column + 1.5, 4 * at_row + 1.5, score, descriptor))
-    return found
+        detections.append(Found(channel, row, column, 4 * at_column + 1.5, 4 * at_row + 1.5, score, descriptor))
+    return detections
 
 
 def pyramid(maps: list[np.ndarray]) -> list[list[Found]]:
     """Keypoints of each scale's map, the smallest first, px of that scale's image; scores divided by 1, 2, ..."""
-    found: list[list[Found]] = []
+    levels: list[list[Found]] = []
     previous = banned = None
     for level, dense in enumerate(maps, start=1):
         height, width, _ = dense.shape
@@ -79,9 +79,9 @@ def pyramid(maps: list[np.ndarray]) -> list[list[Found]]:
         now = np.zeros((height, width), bool) if banned is None else banned.copy()
         for _, row, column in detected(dense):
             now[row, column] = True
-        found.append([one._replace(score=one.score / level) for one in ours])
+        levels.append([keypoint._replace(score=keypoint.score / level) for keypoint in ours])
         banned, previous = now, dense if ours else None
-    return found
+    return levels
 
 
 def _value(dense: np.ndarray, channel: int, row: int, column: int) -> float:

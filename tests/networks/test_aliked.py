@@ -53,7 +53,7 @@ def seeded(shape, seed=0, scale=1.0):
 
 
 def randomized(build, scale: float) -> nnx.Module:
-    """What `build` makes, with random values throughout, biases too."""
+    """The module of `build` with random values throughout, biases too."""
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         graph, state = nnx.split(nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0))))
     leaves, structure = jax.tree.flatten(state)
@@ -61,20 +61,20 @@ def randomized(build, scale: float) -> nnx.Module:
     return nnx.merge(graph, jax.tree.unflatten(structure, values))
 
 
-def assert_golden(case, features, scores, found, descriptors):
+def assert_golden(case, features, scores, detections, descriptors):
     with np.load(GOLDEN) as file:
         golden = {
             name: file[f"{case}/{name}"] for name in ("features", "score_map", "keypoints", "scores", "projections")
         }
     np.testing.assert_allclose(samples(np.asarray(features)), golden["features"], atol=5e-6)
     np.testing.assert_allclose(samples(np.asarray(scores)[..., None]), golden["score_map"], atol=1e-5)
-    kept = np.asarray(found.mask)
-    assert kept.sum() == min(found.count, len(kept)) == len(golden["scores"])
-    assert kept[: kept.sum()].all()
-    np.testing.assert_allclose(found.keypoints[kept], golden["keypoints"], atol=1e-4)
-    np.testing.assert_allclose(found.scores[kept], golden["scores"], atol=5e-5)
-    np.testing.assert_allclose(projections(np.asarray(descriptors[kept])), golden["projections"], atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(descriptors[kept], axis=1), 1, atol=1e-6)
+    mask = np.asarray(detections.mask)
+    assert mask.sum() == min(detections.count, len(mask)) == len(golden["scores"])
+    assert mask[: mask.sum()].all()
+    np.testing.assert_allclose(detections.keypoints[mask], golden["keypoints"], atol=1e-4)
+    np.testing.assert_allclose(detections.scores[mask], golden["scores"], atol=5e-5)
+    np.testing.assert_allclose(projections(np.asarray(descriptors[mask])), golden["projections"], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(descriptors[mask], axis=1), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -134,8 +134,8 @@ def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, compilat
 def test_a_deformable_convolution_agrees_with_the_oracle():
     conv = randomized(partial(DeformableConv, 3, 4, precision="highest"), 1.5)
     images = seeded((2, 6, 5, 3))
-    found = jax.jit(lambda images: conv(images))(images)
-    for image, ours in zip(images, found, strict=True):
+    results = jax.jit(lambda images: conv(images))(images)
+    for image, ours in zip(images, results, strict=True):
         offsets = oracle.convolved(image, np.asarray(conv.offset.kernel[...]), np.asarray(conv.offset.bias[...]))
         assert (np.abs(offsets) > 1.5).any()  # a quarter of the longer side
         np.testing.assert_allclose(ours, oracle.deformed(image, np.asarray(conv.kernel[...]), offsets), atol=1e-4)
@@ -152,11 +152,11 @@ def test_a_field_is_the_dense_map_where_it_is_asked_for():
 
     @jax.jit
     def both(levels):
-        made = field(levels, *window)
+        features = field(levels, *window)
         maps = [upsample(level, len(levels[0]) // len(level)) for level in levels]
         plain = jnp.concatenate(maps, axis=-1)[window]
         plain /= jnp.linalg.norm(plain, axis=-1, keepdims=True)
-        return (made.dense(), made.sample(points), made.at(y, x)), (plain, sample(plain, points))
+        return (features.dense(), features.sample(points), features.at(y, x)), (plain, sample(plain, points))
 
     (dense, sampled, pixels), (plain, expected) = both(levels)
     np.testing.assert_allclose(dense, plain, atol=1e-6)
@@ -178,9 +178,9 @@ def test_descriptors_agree_with_the_oracle_also_at_the_border():
         features = field(levels, slice(4, 30), slice(0, 32))
         return head(features, jnp.asarray(points), 40), features.dense()
 
-    found, dense = described(pyramid(32, 32, 2))
+    descriptors, dense = described(pyramid(32, 32, 2))
     expected = [oracle.described(np.asarray(dense, np.float64), point, weights) for point in points]
-    np.testing.assert_allclose(found, expected, atol=2e-5)
+    np.testing.assert_allclose(descriptors, expected, atol=2e-5)
 
 
 @pytest.fixture(scope="module")
@@ -198,15 +198,15 @@ _detect = jax.jit(detect, static_argnums=2)
 @pytest.mark.parametrize("threshold, capacity", [(0.3, 500), (0.1, 500), (0.99, 500), (0, 500), (0.1, 20), (0.99, 20)])
 def test_detection_agrees_with_the_oracle(score_map, threshold, capacity):
     expected = oracle.keypoints(score_map.astype(np.float64), threshold or 1, capacity)
-    found = _detect(score_map, threshold, capacity)
+    detections = _detect(score_map, threshold, capacity)
     count = len(expected)
     assert count > 15
-    assert found.count == len(oracle.keypoints(score_map.astype(np.float64), threshold or 1, 500))
-    np.testing.assert_array_equal(found.mask, np.arange(len(found.mask)) < count)
-    np.testing.assert_allclose(found.keypoints[:count], expected[:, :2], atol=1e-5)
-    np.testing.assert_allclose(found.scores[:count], expected[:, 2], atol=1e-6)
+    assert detections.count == len(oracle.keypoints(score_map.astype(np.float64), threshold or 1, 500))
+    np.testing.assert_array_equal(detections.mask, np.arange(len(detections.mask)) < count)
+    np.testing.assert_allclose(detections.keypoints[:count], expected[:, :2], atol=1e-5)
+    np.testing.assert_allclose(detections.scores[:count], expected[:, 2], atol=1e-6)
     if capacity == 20:
-        assert found.count > 20
+        assert detections.count > 20
 
 
 @pytest.mark.parametrize("size", [320, 336])
@@ -215,8 +215,8 @@ def test_positions_are_rounded_as_the_original_rounds_them(size):
     peaks[3, 3 : size - 3 : 5] = 1  # each alone in its neighborhood, so that the refinement does not move it
     keypoints = _detect(peaks, 0.5, 100).keypoints
     pixels = np.arange(3, size - 3, 5, dtype=np.float32)
-    last, one, two = np.float32(size - 1), np.float32(1), np.float32(2)
-    expected = ((pixels / last * two - one) / two + one / two) * last
+    last, unit, two = np.float32(size - 1), np.float32(1), np.float32(2)
+    expected = ((pixels / last * two - unit) / two + unit / two) * last
     assert (expected < pixels).any()  # which is truncated to the pixel before
     np.testing.assert_array_equal(keypoints[: len(pixels), 0], expected)
 
@@ -224,9 +224,9 @@ def test_positions_are_rounded_as_the_original_rounds_them(size):
 @pytest.mark.parametrize("value", [0, 0.5, 1, np.nan, np.inf])
 @pytest.mark.parametrize("size", [(12, 9), (3, 4)])
 def test_a_constant_map_has_keypoints_only_above_the_threshold(value, size):
-    found = _detect(np.full(size, value, np.float32), 0.7, 100)
-    assert found.count == (40 if value >= 0.7 and size == (12, 9) else 0)
-    assert found.mask.sum() == found.count
+    detections = _detect(np.full(size, value, np.float32), 0.7, 100)
+    assert detections.count == (40 if value >= 0.7 and size == (12, 9) else 0)
+    assert detections.mask.sum() == detections.count
 
 
 class Direct(nnx.Module):
@@ -235,8 +235,8 @@ class Direct(nnx.Module):
     dimension = 2
 
     def extract(self, images, threshold, capacity):
-        found = jax.vmap(lambda scores: detect(scores, threshold, capacity))(images[..., 0])
-        return found, found.keypoints / jnp.linalg.norm(found.keypoints, axis=-1, keepdims=True)
+        detections = jax.vmap(lambda scores: detect(scores, threshold, capacity))(images[..., 0])
+        return detections, detections.keypoints / jnp.linalg.norm(detections.keypoints, axis=-1, keepdims=True)
 
 
 def crowded() -> np.ndarray:
@@ -264,11 +264,11 @@ def test_what_does_not_fit_the_usual_slots_is_not_lost(unlimited):
 
 @pytest.mark.parametrize("limit", [50, 100])
 def test_of_too_many_the_highest_scores_are_kept_by_falling_score(unlimited, limit):
-    everything, _ = local(unlimited(crowded()))
+    unlimited_features, _ = local(unlimited(crowded()))
     features, other = local(AlikedFeatures(Direct(), (60, 40), max_keypoints=limit)(crowded()))
     peaks = crowded()[0, 3:37:3, 3:57:3, 0].reshape(-1)
     strongest = np.argsort(-peaks.astype(int), kind="stable")[:limit]
-    np.testing.assert_array_equal(features.keypoints, everything.keypoints[strongest])
+    np.testing.assert_array_equal(features.keypoints, unlimited_features.keypoints[strongest])
     assert len(other.scores) == 32
 
 
@@ -291,8 +291,8 @@ def test_the_smallest_image_has_one_pixel_within_its_border(drawn):
     image[0, 2, 2] = 200
     features = AlikedFeatures(Direct(), (5, 5))(image)[0].features
     np.testing.assert_array_equal(features.keypoints, [[2, 2]])
-    found, descriptors = jax.eval_shape(lambda: drawn.extract(image.astype(np.float32), 0.1, 25))
-    assert (found.keypoints.shape, descriptors.shape) == ((1, 25, 2), (1, 25, 64))
+    detections, descriptors = jax.eval_shape(lambda: drawn.extract(image.astype(np.float32), 0.1, 25))
+    assert (detections.keypoints.shape, descriptors.shape) == ((1, 25, 2), (1, 25, 64))
 
 
 def test_the_forecast_grows_with_the_image(drawn):

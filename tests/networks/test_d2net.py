@@ -73,10 +73,10 @@ def assert_same(level, expected, ratio=1.0):
     count = len(expected)
     assert level.count == count
     np.testing.assert_array_equal(level.mask, np.arange(len(level.mask)) < count)
-    points = np.array([(one.x, one.y) for one in expected]).reshape(-1, 2) * ratio
+    points = np.array([(keypoint.x, keypoint.y) for keypoint in expected]).reshape(-1, 2) * ratio
     np.testing.assert_allclose(level.keypoints[:count], points, atol=1e-4)
-    np.testing.assert_allclose(level.scores[:count], [one.score for one in expected], rtol=1e-6)
-    descriptors = np.array([one.descriptor for one in expected]).reshape(count, -1)
+    np.testing.assert_allclose(level.scores[:count], [keypoint.score for keypoint in expected], rtol=1e-6)
+    descriptors = np.array([keypoint.descriptor for keypoint in expected]).reshape(count, -1)
     np.testing.assert_allclose(level.descriptors[:count], descriptors.reshape(count, -1), atol=1e-5)
 
 
@@ -176,15 +176,15 @@ def test_detection_agrees_with_the_oracle_without_relu():
 
 
 def test_maps_of_the_oracle_meet_every_rule():
-    found = refused = at_border = 0
+    keypoints = refused = at_border = 0
     for seed in range(6):
         dense = smooth(seed).astype(np.float64)
-        kept = {(one.row, one.column) for one in oracle.keypoints(dense)}
+        refined = {(keypoint.row, keypoint.column) for keypoint in oracle.keypoints(dense)}
         detected = {(row, column) for _, row, column in oracle.detected(dense)}
-        found += len(kept)
-        refused += len(detected - kept)
-        at_border += sum(row in (0, 11) or column in (0, 9) for row, column in kept)
-    assert found > 60
+        keypoints += len(refined)
+        refused += len(detected - refined)
+        at_border += sum(row in (0, 11) or column in (0, 9) for row, column in refined)
+    assert keypoints > 60
     assert refused > 5
     assert at_border > 5
 
@@ -194,8 +194,8 @@ def test_scales_agree_with_the_oracle():
     expected = oracle.pyramid([dense.astype(np.float64) for dense in maps])
     assert all(expected)
     ratios = ((2.0, 2.0), (1.0, 1.0), (0.5, 0.5))
-    found = detected(*maps, ratios=ratios)
-    for level, ours, (ratio, _) in zip(found, expected, ratios, strict=True):
+    levels = detected(*maps, ratios=ratios)
+    for level, ours, (ratio, _) in zip(levels, expected, ratios, strict=True):
         assert_same(level, ours, ratio)
 
 
@@ -211,7 +211,7 @@ def test_of_channels_that_tie_the_first_is_reported():
     dense = np.zeros((5, 5, 3), np.float32)
     dense[2, 2] = [0, 3, 3]
     twice = oracle.keypoints(dense.astype(np.float64))
-    assert [one.channel for one in twice] == [1, 2]
+    assert [keypoint.channel for keypoint in twice] == [1, 2]
     assert_same(*detected(dense), twice[:1])
 
 
@@ -224,15 +224,15 @@ def test_a_constant_map_has_no_keypoints(value):
 
 def test_what_does_not_fit_is_counted_and_the_strongest_stay():
     dense = smooth(3)
-    everything, few = jax.jit(lambda dense: [select(dense, survey(dense), slots) for slots in (1000, 5)])(dense)
-    assert everything.mask.shape == (120,)
-    count = int(everything.count)
+    all_keypoints, few = jax.jit(lambda dense: [select(dense, survey(dense), slots) for slots in (1000, 5)])(dense)
+    assert all_keypoints.mask.shape == (120,)
+    count = int(all_keypoints.count)
     assert few.count == count > 5
     assert few.mask.all()
-    strongest = np.sort(np.argsort(-everything.scores[:count], stable=True)[:5])
-    np.testing.assert_array_equal(few.scores, everything.scores[strongest])
-    np.testing.assert_array_equal(few.keypoints, everything.keypoints[strongest])
-    np.testing.assert_allclose(few.descriptors, everything.descriptors[strongest], atol=1e-6)
+    strongest = np.sort(np.argsort(-all_keypoints.scores[:count], stable=True)[:5])
+    np.testing.assert_array_equal(few.scores, all_keypoints.scores[strongest])
+    np.testing.assert_array_equal(few.keypoints, all_keypoints.keypoints[strongest])
+    np.testing.assert_allclose(few.descriptors, all_keypoints.descriptors[strongest], atol=1e-6)
 
 
 def test_crowded_images_are_extracted_again(small, images, monkeypatch):
@@ -264,10 +264,10 @@ def test_one_program_per_extractor(images, compilations):
 
 def test_the_highest_scores_are_kept_in_order(small, images):
     limited = D2NetFeatures(small.model, small.image_size, max_keypoints=4)
-    for ours, everything in zip(local(limited(images)), local(small(images)), strict=True):
-        kept = np.sort(np.argsort(-everything.scores, kind="stable")[:4])
-        np.testing.assert_array_equal(ours.scores, everything.scores[kept])
-        np.testing.assert_array_equal(ours.keypoints, everything.keypoints[kept])
+    for ours, unlimited in zip(local(limited(images)), local(small(images)), strict=True):
+        strongest = np.sort(np.argsort(-unlimited.scores, kind="stable")[:4])
+        np.testing.assert_array_equal(ours.scores, unlimited.scores[strongest])
+        np.testing.assert_array_equal(ours.keypoints, unlimited.keypoints[strongest])
 
 
 @pytest.mark.slow

@@ -107,14 +107,14 @@ def test_extractor_gives_the_public_codes_descriptors_and_compiles_once(model, g
     extractor = MixVprDescriptor(model, batch_size=2)
     assert (extractor.image_size, extractor.vector_size, extractor.interpolation) == ((320, 320), 4096, "pil_bicubic")
     compilations.reset()
-    one, three = (vectors(extractor(images()[rows])) for rows in ([0], [0, 1, 0]))
+    single, three = (vectors(extractor(images()[rows])) for rows in ([0], [0, 1, 0]))
     assert compilations.count == 1
     assert three.dtype == np.float32
-    np.testing.assert_array_equal(three[[0, 2]], one[[0, 0]])
+    np.testing.assert_array_equal(three[[0, 2]], single[[0, 0]])
     assert_same_descriptors(three[:2], golden["4096/descriptors"])
     np.testing.assert_allclose(np.linalg.norm(three, axis=1), 1, rtol=1e-6)
     floats = vectors(extractor(images()[:1].astype(np.float32)))
-    assert_same_descriptors(floats, one)
+    assert_same_descriptors(floats, single)
 
 
 @pytest.mark.optimized

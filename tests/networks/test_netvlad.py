@@ -46,14 +46,15 @@ def test_descriptors_and_patches_are_the_public_codes(golden, case):
     clusters, outputs, size, seed = case
     network = filled(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
     sizes = PATCHES.get(outputs, ())
-    whole, patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)(network, network.preprocess(image(size)), sizes)
+    with_patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)
+    descriptors, patches = with_patches(network, network.preprocess(image(size)), sizes)
     key, (width, height) = name("patch", *case), (side // 16 for side in size)
-    assert whole.shape == (1, outputs or clusters * CHANNELS)
-    assert_close(whole[0] if outputs else samples(np.asarray(whole)), golden[f"{key}/global"])
-    for patch, found in zip(sizes, patches, strict=True):
-        assert found.shape == (1, (height - patch + 1) * (width - patch + 1), outputs)
-        assert_close(samples(np.asarray(found[0])), golden[f"{key}/{patch}"])
-        assert_close(np.asarray(found[0], np.float64).mean(axis=0), golden[f"{key}/{patch}/means"])
+    assert descriptors.shape == (1, outputs or clusters * CHANNELS)
+    assert_close(descriptors[0] if outputs else samples(np.asarray(descriptors)), golden[f"{key}/global"])
+    for patch, patch_descriptors in zip(sizes, patches, strict=True):
+        assert patch_descriptors.shape == (1, (height - patch + 1) * (width - patch + 1), outputs)
+        assert_close(samples(np.asarray(patch_descriptors[0])), golden[f"{key}/{patch}"])
+        assert_close(np.asarray(patch_descriptors[0], np.float64).mean(axis=0), golden[f"{key}/{patch}/means"])
 
 
 @pytest.mark.optimized
@@ -62,10 +63,10 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
     clusters, outputs, size, seed = MATLAB
     read = read_checkpoint(write_matlab(tmp_path / "struct.mat", matlab_netvlad(clusters, outputs, seed)))
     network = filled(partial(VggNetVlad, clusters, outputs, original=True), NETVLAD_MATLAB, read)
-    found = GlobalDescriptor(network, size)(image(size))[0].vector
-    assert_close(found, golden[name("matlab", *MATLAB)])
+    vector = GlobalDescriptor(network, size)(image(size))[0].vector
+    assert_close(vector, golden[name("matlab", *MATLAB)])
     floats = GlobalDescriptor(network, size)(image(size).astype(np.float32))[0].vector
-    np.testing.assert_allclose(floats, found, atol=1e-7)
+    np.testing.assert_allclose(floats, vector, atol=1e-7)
 
 
 @pytest.mark.optimized
@@ -87,7 +88,7 @@ def test_layer_and_patches_are_those_of_loops(order):
     with jax.numpy_dtype_promotion("standard"):
         layer = NetVlad(3, order, precision="highest", rngs=nnx.Rngs(0))
     layer.centers[...] = jax.numpy.asarray(rng.normal(size=(3, CHANNELS)) / 20, np.float32)
-    kernel, centers = (np.asarray(one[...], np.float64) for one in (layer.assignment.kernel, layer.centers))
+    kernel, centers = (np.asarray(parameter[...], np.float64) for parameter in (layer.assignment.kernel, layer.centers))
 
     def pooled(vectors):
         sums = np.zeros((3, CHANNELS))
@@ -100,10 +101,10 @@ def test_layer_and_patches_are_those_of_loops(order):
         return flat / np.linalg.norm(flat)
 
     single = jax.numpy.asarray(maps, np.float32)
-    np.testing.assert_allclose(layer(single), [pooled(one) for one in maps], atol=1e-6)
+    np.testing.assert_allclose(layer(single), [pooled(parameter) for parameter in maps], atol=1e-6)
     for size in (1, 2, 4):
-        expected = [[pooled(one[row : row + size, column : column + size])
-                     for row in range(5 - size) for column in range(6 - size)] for one in maps]  # fmt: skip
+        expected = [[pooled(parameter[row : row + size, column : column + size])
+                     for row in range(5 - size) for column in range(6 - size)] for parameter in maps]  # fmt: skip
         np.testing.assert_allclose(layer.patches(single, size), expected, atol=1e-6)
 
 
@@ -137,8 +138,8 @@ def small():
 def test_fewer_components_are_the_first_of_all(small):
     every, first = (GlobalDescriptor(small, (64, 48), components=number) for number in (None, 3))
     assert (every.vector_size, first.vector_size) == (8, 3)
-    whole, part = (extractor(image((64, 48)))[0].vector for extractor in (every, first))
-    np.testing.assert_allclose(part, whole[:3] / np.linalg.norm(whole[:3]), atol=1e-6)
+    all_components, part = (extractor(image((64, 48)))[0].vector for extractor in (every, first))
+    np.testing.assert_allclose(part, all_components[:3] / np.linalg.norm(all_components[:3]), atol=1e-6)
 
 
 @pytest.mark.optimized
@@ -146,7 +147,7 @@ def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(sma
     extractor = GlobalDescriptor(small, (64, 48))
     images = np.concatenate([image((64, 48)), image((64, 48))[:, ::-1]])
     compilations.reset()
-    both = [one.vector for one in extractor(images)]
+    both = [description.vector for description in extractor(images)]
     np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
     assert compilations.count == 1
     assert np.abs(both[0] - both[1]).max() > 1e-3

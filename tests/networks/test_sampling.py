@@ -17,9 +17,9 @@ def dense() -> np.ndarray:
 def test_values_between_pixels_and_outside_agree_with_the_oracle(dense):
     points = np.random.default_rng(1).uniform(-3, 9, (40, 5, 2)).astype(np.float32)
     expected = [oracle.sampled(dense, x, y) for x, y in points.reshape(-1, 2)]
-    found = jax.jit(sample)(dense, points)
-    assert found.shape == (40, 5, 3)
-    np.testing.assert_allclose(found.reshape(-1, 3), expected, atol=1e-5)
+    sampled = jax.jit(sample)(dense, points)
+    assert sampled.shape == (40, 5, 3)
+    np.testing.assert_allclose(sampled.reshape(-1, 3), expected, atol=1e-5)
 
 
 def test_pixels_are_themselves_and_fade_out_beyond_the_border(dense):
@@ -39,11 +39,13 @@ def test_the_finer_grid_has_the_same_corners(dense, factor):
 
 
 def test_a_single_pixel_is_repeated():
-    one = jnp.arange(3.0)[None, None, None]
-    np.testing.assert_array_equal(jax.jit(upsample, static_argnums=1)(one, 32), np.broadcast_to(one, (1, 32, 32, 3)))
+    pixel = jnp.arange(3.0)[None, None, None]
+    finer = jax.jit(upsample, static_argnums=1)(pixel, 32)
+    np.testing.assert_array_equal(finer, np.broadcast_to(pixel, finer.shape))
+    assert finer.shape == (1, 32, 32, 3)
 
 
 def test_a_window_is_cut_from_the_finer_grid():
-    whole, part = neighbors(10, 320), neighbors(10, 320, slice(16, 300))
-    for everything, some in zip(whole, part, strict=True):
-        np.testing.assert_array_equal(everything[16:300], some)
+    line, window = neighbors(10, 320), neighbors(10, 320, slice(16, 300))
+    for of_line, of_window in zip(line, window, strict=True):
+        np.testing.assert_array_equal(of_line[16:300], of_window)

@@ -41,10 +41,10 @@ def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", NETWORKS, ids=map(str, NETWORKS))
 def test_descriptors_are_the_public_codes(golden, case):
-    [found] = SelaVprFeatures(network(*case))(image(SIZE))
-    [local] = found.local
+    [description] = SelaVprFeatures(network(*case))(image(SIZE))
+    [local] = description.local
     key = name("network", *case)
-    assert_close(found.vector, golden[f"{key}/global"])
+    assert_close(description.vector, golden[f"{key}/global"])
     assert local.descriptors.shape == (61 * 61, 128)
     assert_close(samples(local.descriptors), golden[f"{key}/local"])
     assert_close(local.descriptors.astype(np.float64).mean(axis=0), golden[f"{key}/means"])
@@ -53,31 +53,31 @@ def test_descriptors_are_the_public_codes(golden, case):
 @pytest.mark.optimized
 @pytest.mark.parametrize("case", BACKBONES, ids=map(str, BACKBONES))
 def test_tokens_are_the_public_codes(golden, case):
-    """Of any size: positions are resized but for those that were trained; images need not be square."""
+    """Positions are resized unless the size is that of the training; images need not be square."""
     depth, registers, adapted, size, seed = case
     if adapted:
         shapes = selavpr_shapes(WIDTH, depth, registers, prefix="")
-        own = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
-        others = transformer_checkpoint(shapes, seed)
-        checkpoint = others | {f"backbone.{key}": value for key, value in own.items()}
+        backbone = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
+        unadapted = transformer_checkpoint(shapes, seed)
+        checkpoint = unadapted | {f"backbone.{key}": value for key, value in backbone.items()}
         transformer = filled(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
     else:
         build = partial(VisionTransformer, WIDTH, depth, 4, registers=registers)
         checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
         transformer = filled(build, DINOV2, checkpoint)
-    whole, found = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
+    class_token, tokens = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
     key = name("backbone", *case[:3], *size, seed)
-    assert found.shape == (1, size[1] // 14, size[0] // 14, WIDTH)
-    assert_close(whole[0], golden[f"{key}/whole"])
-    assert_close(samples(np.asarray(found)), golden[f"{key}/maps"])
+    assert tokens.shape == (1, size[1] // 14, size[0] // 14, WIDTH)
+    assert_close(class_token[0], golden[f"{key}/whole"])
+    assert_close(samples(np.asarray(tokens)), golden[f"{key}/maps"])
 
 
 @pytest.mark.optimized
 @pytest.mark.parametrize("case", MATCHES, ids=map(str, MATCHES))
 def test_scores_are_the_public_codes(golden, case):
     """Numbers of mutual matches, equal as integers; a single match counts nothing there."""
-    matches = mfvpr.match_candidates(*(as_features(one) for one in maps(*case)))
-    published, counted = (mfvpr.score_candidates(mfvpr.MatchCount(one), matches) for one in ("zero", "count"))
+    matches = mfvpr.match_candidates(*(as_features(local_map) for local_map in maps(*case)))
+    published, counted = (mfvpr.score_candidates(mfvpr.MatchCount(single), matches) for single in ("zero", "count"))
     np.testing.assert_array_equal(published, golden[name("scores", *case)])
     np.testing.assert_array_equal(np.where(counted == 1, 0, counted), published)
     assert (counted >= 1).all()  # the nearest pair of all is mutual
@@ -131,9 +131,9 @@ def test_without_adapters_an_adapted_block_is_a_plain_one():
 
 @pytest.mark.parametrize("prefix", ["", "module."])
 def test_keys_of_a_training_on_several_devices_are_the_same(prefix):
-    found = network(width=64, prefix=prefix)
+    model = network(width=64, prefix=prefix)
     expected = transformer_checkpoint(selavpr_shapes(64, 1, prefix=prefix))[f"{prefix}LocalAdapt.upconv2.weight"]
-    np.testing.assert_array_equal(found.upsampling2.kernel[1, 2], expected[:, :, 1, 2])
+    np.testing.assert_array_equal(model.upsampling2.kernel[1, 2], expected[:, :, 1, 2])
 
 
 def test_features_lie_between_the_middles_of_patches():
@@ -177,12 +177,12 @@ def test_tokens_are_descriptors_of_images():
     shapes = dinov2_shapes(64, 2)
     transformer = filled(partial(VisionTransformer, 64, 2, 4), DINOV2, transformer_checkpoint(shapes))
     size = (42, 28)
-    whole, found = transformer(transformer.preprocess(image(size)))
-    tokens = np.asarray(found[0], np.float64).reshape(-1, 64)
+    class_token, token_maps = transformer(transformer.preprocess(image(size)))
+    tokens = np.asarray(token_maps[0], np.float64).reshape(-1, 64)
     tokens /= np.linalg.norm(tokens, axis=1, keepdims=True)
     means = {power: np.mean(np.maximum(tokens, 1e-6) ** power, axis=0) ** (1 / power) for power in (1.0, 3.0)}
     recipes = set()
-    for pooling, power, expected in (("cls", 3.0, whole[0]), ("gem", 3.0, means[3.0]), ("gem", 1.0, means[1.0])):
+    for pooling, power, expected in (("cls", 3.0, class_token[0]), ("gem", 3.0, means[3.0]), ("gem", 1.0, means[1.0])):
         extractor = GlobalDescriptor(TokenDescriptor(transformer, pooling, power), size)
         np.testing.assert_allclose(extractor(image(size))[0].vector, expected / np.linalg.norm(expected), atol=1e-6)
         recipes.add(fingerprint(recipe_of(extractor)))
@@ -195,7 +195,7 @@ def test_tokens_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(com
     extractor = SelaVprFeatures(network(width=64), size)
     images = np.concatenate([image(size), image(size)[:, ::-1]])
     compilations.reset()
-    both = [one.vector for one in extractor(images)]
+    both = [description.vector for description in extractor(images)]
     np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
     assert compilations.count == 1
     assert np.abs(both[0] - both[1]).max() > 1e-3

@@ -1,4 +1,4 @@
-"""What belongs to which folder of images, and what is missing, of files of other programs."""
+"""Files of other programs: which entry belongs to which folder of images, and what is missing."""
 
 from types import SimpleNamespace
 
@@ -43,15 +43,15 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     same = folder(tmp_path)
     data = Dataset("same", same, (QuerySequence("same", same, None),))
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
-    for group, made, own in (("features", build.extractor, {"image_size": None}),
+    for group, build_stage, defaults in (("features", build.extractor, {"image_size": None}),
                              ("retrieval", lambda *options: build.filter(*options[:1], SimpleNamespace(), data),
                               {"whiten": None})):  # fmt: skip
-        settings = {"name": "import"} | common | own | change
+        settings = {"name": "import"} | common | defaults | change
         if not refused:
-            assert made(settings, data).files == {tmp_path: File(build.expand_user("a.h5"))}
+            assert build_stage(settings, data).files == {tmp_path: File(build.expand_user("a.h5"))}
             continue
         with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
-            made(settings, data)
+            build_stage(settings, data)
 
 
 def written(root, names, file):

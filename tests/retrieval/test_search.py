@@ -59,9 +59,9 @@ def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_
     together = retrieve(queries, database, num_candidates=9)
     np.testing.assert_array_equal(retrieve(queries[4:], database, num_candidates=9).scores, together.scores[4:])
     for memory in (None, 1e-9, 1e-9 * 8 * 4 * num_database):  # parts of 5; of 2, 2 and 1; of 3 and 2
-        found = ExactSearch(memory).shortlist(queries, database, 9)
-        np.testing.assert_array_equal(found.indices, together.indices)
-        np.testing.assert_array_equal(found.scores, together.scores)
+        shortlist = ExactSearch(memory).shortlist(queries, database, 9)
+        np.testing.assert_array_equal(shortlist.indices, together.indices)
+        np.testing.assert_array_equal(shortlist.scores, together.scores)
 
 
 @pytest.mark.optimized
@@ -133,10 +133,10 @@ ORDERS = hnp.arrays(np.int64, (7, 4), elements=st.integers(-1, 5))
 
 @given(ORDERS, hnp.arrays(bool, (7, 6)), st.integers(0, 7), st.randoms())
 def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
-    """Of whatever parts, in whatever order, to the last bit."""
+    """To the last bit, for any parts in any order."""
     ks, rows = [1, 2, 9], list(range(7))
     rng.shuffle(rows)
-    parts = [Tally.of(order[some], positives[some], ks) for some in (rows[:cut], rows[cut:])]
+    parts = [Tally.of(order[part_rows], positives[part_rows], ks) for part_rows in (rows[:cut], rows[cut:])]
     merged = parts[1].merged(parts[0])
     np.testing.assert_array_equal(merged.recall, recall_at_k(order, positives, ks))
     assert merged.queries == 7
@@ -150,6 +150,6 @@ def test_a_search_needs_both_sides(queries, database):
 
 
 def test_what_is_excluded_is_of_these_queries():
-    some = np.eye(3, dtype=np.float32)
+    descriptors = np.eye(3, dtype=np.float32)
     with pytest.raises(InputError, match=r"3 queries .*3 database images, got 2 and 3"):
-        EXACT.shortlist(some, some, 2, excluded=Positives.from_rows([[0], [1]], 3))
+        EXACT.shortlist(descriptors, descriptors, 2, excluded=Positives.from_rows([[0], [1]], 3))

@@ -19,7 +19,7 @@ def by_loops(queries, database, num_candidates, excluded=()):
         votes = dict.fromkeys(usable, 0)
         for window in query if np.isfinite(query).all() else ():
             distances = [(math.dist(window, other), row) for row in usable for other in database[row]]
-            for _, row in sorted(distances, key=lambda one: one[0])[:num_candidates]:
+            for _, row in sorted(distances, key=lambda pair: pair[0])[:num_candidates]:
                 votes[row] += 1
         order = sorted(usable, key=lambda row: (-votes[row], row)) if np.isfinite(query).all() else []
         listed.append([(row, votes[row]) for row in order[:num_candidates]])
@@ -28,9 +28,9 @@ def by_loops(queries, database, num_candidates, excluded=()):
 
 def assert_lists(shortlist, expected, num_candidates):
     assert shortlist.indices.shape == (len(expected), num_candidates)
-    for indices, scores, mask, own in zip(shortlist.indices, shortlist.scores, shortlist.mask, expected, strict=True):
-        assert list(zip(indices[mask].tolist(), scores[mask].tolist(), strict=True)) == own
-        assert mask.sum() == len(own)
+    for indices, scores, mask, pairs in zip(shortlist.indices, shortlist.scores, shortlist.mask, expected, strict=True):
+        assert list(zip(indices[mask].tolist(), scores[mask].tolist(), strict=True)) == pairs
+        assert mask.sum() == len(pairs)
         assert (indices[~mask] == -1).all()
         assert (scores[~mask] == 0).all()
 
