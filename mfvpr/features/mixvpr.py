@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Num
 
@@ -48,7 +47,4 @@ class MixVprDescriptor:
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        def describe(model: MixVPR, images: jax.Array) -> jax.Array:
-            return model(preprocess(images))
-
-        return compile_network(self.model, describe)
+        return compile_network(self.model, lambda model, images: model(preprocess(images)))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, Num
 
@@ -60,7 +59,6 @@ class PatchNetVladFeatures:
 
     @property
     def vector_size(self) -> int:
-        """Length of the global descriptor."""
         return self.model.dimension
 
     @property
@@ -90,10 +88,8 @@ class PatchNetVladFeatures:
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        def describe(model: VggNetVlad, images: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-            return model.with_patches(model.preprocess(images), self.patch_sizes)
-
-        return compile_network(self.model, describe)
+        sizes = self.patch_sizes
+        return compile_network(self.model, lambda model, images: model.with_patches(model.preprocess(images), sizes))
 
     def _features(self, size: int, descriptors: Float[np.ndarray, "keypoints dimensions"]) -> Features:
         columns, rows = (side - size + 1 for side in self._map_size)

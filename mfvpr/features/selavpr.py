@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, Num
 
@@ -48,7 +47,6 @@ class SelaVprFeatures:
 
     @property
     def vector_size(self) -> int:
-        """Length of the global descriptor."""
         return self.model.dimension
 
     @property
@@ -74,10 +72,7 @@ class SelaVprFeatures:
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        def describe(model: SelaVpr, images: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return model(model.preprocess(images))
-
-        return compile_network(self.model, describe)
+        return compile_network(self.model, lambda model, images: model(model.preprocess(images)))
 
     def _features(self, local: Float[np.ndarray, "rows columns dimensions"]) -> Features:
         row, column = np.indices(local.shape[:2]).reshape(2, -1)

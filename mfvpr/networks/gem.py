@@ -1,12 +1,13 @@
 """Generalized mean pooling (Radenovic et al., TPAMI 2019) on VGG16 or ResNet-50, as in CosPlace (CVPR 2022)."""
 
+from functools import partial
 from typing import Literal
 
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
-from mfvpr.networks.imagenet import Images, Pixels, preprocess
+from mfvpr.networks.imagenet import Images, preprocess
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
@@ -51,11 +52,7 @@ class Gem(nnx.Module):
         self.has_components = False
 
     require = staticmethod(require_position)
-
-    @staticmethod
-    def preprocess(images: Pixels) -> Images:
-        """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
-        return preprocess(images, "torch")
+    preprocess = staticmethod(partial(preprocess, preprocessing="torch"))
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""

@@ -105,8 +105,8 @@ def _compute_once(x: Array) -> Array:
     MixVPR's time. It removes `optimization_barrier` before this step, but keeps a condition, here one that is true for
     every number and for NaN. The compilers of other platforms do not need it.
     """
-    return lax.platform_dependent(x, cpu=_behind_condition, default=lambda x: x)
 
+    def behind_condition(x: Array) -> Array:
+        return lax.cond(x[(0,) * x.ndim] * 0 != 1, lambda x: x, jnp.negative, x)
 
-def _behind_condition(x: Array) -> Array:
-    return lax.cond(x[(0,) * x.ndim] * 0 != 1, lambda x: x, jnp.negative, x)
+    return lax.platform_dependent(x, cpu=behind_condition, default=lambda x: x)

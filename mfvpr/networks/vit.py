@@ -1,5 +1,6 @@
 """Vision transformers (Dosovitskiy et al., ICLR 2021) as in DINOv2 (Oquab et al., TMLR 2024)."""
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -9,7 +10,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.imagenet import Images, Pixels, preprocess
+from mfvpr.networks.imagenet import Images, preprocess
 from mfvpr.networks.lengths import of_unit_length
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
@@ -130,10 +131,7 @@ class VisionTransformer(nnx.Module):
         self.width = width
         self.precision = precision
 
-    @staticmethod
-    def preprocess(images: Pixels) -> Images:
-        """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
-        return preprocess(images, "torch")
+    preprocess = staticmethod(partial(preprocess, preprocessing="torch"))
 
     def __call__(self, images: Images) -> Tokens:
         """Normalized tokens of preprocessed images."""
@@ -159,6 +157,12 @@ class VisionTransformer(nnx.Module):
         return grid.reshape(rows * columns, -1)
 
 
+def require_patches(size: tuple[int, int]) -> None:
+    """Raise an InputError unless width and height (px) are multiples of a patch's side."""
+    if any(side < PATCH or side % PATCH for side in size):
+        raise InputError(f"image_size={list(size)}: expected multiples of {PATCH}, the side of a patch in px")
+
+
 class TokenDescriptor(nnx.Module):
     """Global descriptor of a transformer's tokens.
 
@@ -176,22 +180,12 @@ class TokenDescriptor(nnx.Module):
         self.has_components = False
 
     preprocess = staticmethod(VisionTransformer.preprocess)
-
-    @staticmethod
-    def require(size: tuple[int, int]) -> None:
-        """Raise an InputError unless width and height (px) are multiples of a patch's side."""
-        require_patches(size)
+    require = staticmethod(require_patches)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""
         class_token, maps = self.network(images)
         return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
-
-
-def require_patches(size: tuple[int, int]) -> None:
-    """Raise an InputError unless width and height (px) are multiples of a patch's side."""
-    if any(side < PATCH or side % PATCH for side in size):
-        raise InputError(f"image_size={list(size)}: expected multiples of {PATCH}, the side of a patch in px")
 
 
 def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
