@@ -61,10 +61,7 @@ class Vgg16(nnx.Module):
         return last
 
     def maps(
-        self,
-        images: Images,
-        layers: Sequence[str],
-        uniform: bool | Bool[Array, ""] = False,
+        self, images: Images, layers: Sequence[str], uniform: bool | Bool[Array, ""] = False
     ) -> tuple[Float[Array, "batch _ _ _"], ...]:
         """Outputs of these layers before their ReLU; later layers do not run."""
         outputs = {}

@@ -87,15 +87,14 @@ def test_aliked_recognizes_the_street(evaluate, small_street, tmp_path, name, de
 
 
 @pytest.mark.skipif(not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's do not ship")
-def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, small_street, tmp_path, monkeypatch):
+def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, street_settings, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
-    folders = [f"dataset.{side}={small_street}/{side}" for side in ("database", "queries")]
-    places = ("dataset=folder", *folders, "dataset.ground_truth=order", "candidates=3", "figures=0")
+    settings = (*street_settings, "candidates=3", "figures=0")
     features = ("features=aliked", "features.image_size=[160,160]", "retrieval.num_words=8")
     messages, seen = [], {}
     for name in ("neighbors", "lightglue", "lightglue"):
         out = tmp_path / f"out{len(seen)}"
-        messages.append(evaluate(*places, *features, f"matching={name}", f"out={out}"))
+        messages.append(evaluate(*settings, *features, f"matching={name}", f"out={out}"))
         seen[name] = json.loads((out / "results.json").read_text())
     assert "10 of 10 queries to match" in messages[1]
     assert "matches: all 10 queries from" in messages[2]
@@ -146,21 +145,15 @@ def test_mistakes_are_one_line(arguments, words, refused, tmp_path):
     assert words.replace("NOWHERE", str(tmp_path / "none")) in refused(tmp_path / "none", *arguments, *places)
 
 
-def test_a_store_that_is_a_file_is_refused(refused, small_street, weights):
-    places = (f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries")
-    error = refused(
-        weights, "dataset=folder", *places, "dataset.ground_truth=order", "candidates=10", f"store={ROOT}/README.md"
-    )
+def test_a_store_that_is_a_file_is_refused(refused, street_settings, weights):
+    error = refused(weights, *street_settings, "candidates=10", f"store={ROOT}/README.md")
     assert error.startswith("error: ")
     assert "README.md" in error
 
 
 @pytest.mark.skipif(not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's do not ship")
-def test_features_that_lightglue_was_not_trained_for_are_refused(refused, small_street, weights):
-    places = (f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries")
-    error = refused(
-        weights, "dataset=folder", *places, "dataset.ground_truth=order", "candidates=10", "matching=lightglue"
-    )
+def test_features_that_lightglue_was_not_trained_for_are_refused(refused, street_settings, weights):
+    error = refused(weights, *street_settings, "candidates=10", "matching=lightglue")
     assert "got Sift of 128; " in error
 
 
@@ -174,12 +167,11 @@ def test_sizes_that_networks_cannot_take_are_refused_with_those_they_can(refused
     ("gem", ("retrieval.weights=cosplace_vgg16_512",)),
 ])  # fmt: skip
 def test_global_descriptors_of_networks_are_filters(
-    evaluate, weights, small_street, tmp_path, monkeypatch, name, options
+    evaluate, weights, small_street, street_settings, tmp_path, monkeypatch, name, options
 ):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
-    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
-    stderr = evaluate("dataset=folder", *folders, "dataset.ground_truth=order", f"retrieval={name}", *options,
-                    "retrieval.image_size=[96,64]", "candidates=3", "figures=0", f"out={tmp_path}/out")  # fmt: skip
+    stderr = evaluate(*street_settings, f"retrieval={name}", *options, "retrieval.image_size=[96,64]", "candidates=3",
+                      "figures=0", f"out={tmp_path}/out")  # fmt: skip
     assert "note: R@5 and R@10 are R@3, of the filter too" in stderr
     stores = {path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*")}
     assert "GlobalDescriptor" in stores
@@ -196,15 +188,12 @@ def test_global_descriptors_of_networks_are_filters(
 
 @pytest.mark.parametrize(("options", "words"), [
     (("retrieval=netvlad", "retrieval.weights=mixvpr_512"), "=mixvpr_512: expected weights of netvlad: one of"),
-    (("retrieval=gem", "retrieval.components=5"), "retrieval.components"),
-    (("retrieval=netvlad", "retrieval.components=200"), "components=200: expected from 1 to 128"),
+    (("retrieval=gem", "retrieval.weights=cosplace_vgg16_512", "retrieval.components=5"), "retrieval.components"),
+    (("retrieval=netvlad", "retrieval.weights=patchnetvlad_mapillary_128", "retrieval.components=200"),
+     "components=200: expected from 1 to 128"),
 ])  # fmt: skip
-def test_mistakes_with_them_are_one_line(weights, monkeypatch, capsys, small_street, tmp_path, options, words):
+def test_mistakes_with_them_are_one_line(weights, monkeypatch, capsys, street_settings, tmp_path, options, words):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
-    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
-    default_weights = ("retrieval.weights=patchnetvlad_mapillary_128",) if "weights" not in " ".join(options) else ()
-    default_weights = ("retrieval.weights=cosplace_vgg16_512",) if "retrieval=gem" in options else default_weights
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
-                            options[0], *default_weights, *options[1:], f"out={tmp_path}/out")  # fmt: skip
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *street_settings, *options, f"out={tmp_path}/out")
     assert code == 2
     assert words in stderr.splitlines()[-1]

@@ -172,14 +172,13 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
 
 
 @pytest.fixture
-def program(weights, small_street, tmp_path, monkeypatch, capsys):
+def program(weights, street_settings, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
-    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
     small = ("features.weights=patchnetvlad_mapillary_128", "features.image_size=[160,128]", "candidates=5")
 
     def run(kind, *more, last=()):
         out = tmp_path / str(len([*tmp_path.iterdir()]))
-        options = ("dataset=folder", *folders, "dataset.ground_truth=order", *more, *small, f"out={out}", *last)
+        options = (*street_settings, *more, *small, f"out={out}", *last)
         code, stdout, stderr = typed(monkeypatch, capsys, kind, *options)
         return out, code, stdout, stderr
 
@@ -244,9 +243,7 @@ def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
     assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr
 
 
-def test_other_features_have_no_global_descriptor(small_street, tmp_path, monkeypatch, capsys):
-    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", "dataset=folder", *folders, "dataset.ground_truth=order",
-                            "retrieval=same", f"out={tmp_path}/out")  # fmt: skip
+def test_other_features_have_no_global_descriptor(street_settings, tmp_path, monkeypatch, capsys):
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *street_settings, "retrieval=same", f"out={tmp_path}/out")
     assert code == 2
     assert "retrieval=same: expected features with a global descriptor" in stderr

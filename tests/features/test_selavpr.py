@@ -26,7 +26,7 @@ def training(tensors):
 
 
 @pytest.fixture
-def program(small_street, tmp_path, monkeypatch, capsys):
+def program(street_settings, tmp_path, monkeypatch, capsys):
     """A command line, with small networks under the published names, none of which is installed yet."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
@@ -35,7 +35,6 @@ def program(small_street, tmp_path, monkeypatch, capsys):
         monkeypatch.setitem(networks.NETWORKS, name, networks.Network(lambda build=build: build, SELAVPR))
     build = partial(VisionTransformer, 64, 1, 1)
     monkeypatch.setitem(networks.NETWORKS, "dinov2_vits14", networks.Network(lambda: build, DINOV2))
-    folders = f"dataset.database={small_street}/database", f"dataset.queries={small_street}/queries"
 
     def converted(*arguments):
         monkeypatch.setattr(sys, "argv", ["weights", *map(str, arguments)])
@@ -51,7 +50,7 @@ def program(small_street, tmp_path, monkeypatch, capsys):
     def run(kind, *more):
         if kind == "weights":
             return converted(*more)
-        options = ("dataset=folder", *folders, "dataset.ground_truth=order", f"out={tmp_path}/out", *more)
+        options = (*street_settings, f"out={tmp_path}/out", *more)
         return typed(monkeypatch, capsys, kind, *options)
 
     return run

@@ -51,9 +51,8 @@ def main(clone: str, weights: str) -> None:
     golden = {}
     for seed in SEEDS:
         for counts in SIZES:
-            golden[f"random/{seed}/{counts}"] = _computed(clone, checkpoint(seed), pair(counts, SMALL["inputs"], seed))[
-                0
-            ]
+            features = pair(counts, SMALL["inputs"], seed)
+            golden[f"random/{seed}/{counts}"], _ = _computed(clone, checkpoint(seed), features)
     for sure in SURE:
         features = pair(SIZES[0], SMALL["inputs"], 0)
         golden[f"sure/{sure}"], stop = _computed(clone, checkpoint(0, sure), features, depth_confidence=DEPTH)

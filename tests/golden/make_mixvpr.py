@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.golden.make_netvlad import samples
 from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "mixvpr.npz"
 SIZES = ((1024, 4), (256, 2), (64, 2))  # channels and rows of the published networks
-SAMPLES = 1000
 
 
 def images() -> np.ndarray:
@@ -30,11 +30,6 @@ def faint_maps() -> np.ndarray:
     """`[1, 20, 20, 1024]` float32: maps of so little contrast that the epsilon of a normalization shows."""
     row, column, channel = np.indices((20, 20, 1024))
     return ((row * (channel % 13 + 1) + column * (channel % 7 + 2)) % 17).astype(np.float32)[None] / 8192
-
-
-def samples(values: np.ndarray) -> np.ndarray:
-    """Values at `SAMPLES` places."""
-    return values.reshape(-1)[np.random.default_rng(0).choice(values.size, SAMPLES, replace=False)]
 
 
 def main(clone: str) -> None:

@@ -15,13 +15,13 @@ from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.validation import check_matching
 from mfvpr.features import FeatureSet, Scale, Sift
-from mfvpr.features.feature_set import stack_features
 from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.storage.matches import open_match_store
 from mfvpr.types import per_keypoint, per_match
 from mfvpr.utils import ragged, recipe_of
 from tests.golden.make_lightglue import SIZES, SMALL, checkpoint, pair
+from tests.networks.test_lightglue import padded
 
 pytestmark = pytest.mark.thorough
 
@@ -42,14 +42,6 @@ def matcher(sure=None, **options):
 
 
 matched = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
-
-
-def slots(features, capacity, garbage=np.nan):
-    """The same image with more slots, whose padding holds garbage."""
-    image = jax.tree.map(lambda leaf: leaf[0].copy(), stack_features([features], capacity))
-    for values in (image.keypoints, image.descriptors, image.scores):
-        values[len(features.mask) :] = garbage
-    return image
 
 
 def empty(features):
@@ -103,12 +95,12 @@ def test_a_pair_depends_neither_on_its_batch_nor_on_its_padding(chunk_size):
     numbers = np.array([(0, 1), (2, 3), (4, 5), (0, 3), (2, 1), (4, 1), (0, 5)], np.int32)
     sure = matcher(0, depth_confidence=0.95, chunk_size=chunk_size)
     for capacity, garbage in ((31, np.nan), (64, np.inf)):
-        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(slots(image, capacity, garbage) for image in images))
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded(image, capacity, garbage) for image in images))
         matches = mfvpr.match_pairs(batch, batch, numbers, 6, sure)
         assert matches.mask.sum() > 10
         assert not matches.mask[6].any()
         for place, (query, candidate) in enumerate(numbers[:6]):
-            alone = rows(matched(sure, slots(images[query], 40, -1e9), slots(images[candidate], 40, 0)))
+            alone = rows(matched(sure, padded(images[query], 40, -1e9), padded(images[candidate], 40, 0)))
             image = jax.tree.map(lambda leaf, place=place: np.asarray(leaf)[place], matches)
             assert_same_rows(rows(image), alone)
             assert (image.count0, image.count1) == (len(images[query].mask), len(images[candidate].mask))
@@ -148,7 +140,7 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
         assert not match_set.counts[2:].any()
         for query, place in np.ndindex(2, 2):
             row = shortlist().indices[query, place]
-            alone = rows(matched(matcher(), slots(queries[query], 32), slots(database[row], 32)))
+            alone = rows(matched(matcher(), padded(queries[query], 32), padded(database[row], 32)))
             in_set = ragged.split(per_match(match_set.matches[query]), match_set.counts[query])[place]
             assert_same_rows(in_set, alone)
         sure = replace(match_set, matches=[replace(matches, confidence=None) for matches in match_set.matches])

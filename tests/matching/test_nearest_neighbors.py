@@ -20,7 +20,7 @@ pytestmark = pytest.mark.thorough
 MODES = ["mutual", "opencv_legacy", "none", "candidate"]
 # Compiled as a whole, not operation by operation: seconds, where every test has its own shapes.
 match_once = jax.jit(match, static_argnames=("cross_check", "with_ratio"))
-match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "chunk_size"))
+match_candidates_once = jax.jit(match_candidates, static_argnames=("cross_check", "with_ratio", "chunk_size"))
 match_pairs_once = jax.jit(match_pairs)
 PAIRS = np.array([(0, 1), (0, 0)], np.int32)
 compact_once = jax.jit(compact, static_argnames="capacity")
@@ -82,11 +82,12 @@ def test_every_chunk_size_gives_the_loop(chunk_size):
     query = make_features(rng, 20, capacity=24)
     candidates = [make_features(rng, count, capacity=30) for count in (30, 0, 7, 1, 22)]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
-    got = match_candidates_once(query, batch, chunk_size=chunk_size)
+    got = match_candidates_once(query, batch, with_ratio=True, chunk_size=chunk_size)
     for row, candidate in enumerate(candidates):
-        alone = match_once(query, candidate)
+        alone = match_once(query, candidate, with_ratio=True)
         np.testing.assert_array_equal(got.mask[row], alone.mask)
         np.testing.assert_allclose(got.distance[row], alone.distance, atol=1e-6)
+        np.testing.assert_allclose(got.ratio[row], alone.ratio, rtol=1e-6)
         np.testing.assert_array_equal(got.points1[row][alone.mask], np.asarray(alone.points1)[alone.mask])
 
 
@@ -146,26 +147,16 @@ def test_compact_moves_real_matches_to_the_front_in_order():
 @pytest.mark.parametrize("counts", [(0, 0), (0, 5), (5, 0)])
 def test_images_without_a_single_slot(mode, counts):
     features0, features1 = (make_features(np.random.default_rng(6), count) for count in counts)
-    batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), features1)
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 5), features1)
     for matches in (
         match_once(features0, features1, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode),
+        match_candidates_once(features0, batch, cross_check=mode, chunk_size=2),
         match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, Matching(mode)),
     ):
         assert matches.mask.shape[-1] == counts[mode == "candidate"]
         assert not matches.mask.any()
     assert compact_once(match_once(features0, features1), 4).mask.shape == (4,)
-
-
-@pytest.mark.parametrize("counts", [(0, 3), (3, 0), (0, 0)])
-@pytest.mark.parametrize("mode", ["mutual", "candidate"])
-def test_chunks_of_images_without_a_single_slot(mode, counts):
-    rng = np.random.default_rng(15)
-    query = make_features(rng, counts[0])
-    candidates = jax.tree.map(lambda *fields: np.stack(fields), *[make_features(rng, counts[1]) for _ in range(5)])
-    matches = match_candidates(query, candidates, cross_check=mode, chunk_size=2)
-    assert matches.mask.shape == (5, counts[mode == "candidate"])
-    assert not matches.mask.any()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -242,8 +233,6 @@ def test_options_without_meaning_are_refused():
     features = make_features(np.random.default_rng(9), 3)
     with pytest.raises(ValueError, match="expected one of mutual"):
         match(features, features, cross_check="mutal")
-    with pytest.raises(ValueError, match="chunk_size=0"):
-        match_candidates(features, jax.tree.map(lambda leaf: leaf[None], features), chunk_size=0)
 
 
 @pytest.mark.optimized

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import match, match_candidates, soft_match
+from mfvpr import match, soft_match
 from tests import soft_oracles
 from tests.builders import double, make_features
 
@@ -147,16 +147,6 @@ def test_ratios_agree_with_the_loop(pair, mode):
     expected = soft_oracles.ratios(features0.descriptors[rows0], features1.descriptors[usable(features1)])
     np.testing.assert_allclose(got.ratio[rows0], expected, atol=1e-5)
     assert ((got.ratio >= 0) & (got.ratio <= 1)).all()
-
-
-def test_ratios_of_all_candidates_are_those_of_each():
-    rng = np.random.default_rng(7)
-    query = make_features(rng, 10, capacity=12)
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(make_features(rng, n, capacity=9) for n in (9, 1, 0)))
-    got = jax.jit(partial(match_candidates, with_ratio=True))(query, batch)
-    for row in range(3):
-        alone = with_ratio(query, jax.tree.map(lambda leaf, row=row: leaf[row], batch))
-        np.testing.assert_allclose(got.ratio[row], alone.ratio, rtol=1e-6)
 
 
 def test_an_exact_copy_has_ratio_zero_and_two_copies_have_one():

@@ -149,13 +149,9 @@ def test_what_is_not_finite_is_no_keypoint_and_of_none_nothing_is_said():
 
 @pytest.mark.optimized
 @pytest.mark.skipif(not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: weights do not ship")
-def test_published_weights_assign_as_the_public_code(golden):
-    entry = entry_of("aliked_lightglue")
-    plan = blueprint(entry)
-    tensors = read_checkpoint(random_checkpoints.LIGHTGLUE)
-    weights = jax.jit(LightGlue.packed)(plan.filled(convert(tensors, LIGHTGLUE, plan.shapes)))
+def test_published_weights_assign_as_the_public_code(golden, matcher):
     for counts in REAL:
-        assignments = assigned(weights, *(padded(image, 72) for image in pair(counts, 128, 0)))
+        assignments = assigned(matcher.weights, *(padded(image, 72) for image in pair(counts, 128, 0)))
         expected = golden[f"real/{counts}"]
         assert (np.exp(expected) > 0.9).sum() >= 10
         np.testing.assert_allclose(np.exp(assignments[: counts[0], : counts[1]]), np.exp(expected), rtol=0, atol=2e-5)

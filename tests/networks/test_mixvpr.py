@@ -16,12 +16,13 @@ from mfvpr.features import MixVprDescriptor
 from mfvpr.networks import MixVPR, ResNet50
 from mfvpr.networks.mixvpr import preprocess
 from mfvpr.utils import InputError
-from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images, samples
+from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images
+from tests.golden.make_netvlad import samples
+from tests.networks.test_netvlad import RELATIVE, assert_close
 from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
 
-RELATIVE = 1e-5
 PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}
 
 
@@ -58,24 +59,17 @@ def computed(model):
     return SimpleNamespace(**stages(model, images()))
 
 
-def assert_close(actual, expected):
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
-
-
 def assert_same_descriptors(actual, expected):
     assert actual.shape == expected.shape
     assert np.linalg.norm(actual - expected, axis=1).max() < RELATIVE
 
 
 @pytest.mark.optimized
-def test_backbone_is_the_public_codes(computed, golden):
+def test_backbone_and_mixers_are_the_public_codes(computed, golden):
     assert computed.maps.shape == (2, 20, 20, 1024)
     assert_close(samples(np.asarray(computed.maps)), golden["backbone"])
     assert_close(computed.maps.mean((1, 2)), golden["backbone/means"])
 
-
-@pytest.mark.optimized
-def test_each_mixer_is_the_public_codes(computed, golden):
     for place, mixed in enumerate(computed.mixers):
         assert_close(samples(np.asarray(mixed)), golden[f"mixer{place}"])
 
@@ -141,10 +135,8 @@ def test_no_images_give_no_descriptors(model):
     assert MixVprDescriptor(model)(np.zeros((0, 320, 320, 3), np.uint8)) == []
 
 
-@pytest.mark.parametrize("channels, rows", SIZES)
-def test_parameter_counts(channels, rows):
-    width = channels * rows
-    assert blueprint(entry_of(f"mixvpr_{width}")).parameters == PARAMETERS[width]
+def test_parameter_counts():
+    assert {width: blueprint(entry_of(f"mixvpr_{width}")).parameters for width in PARAMETERS} == PARAMETERS
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """SSM-VPR's two maps against the public code's numbers (tests/golden), and what the network promises."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -34,19 +34,9 @@ def published(seed):
     return network.filled(convert(checkpoint(seed), SSM, network.shapes))
 
 
-@jax.jit
-def stage1(model, images):
-    return model.stage1(model.preprocess(images))
-
-
-@jax.jit
-def stage2(model, images):
-    return model.stage2(model.preprocess(images))
-
-
-@jax.jit
-def both(model, images):
-    return model(model.preprocess(images))
+@partial(jax.jit, static_argnums=0)
+def run(function, model, images):
+    return function(model, model.preprocess(images))
 
 
 def assert_same_map(dense, name, golden):
@@ -58,7 +48,7 @@ def assert_same_map(dense, name, golden):
 @pytest.mark.optimized
 @pytest.mark.parametrize("case", [case for case in CASES if case.width == 224], ids=str)
 def test_one_pass_gives_both_maps_of_the_public_code(case, golden):
-    (first,), (second,) = both(published(case.seed), case.image[None])
+    (first,), (second,) = run(SsmVgg.__call__, published(case.seed), case.image[None])
     assert_same_map(first, f"{case}/stage1", golden)
     assert_same_map(second, f"{case}/stage2", golden)
 
@@ -70,7 +60,7 @@ def test_each_map_alone_is_the_public_codes(case, golden):
     """The last of images that do not see each other."""
     images = np.stack([case.image[::-1], case.image]) if 1 in case.stages else case.image[None]
     for stage in case.stages:
-        *_, dense = {1: stage1, 2: stage2}[stage](published(case.seed), images)
+        *_, dense = run({1: SsmVgg.stage1, 2: SsmVgg.stage2}[stage], published(case.seed), images)
         assert_same_map(dense, f"{case}/stage{stage}", golden)
 
 

@@ -37,10 +37,15 @@ def test_convolutions_agree_with_their_definition(height, width, dilation, chann
     np.testing.assert_allclose(fast, expected, atol=tolerance)
 
 
+def untrained(last):
+    """The network without values."""
+    with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
+        return nnx.eval_shape(lambda: Vgg16(last, rngs=nnx.Rngs(0)))
+
+
 @pytest.mark.parametrize("last, shape", [("conv1_1", (37, 50, 64)), ("conv4_2", (4, 6, 512)), ("conv5_3", (2, 3, 512))])
 def test_the_network_ends_where_it_is_told(last, shape):
-    with jax.numpy_dtype_promotion("standard"):
-        model = nnx.eval_shape(lambda: Vgg16(last, rngs=nnx.Rngs(0)))
+    model = untrained(last)
     graph, state = nnx.split(model)
     image = jax.ShapeDtypeStruct((1, 37, 50, 3), jnp.float32)
     assert jax.eval_shape(lambda state, image: nnx.merge(graph, state)(image), state, image).shape == (1, *shape)
@@ -50,9 +55,7 @@ def test_the_network_ends_where_it_is_told(last, shape):
 
 @pytest.mark.parametrize("last, count", [("conv4_3", 7_635_264), ("conv5_2", 12_354_880), ("conv5_3", 14_714_688)])
 def test_parameter_counts_are_the_published_ones(last, count):
-    with jax.numpy_dtype_promotion("standard"):
-        model = nnx.eval_shape(lambda: Vgg16(last, rngs=nnx.Rngs(0)))
-    assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(model))) == count
+    assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(untrained(last)))) == count
 
 
 def halved(x, *, ceil):
@@ -91,9 +94,7 @@ def test_maps_are_those_of_networks_that_end_there():
 
 
 def test_layers_behind_the_last_map_do_not_run():
-    with jax.numpy_dtype_promotion("standard"):
-        model = nnx.eval_shape(lambda: Vgg16("conv5_3", rngs=nnx.Rngs(0)))
-    graph, state = nnx.split(model)
+    graph, state = nnx.split(untrained("conv5_3"))
     image = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     run = jax.make_jaxpr(lambda state, image: nnx.merge(graph, state).maps(image, ("conv1_2",)))(state, image)
     assert str(run).count("conv_general_dilated[") == 2
