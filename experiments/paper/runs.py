@@ -70,7 +70,7 @@ def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], t
     fixed["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
     fixed["dataset"] |= {name: None for name in ("database", "queries") if name in fixed["dataset"]}  # folders
     names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
-    weights = {name: files.fingerprint(name) for name in names if name in REGISTRY}
+    weights = {name: files.read_manifest(name).sha256 for name in names if name in REGISTRY}
     return {
         "settings": fingerprint(fixed), "images": fingerprint(dict(images)),
         "ground truth": truth or "none", "weights": fingerprint(weights),
