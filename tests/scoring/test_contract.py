@@ -229,9 +229,12 @@ def test_one_match_that_is_no_number_leaves_no_score(field, broken):
 def test_small_types_score_as_the_same_values_in_single_precision(scorer):
     """Half precision overflows at 65504, and bytes at 255."""
     matches = random_matches(np.random.default_rng(17), 60)
-    halves = jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float16), matches)
-    halves = replace(halves, scores0=np.full(60, 200, np.uint8), scores1=np.full(60, 100, np.uint8))
-    single = jax.tree.map(lambda leaf: leaf if leaf.dtype == bool else leaf.astype(np.float32), halves)
+    halves = jax.tree.map(lambda leaf: leaf.astype(np.float16) if leaf.dtype == np.float32 else leaf, matches)
+    single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf, halves)
+    halves, single = (
+        replace(values, scores0=np.full(60, 200, dtype), scores1=np.full(60, 100, dtype))
+        for values, dtype in ((halves, np.uint8), (single, np.float32))
+    )
     got = score(scorer, halves)
     assert got.dtype == jnp.float32
     np.testing.assert_allclose(got, score(scorer, single), rtol=2e-6)
