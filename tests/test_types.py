@@ -26,7 +26,7 @@ pytestmark = pytest.mark.thorough
 
 
 def one_number(factor):
-    """A scorer class of its own, as users write them by the dozen: one number, `factor` times which is its score."""
+    """A new class of scorers with the score `factor * number`."""
 
     class Score:
         number: float = 1.0
@@ -40,15 +40,15 @@ def one_number(factor):
 
 
 def test_jit_never_takes_one_class_for_another():
-    """Neither traces, which are taken by the luck of the hashes where classes are not compared, nor programs."""
+    """Neither for traces, where only colliding hashes would show it, nor for programs."""
     evaluate = jax.jit(lambda scorer, matches: scorer(matches))
     matches = random_matches(np.random.default_rng(0), 3)
 
-    def traced(scorer):
+    def score_by_trace(scorer):
         program = evaluate.trace(scorer, matches).jaxpr
         return jaxpr_as_fun(program)(*jax.tree.leaves((scorer, matches)))[0]
 
-    assert [factor for factor in range(400) if traced(one_number(factor)()) != factor] == []
+    assert [factor for factor in range(400) if score_by_trace(one_number(factor)()) != factor] == []
     assert [factor for factor in range(50) if evaluate(one_number(factor)(), matches) != factor] == []
 
 
@@ -60,8 +60,8 @@ def test_nor_do_grids_and_candidates():
         assert mfvpr.score_candidates(scorer, matches) == factor
 
 
-def registered(number, log):
-    """A class of scorers as users register it in JAX's own way; `log` gets the numbers of those that are called."""
+def register_scorer(number, log):
+    """A class of scorers that JAX's own function registers; its calls append `number` to `log`."""
 
     def call(self, matches):
         log.append(number)
@@ -84,7 +84,7 @@ def check_classes(entry, count=40):
     """The class that is called while a program is traced is the class of its scorer."""
     matches, log = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3)), []
     for number in range(count):
-        scorer = registered(number, log)()
+        scorer = register_scorer(number, log)()
         jax.eval_shape(lambda matches, scorer=scorer: ENTRIES[entry](scorer, matches), matches)
         assert log[-1:] == [number]
 
@@ -108,7 +108,7 @@ def test_the_program_of_a_sweep_is_that_of_its_class():
     match_set = MatchSet.of([rows], np.array([counts]))
     work = SimpleNamespace(match_set=match_set, settings=1)
     for number in range(60):
-        [group] = groups(registered(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
+        [group] = groups(register_scorer(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
         group_program(work, group)
         assert log[-1:] == [number]
 
@@ -126,23 +126,16 @@ PROGRAMS_OF_THEIR_OWN = {
 }
 
 
-def test_all_other_programs_are_made_where_classes_are_compared():
+def test_all_other_programs_compare_classes():
     package = Path(mfvpr.__file__).parent
     modules = {str(path.relative_to(package)) for path in package.rglob("*.py") if "jax.jit" in path.read_text()}
     assert modules == PROGRAMS_OF_THEIR_OWN
 
 
-def test_classes_without_leaves_are_told_apart_too():
-    @mfvpr.value
-    class First:
-        pass
-
-    @mfvpr.value
-    class Second:
-        pass
-
-    assert jax.tree.structure(First()) != jax.tree.structure(Second())
-    assert jax.tree.structure(First()) == jax.tree.structure(First())
+def test_classes_without_leaves_differ():
+    first, second = (mfvpr.value(type(name, (), {})) for name in ("First", "Second"))
+    assert jax.tree.structure(first()) != jax.tree.structure(second())
+    assert jax.tree.structure(first()) == jax.tree.structure(first())
 
 
 @mfvpr.value

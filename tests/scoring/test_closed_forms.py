@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr import AggregatedScore, AnchorPoints, DescriptorDistanceWeight, HistogramOfShifts, UnitWeight
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, UnitWeight
 from mfvpr.utils import InputError
 from tests.builders import SIZE, make_matches, random_matches
+from tests.scoring.batches import score
 
 pytestmark = pytest.mark.thorough
 
 histogram = jax.jit(HistogramOfShifts.histogram)
-score = jax.jit(lambda scorer, matches: scorer(matches))
 dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
 CENTER = -SIZE + 7.5 + 15 * 24  # the center of bin 24 along an axis: 31.5 px
 
@@ -49,17 +49,8 @@ def test_a_match_votes_for_bins_as_far_as_the_limit():
 def test_matches_agree_within_two_deviations_along_both_axes():
     shifts = np.array([[0, 0], [45, 0], [45.1, 0], [0, -45], [0, -45.1], [44, 44]])
     matches = make_matches(np.full((6, 2), 100.0), 100 + shifts)
-    found = HistogramOfShifts(sigma=22.5).agrees(matches, np.zeros(2, np.float32))
-    assert found.tolist() == [True, True, False, True, False, True]
-
-
-def test_translation_by_bins_moves_the_peak_and_keeps_the_score():
-    matches = random_matches(np.random.default_rng(0), 80)
-    matches = replace(matches, points0=matches.points0 / 4 + 100, points1=matches.points1 / 4 + 100)
-    moved = replace(matches, points1=matches.points1 + np.float32([45, -30]))
-    scorer = HistogramOfShifts()
-    np.testing.assert_allclose(scorer(moved), scorer(matches), rtol=1e-5)
-    np.testing.assert_allclose(scorer.dominant_shift(moved) - scorer.dominant_shift(matches), [45, -30])
+    agreement = HistogramOfShifts(sigma=22.5).agrees(matches, np.zeros(2, np.float32))
+    assert agreement.tolist() == [True, True, False, True, False, True]
 
 
 def test_tiny_sigma_is_the_hard_histogram_of_zhang():
@@ -87,9 +78,9 @@ def test_a_zoom_costs_nothing_at_its_scale(scale):
     scorer = HistogramOfShifts(scales=SCALES)
     assert float(scorer(matches)) == pytest.approx(float(HistogramOfShifts()(pure)), rel=1e-5)
     assert float(scorer.dominant_scale(matches)) == pytest.approx(scale)
-    found = scorer.dominant_shift(matches, refine=True)
-    np.testing.assert_allclose(found, center1 - center0 + shift, atol=1e-3)
-    assert np.asarray(scorer.agrees(matches, found)).all()
+    refined = scorer.dominant_shift(matches, refine=True)
+    np.testing.assert_allclose(refined, center1 - center0 + shift, atol=1e-3)
+    assert np.asarray(scorer.agrees(matches, refined)).all()
     if scale != 1:
         assert float(HistogramOfShifts()(matches)) < 0.95 * float(scorer(matches))
 
@@ -112,21 +103,16 @@ def test_scales_are_votes_of_zoomed_points_and_the_prior_is_a_factor():
     assert float(smallest(matches)) == pytest.approx(likely[0] * by_scale[0], rel=1e-5)
 
 
-def test_scales_of_exchanged_images_are_their_inverses():
-    matches = random_matches(np.random.default_rng(6), 60)
+@pytest.mark.parametrize(("seed", "scales"), [(2, (1.0,)), (6, (0.5, 1.0, 2.0))])
+def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero(seed, scales):
+    """Scales become their inverses."""
+    matches = random_matches(np.random.default_rng(seed), 60)
     exchanged = replace(matches, points0=matches.points1, points1=matches.points0)
-    scorer = HistogramOfShifts(scales=(0.5, 1.0, 2.0), align="zero_center")
+    scorer = HistogramOfShifts(align="zero_center", scales=scales)
     assert float(scorer(exchanged)) == pytest.approx(float(scorer(matches)), rel=1e-5)
     assert float(scorer.dominant_scale(exchanged)) == pytest.approx(1 / float(scorer.dominant_scale(matches)))
-
-
-def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero():
-    matches = random_matches(np.random.default_rng(2), 60)
-    exchanged = replace(matches, points0=matches.points1, points1=matches.points0)
-    scorer = HistogramOfShifts(align="zero_center")
-    np.testing.assert_allclose(
-        scorer.histogram(exchanged).scores, scorer.histogram(matches).scores[::-1, ::-1], rtol=1e-4, atol=1e-5
-    )
+    mirrored = scorer.histogram(matches).scores[::-1, ::-1]
+    np.testing.assert_allclose(scorer.histogram(exchanged).scores, mirrored, rtol=1e-4, atol=1e-5)
     reverse = replace(scorer, direction="query_minus_candidate")
     np.testing.assert_allclose(reverse.dominant_shift(matches), -scorer.dominant_shift(matches), atol=1e-3)
 
@@ -151,19 +137,11 @@ def test_identical_images_give_the_full_window_to_every_anchor(include_self):
     assert AnchorPoints(include_self=include_self)(matches) == pytest.approx(3.0 * 1.0 * cells.sum(), rel=1e-6)
 
 
-def test_a_translation_by_whole_cells_keeps_the_anchor_score():
-    points = grid_points().reshape(15, 15, 2)[3:12, 3:12].reshape(-1, 2)
-    still, moved = make_matches(points, points), make_matches(points, points + 2 * SIZE / 15)
-    np.testing.assert_allclose(AnchorPoints()(moved), AnchorPoints()(still))
-
-
 def test_tolerance_one_counts_exact_agreements_as_ssm_vpr():
-    rng = np.random.default_rng(4)
-    points0 = grid_points()
-    target = rng.integers(0, 3, (225, 2)) + np.stack(np.divmod(np.arange(225), 15)[::-1], axis=-1)
-    matches = make_matches(points0, (np.clip(target, 0, 14) + 0.5) * SIZE / 15)
-    cell = np.stack(np.divmod(np.arange(225), 15), axis=-1)
-    displacement = np.clip(target, 0, 14)[:, ::-1] - cell
+    cell = np.stack(np.divmod(np.arange(225), 15)[::-1], axis=-1)
+    target = np.clip(cell + np.random.default_rng(4).integers(0, 3, (225, 2)), 0, 14)
+    matches = make_matches(grid_points(), (target + 0.5) * SIZE / 15)
+    displacement = target - cell
     near = (abs(cell[:, None] - cell) <= 5).all(-1)
     agreements = (near & (displacement[:, None] == displacement).all(-1)).sum()
     assert float(AnchorPoints(tolerance=1.0, cell_weight="ones")(matches)) == agreements
@@ -176,18 +154,9 @@ def test_equal_shifts_give_the_aggregated_score_its_maximum():
     assert AggregatedScore()(matches) == pytest.approx((2 - distance).sum() * (320**2 + 240**2), rel=1e-5)
 
 
-def test_weights_of_the_paper():
-    matches = make_matches([[1, 1]], [[2, 2]], distance=[0.25], scores0=[3.0], scores1=[4.0])
-    assert HistogramOfShifts().weight(matches)[0] == 7.0
-    assert DescriptorDistanceWeight()(matches)[0] == 1.75
-
-
-def test_numbers_without_meaning_give_no_number():
-    matches = random_matches(np.random.default_rng(6), 30)
-    assert np.isnan(HistogramOfShifts(sigma=0.0)(matches))
-    assert np.isnan(HistogramOfShifts(sigma=-5.0)(matches))
+def test_a_bin_size_below_0_raises():
     with pytest.raises(ValueError, match="bin_size=-5"):
-        HistogramOfShifts(bin_size=-5.0)(matches)
+        HistogramOfShifts(bin_size=-5.0)(random_matches(np.random.default_rng(6), 30))
 
 
 def test_a_histogram_without_votes_has_no_shift():
@@ -197,9 +166,9 @@ def test_a_histogram_without_votes_has_no_shift():
 
 @pytest.mark.parametrize(
     ("count", "align"),
-    [(count, "min_edge") for count in (15, 29, 30, 31, 58, 60)]
-    + [(count, "zero_edge" if count % 2 == 0 else "zero_center") for count in (15, 29, 30, 31, 58, 60)],
-)
+    [case for count in (15, 29, 30, 31, 58, 60)
+     for case in ((count, "min_edge"), (count, "zero_center" if count % 2 else "zero_edge"))],
+)  # fmt: skip
 def test_rounding_adds_no_bin_that_holds_nothing(count, align):
     """Bins that tile the range exactly, in widths that binary fractions only approximate."""
     scorer = HistogramOfShifts(bin_size=2 * SIZE / count, align=align)
@@ -222,11 +191,10 @@ def test_interval_of_equal_shifts_is_that_of_a_gaussian_and_holds_two_peaks_wher
 
 
 def test_interval_where_nothing_votes_is_of_all_shifts_and_too_few_bins_have_none():
-    matches = random_matches(np.random.default_rng(0), 20)
-    none = replace(matches, mask=np.zeros_like(matches.mask))
-    low, high = HistogramOfShifts(bin_size=1.0).shift_interval(none, level=0.5)
+    matches, empty = random_matches(np.random.default_rng(0), 20), make_matches([], [])
+    low, high = HistogramOfShifts(bin_size=1.0).shift_interval(empty, level=0.5)
     np.testing.assert_allclose([low, high], [[-SIZE / 2] * 2, [SIZE / 2] * 2], atol=1)
-    small = jax.jit(lambda one: HistogramOfShifts(max_bins=8).shift_interval(one))
+    small = jax.jit(lambda matches: HistogramOfShifts(max_bins=8).shift_interval(matches))
     assert np.isnan(small(matches)).all()
     with pytest.raises(InputError, match="level=95: expected a number between 0 and 1"):
         HistogramOfShifts().shift_interval(matches, level=95)

@@ -1,4 +1,4 @@
-"""What every scorer promises, whatever it computes, beside what `mfvpr.testing` checks (test_testing.py)."""
+"""Contract of all scorers, beside what `mfvpr.testing` checks (test_testing.py)."""
 
 from dataclasses import replace
 
@@ -13,11 +13,15 @@ from mfvpr import (
     AnchorPoints,
     DescriptorDistanceWeight,
     FeatureScoreWeight,
+    GridAnchors,
     HistogramOfShifts,
     Homography,
+    LostScore,
     MatchCount,
+    RapidSpatialScore,
     RatioWeight,
     UnitWeight,
+    VisualPhrases,
     score_candidates,
     score_grid,
 )
@@ -26,34 +30,31 @@ from mfvpr.utils import InputError
 from mfvpr.utils.numerics import with_static_functions
 from tests.builders import SIZE, per_match, random_matches
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
+from tests.scoring import batches
+from tests.scoring.batches import pair_of, stack
 
 pytestmark = pytest.mark.thorough
 
-everyone = pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
-own = pytest.mark.parametrize("scorer", one_of_each_class(OWN), ids=title)
-_score = jax.jit(lambda scorer, matches: scorer(matches))  # compiled once per shape: hence 60 slots, 5 pairs
-_score_all = jax.jit(score_candidates)
+every_scorer = pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
+library_scorer = pytest.mark.parametrize("scorer", one_of_each_class(OWN), ids=title)
+_score_all = jax.jit(score_candidates)  # compiled once per shape: hence 60 slots, 5 pairs
 SIZES = np.array([SIZE, SIZE], np.float32)
 
 
-def fitted(scorer):
-    """With the capacity that the tests' images need."""
+def fit(scorer):
+    """The scorer with the capacity that the tests' images need."""
     return with_static_functions(with_capacity(scorer, SIZES, SIZES))
 
 
 def score(scorer, matches):
-    return _score(fitted(scorer), matches)
+    return batches.score(fit(scorer), matches)
 
 
-def score_all(scorer, matches):
-    return _score_all(fitted(scorer), matches)
+def score_all(scorer, pairs):
+    return _score_all(fit(scorer), stack(pairs))
 
 
-def stack(items):
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *items)
-
-
-@everyone
+@every_scorer
 def test_neither_company_nor_order_nor_padding_matters(scorer):
     """Each score within rounding of itself, however small beside those of others."""
     order = np.random.default_rng(3).permutation(60)
@@ -63,54 +64,35 @@ def test_neither_company_nor_order_nor_padding_matters(scorer):
         return [random_matches(np.random.default_rng(count), count, capacity=60, **padding) for count in counts]
 
     expected = [score(scorer, pair) for pair in pairs()]
-    np.testing.assert_allclose(score_all(scorer, stack(pairs())), expected, rtol=2e-6, atol=0)
+    np.testing.assert_allclose(score_all(scorer, pairs()), expected, rtol=2e-6, atol=0)
     for garbage in (np.inf, -1e30, 7.0):
         shuffled = [per_match(pair, lambda rows: rows[order]) for pair in pairs(garbage=garbage)]
-        np.testing.assert_allclose(score_all(scorer, stack(shuffled)), expected, rtol=2e-6, atol=0)
+        np.testing.assert_allclose(score_all(scorer, shuffled), expected, rtol=2e-6, atol=0)
 
 
-@own
-def test_gradients_agree_with_finite_differences(scorer):
-    """Along a random direction of weights and distances, where every score is smooth."""
-    matches = random_matches(np.random.default_rng(7), 20)
-    direction = np.random.default_rng(8).uniform(-1, 1, (3, 20)).astype(np.float32)
-    start = jnp.stack([matches.distance, matches.scores0, matches.scores1])
-
-    @jax.jit
-    @jax.value_and_grad
-    def along(step):
-        distance, scores0, scores1 = start + step * direction
-        return scorer(replace(matches, distance=distance, scores0=scores0, scores1=scores1))
-
-    step = 2e-3
-    (behind, _), (value, gradient), (ahead, _) = map(along, (-step, 0.0, step))
-    scale = abs(float(value)) + 1e-3
-    np.testing.assert_allclose(gradient / scale, (ahead - behind) / (2 * step) / scale, atol=2e-3)
-
-
-@everyone
+@every_scorer
 def test_a_masked_pair_may_have_any_size(scorer):
     rng = np.random.default_rng(9)
     pair, empty = random_matches(rng, 60), random_matches(rng, 0, capacity=60)
     empty = replace(empty, image_size0=np.full(2, np.nan, np.float32), image_size1=np.zeros(2, np.float32))
-    scores = score_all(scorer, stack([pair, *[empty] * 4]))
+    scores = score_all(scorer, [pair, *[empty] * 4])
     np.testing.assert_allclose(scores[0], score(scorer, pair), rtol=2e-6)
     assert (scores[1:] == 0.0).all()
     numbers = [leaf for leaf in jax.tree.leaves(scorer) if isinstance(leaf, float)]
     if len(numbers) == len(jax.tree.leaves(scorer)) and not isinstance(scorer, Homography):  # which has no gradient
-        for gradient in jax.tree.leaves(jax.jit(jax.grad(score))(fitted(scorer), empty)):
+        for gradient in jax.tree.leaves(jax.jit(jax.grad(score))(fit(scorer), empty)):
             assert np.isfinite(gradient).all()
 
 
-@everyone
+@every_scorer
 @pytest.mark.parametrize(("candidates", "slots"), [(0, 60), (3, 0)])
 def test_no_slots_and_no_candidates(scorer, candidates, slots):
     pair = per_match(random_matches(np.random.default_rng(0), 60), lambda rows: rows[:slots])
     batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (candidates, *leaf.shape)), pair)
-    np.testing.assert_array_equal(score_all(scorer, batch), np.zeros(candidates))
+    np.testing.assert_array_equal(_score_all(fit(scorer), batch), np.zeros(candidates))
 
 
-@everyone
+@every_scorer
 def test_integers_and_double_precision_mode_are_welcome(scorer):
     matches = random_matches(np.random.default_rng(10), 60)
     matches = replace(matches, points0=matches.points0.round(), points1=matches.points1.round())
@@ -124,28 +106,23 @@ def test_integers_and_double_precision_mode_are_welcome(scorer):
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("scorer", "field", "word"),
     [
-        lambda: HistogramOfShifts(align="zero_centre"),
-        lambda: HistogramOfShifts(direction="x"),
-        lambda: AnchorPoints(window_mode="x"),
-        lambda: AnchorPoints(first="reference"),
-        lambda: AnchorPoints(cell_weight="x"),
-        lambda: AggregatedScore(mean="medain"),
+        (HistogramOfShifts, "align", "zero_centre"), (HistogramOfShifts, "direction", "x"),
+        (AnchorPoints, "window_mode", "x"), (AnchorPoints, "first", "reference"), (AnchorPoints, "cell_weight", "x"),
+        (AggregatedScore, "mean", "medain"), (RapidSpatialScore, "reach", "largest"), (LostScore, "form", "cosine"),
+        (VisualPhrases, "align", "min_edge"), (GridAnchors, "outside", "one"), (Homography, "measure", "most"),
     ],
-)
-def test_misspelt_choices_are_refused(wrong):
-    with pytest.raises(ValueError, match="expected one of"):
-        wrong()
+)  # fmt: skip
+def test_misspelled_choices_raise(scorer, field, word):
+    with pytest.raises(ValueError, match=rf"{scorer.__name__}\({field}='{word}'\): expected one of"):
+        scorer(**{field: word})
 
 
 def test_positions_of_the_arguments_are_the_papers_order():
-    assert HistogramOfShifts(10.0, 5.0, UnitWeight()) == HistogramOfShifts(
-        bin_size=10.0, sigma=5.0, weight=UnitWeight()
-    )
-    assert AnchorPoints(12, 8, 2.0, UnitWeight()) == AnchorPoints(
-        num_bins=12, window=8, tolerance=2.0, weight=UnitWeight()
-    )
+    unit = UnitWeight()
+    assert HistogramOfShifts(10.0, 5.0, unit) == HistogramOfShifts(bin_size=10.0, sigma=5.0, weight=unit)
+    assert AnchorPoints(12, 8, 2.0, unit) == AnchorPoints(num_bins=12, window=8, tolerance=2.0, weight=unit)
 
 
 def test_images_of_other_sizes_are_never_scored_with_too_few_bins():
@@ -154,20 +131,18 @@ def test_images_of_other_sizes_are_never_scored_with_too_few_bins():
     expected = score_candidates(HistogramOfShifts(), matches)
     assert (expected > 0).all()
     for scorer in (HistogramOfShifts(), Wrapped()):
-        for traced in (_score_all, jax.jit(jax.vmap(scorer))):
+        for trace in (lambda scorer: _score_all(scorer, matches), lambda scorer: jax.jit(jax.vmap(scorer))(matches)):
             with pytest.raises(ValueError, match=r"bin_size .*traced; .*max_bins="):
-                traced(scorer, matches) if traced is _score_all else traced(matches)
+                trace(scorer)
     roomy = HistogramOfShifts().with_capacity(matches.image_size0, matches.image_size1)
     np.testing.assert_allclose(_score_all(roomy, matches), expected, rtol=2e-6)
+    inner = score_candidates(HistogramOfShifts(sigma=18.0), matches)
+    np.testing.assert_allclose(
+        score_candidates(Wrapped(), matches), inner + 0.25 * score_candidates(MatchCount(), matches), rtol=2e-6
+    )
 
 
-def test_a_capacity_is_found_inside_of_wrappers():
-    matches = stack([random_matches(np.random.default_rng(12), 30, sizes=((640, 480), (800, 600))) for _ in range(2)])
-    plain = score_candidates(HistogramOfShifts(sigma=18.0), matches) + 0.25 * score_candidates(MatchCount(), matches)
-    np.testing.assert_allclose(score_candidates(Wrapped(), matches), plain, rtol=2e-6)
-
-
-def test_a_capacity_that_is_too_small_is_told_where_it_can_be():
+def test_a_capacity_that_is_too_small_raises_unless_traced():
     matches = stack([random_matches(np.random.default_rng(13), 30)])
     with pytest.raises(InputError, match="max_bins=44: expected at least 45"):
         score_candidates(HistogramOfShifts(max_bins=44), matches)
@@ -179,44 +154,42 @@ def test_a_capacity_that_is_too_small_is_told_where_it_can_be():
 def test_calls_with_other_numbers_compile_nothing(compilations):
     matches = stack([random_matches(np.random.default_rng(count), 40 + count, capacity=64) for count in range(3)])
     scorers = [HistogramOfShifts(), AnchorPoints(), AggregatedScore(temperature=3.0), Wrapped(), HistogramOfShifts()]
-    for scorer in scorers:
-        score_candidates(scorer, matches)
-    HistogramOfShifts().dominant_shift(jax.tree.map(lambda leaf: leaf[0], matches), refine=True)
+
+    def score_everywhere(factor, pair):
+        for scorer in scorers:
+            score_candidates(jax.tree.map(lambda number: number * factor, scorer), matches)
+        HistogramOfShifts(sigma=20 * factor).dominant_shift(pair_of(matches, pair), refine=True)
+        axes = {"sigma": [5 * factor, 30.0], "bin_size": [4.9 + factor / 10, 15.0], "max_distance": [0.5, factor]}
+        jax.block_until_ready(score_grid(HistogramOfShifts(), matches, **axes))
+
+    score_everywhere(1.0, 0)
     compilations.reset()
     for factor in (0.99, 1.0, 1.01):
-        for scorer in scorers:
-            score_candidates(jax.tree.map(lambda number: number * factor, scorer), matches)  # noqa: B023
-        pair = jax.tree.map(lambda leaf: leaf[1], matches)
-        HistogramOfShifts(sigma=20 * factor).dominant_shift(pair, refine=True)
+        score_everywhere(factor, 1)
     assert compilations.count == 0
 
 
 def test_a_function_that_changes_is_not_taken_for_what_it_was():
     matches = stack([random_matches(np.random.default_rng(14), 30)])
-    held_by_closure = {"factor": 1.0}
-    scorer = lambda matches: held_by_closure["factor"] * plain(matches)  # noqa: E731
-    weighted = HistogramOfShifts(weight=lambda matches: held_by_closure["factor"] * matches.scores0)
-    first = [score_candidates(one, matches) for one in (scorer, weighted)]
-    held_by_closure["factor"] = 2.0
-    for one, before in zip((scorer, weighted), first, strict=True):
-        np.testing.assert_allclose(score_candidates(one, matches), 2 * before, rtol=2e-6)
+    closure = {"factor": 1.0}
+    weighted = HistogramOfShifts(weight=lambda matches: closure["factor"] * matches.scores0)
+    for scorer in (lambda matches: closure["factor"] * plain(matches), weighted):
+        closure["factor"] = 1.0
+        before = score_candidates(scorer, matches)
+        closure["factor"] = 2.0
+        np.testing.assert_allclose(score_candidates(scorer, matches), 2 * before, rtol=2e-6)
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 @pytest.mark.parametrize("field", ["points1", "scores0", "distance", "ratio"])
 def test_one_match_that_is_no_number_leaves_no_score(field, broken):
-    """Whoever asks: for one pair, in a batch, and in a grid; else such a pair would rank somewhere."""
+    """For one pair, in a batch, and in a grid; else such a pair would rank somewhere."""
     pair = random_matches(np.random.default_rng(15), 20, capacity=24)
     getattr(pair, field)[3] = broken
     batch = stack([pair, random_matches(np.random.default_rng(16), 20, capacity=24)])
-    weights = {"distance": DescriptorDistanceWeight(), "ratio": RatioWeight()}
-    weight = weights.get(field, FeatureScoreWeight())
-    few, many = AnchorPoints(weight=weight), AnchorPoints(num_bins=3, weight=weight)
-    for scorer, axis in (
-        (HistogramOfShifts(weight=weight), {"sigma": [22.5]}),
-        (few, {"tolerance": [3.0]}),
-        (many, {"tolerance": [3.0]}),
-    ):
+    weight = {"distance": DescriptorDistanceWeight(), "ratio": RatioWeight()}.get(field, FeatureScoreWeight())
+    anchors = [(AnchorPoints(num_bins=num_bins, weight=weight), {"tolerance": [3.0]}) for num_bins in (15, 3)]
+    for scorer, axis in ((HistogramOfShifts(weight=weight), {"sigma": [22.5]}), *anchors):
         assert np.isnan(score(scorer, pair))
         for scores in (score_candidates(scorer, batch), score_grid(scorer, batch, **axis)[0]):
             assert np.isnan(scores[0])
@@ -225,7 +198,7 @@ def test_one_match_that_is_no_number_leaves_no_score(field, broken):
     assert np.isnan(HistogramOfShifts(weight=weight).dominant_shift(pair)).all()
 
 
-@own
+@library_scorer
 def test_small_types_score_as_the_same_values_in_single_precision(scorer):
     """Half precision overflows at 65504, and bytes at 255."""
     matches = random_matches(np.random.default_rng(17), 60)
@@ -240,7 +213,7 @@ def test_small_types_score_as_the_same_values_in_single_precision(scorer):
     np.testing.assert_allclose(got, score(scorer, single), rtol=2e-6)
 
 
-def test_what_would_be_ambiguous_or_too_large_is_refused():
+def test_ambiguous_names_too_many_cells_and_single_pairs_raise():
     @mfvpr.value
     class Near:
         max_distance: float = 20.0
@@ -257,7 +230,7 @@ def test_what_would_be_ambiguous_or_too_large_is_refused():
         AnchorPoints(num_bins=216)
     for wrong in (lambda pair: score_candidates(plain, pair), lambda pair: score_grid(plain, pair, max_distance=[1.0])):
         with pytest.raises(ValueError, match=r"expected matches \[C, K, ...\] of candidates"):
-            wrong(jax.tree.map(lambda leaf: leaf[0], batch))
+            wrong(pair_of(batch))
 
 
 def test_threads_of_a_grid_know_the_callers_context():

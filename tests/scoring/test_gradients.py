@@ -20,6 +20,7 @@ from mfvpr import (
     soft_match,
 )
 from tests.builders import SIZE, double, make_features, make_matches, random_matches
+from tests.scoring.batches import each_scorer
 
 pytestmark = pytest.mark.thorough
 
@@ -34,6 +35,7 @@ HARD = [
     AggregatedScore(mean="weighted", clamp=True),
     AggregatedScore(mean="median", clamp=True),
     MatchCount(),
+    HistogramOfShifts(bin_size=20.0, scales=(0.7, 1.0, 1.41), scale_deviation=0.5, weight=RatioWeight(), max_bins=36),
 ]
 SOFT = [
     replace(HARD[0], temperature=0.3),
@@ -57,24 +59,13 @@ RELATIVES = [
     LostScore(form="unweighted", mirrored=True),
     LostScore(form="described"),
 ]
-NUMBERS = (
-    "bin_size",
-    "sigma",
-    "scale_deviation",
-    "tolerance",
-    "temperature",
-    "weight",
-)  # not the window, which moves whole cells
+NUMBERS = ("bin_size", "sigma", "scale_deviation", "tolerance", "temperature", "weight")  # the window moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 PER_KEYPOINT = ("keypoints", "descriptors", "scores")
 
 
-def named(scorers):
-    return pytest.mark.parametrize("scorer", scorers, ids=lambda scorer: type(scorer).__name__)
-
-
-def chosen(value, names):
-    """The fields of a value that have those names and hold something."""
+def fields_of(value, names):
+    """Fields of a value by name, without None."""
     return {name: getattr(value, name) for name in names if getattr(value, name, None) is not None}
 
 
@@ -94,7 +85,7 @@ def check_gradients(value_and_grad, tree, rng, step=1e-6):
         np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=1e-5, atol=1e-8 * abs(float(value)))
 
 
-@named(HARD + SOFT + RELATIVES)
+@each_scorer(HARD + SOFT + RELATIVES)
 def test_gradients_are_central_differences(scorer):
     rng = np.random.default_rng(0)
     matches = random_matches(rng, 20, capacity=24)
@@ -102,7 +93,7 @@ def test_gradients_are_central_differences(scorer):
     confidence = np.where(matches.mask, rng.uniform(0.1, 0.9, 24), np.nan).astype(np.float32)
     with jax.enable_x64(True):
         matches = double(replace(matches, points1=points1, confidence=confidence))
-        tree = double(chosen(scorer, NUMBERS)), chosen(matches, PER_MATCH)
+        tree = double(fields_of(scorer, NUMBERS)), fields_of(matches, PER_MATCH)
         score = lambda tree: replace(scorer, **tree[0])(replace(matches, **tree[1]))  # noqa: E731
         check_gradients(jax.jit(jax.value_and_grad(score)), tree, rng)
 
@@ -117,63 +108,51 @@ def test_gradients_through_soft_matching_are_central_differences():
     @jax.value_and_grad
     def total(tree):
         temperature, *fields = tree
-        matches = soft_match(
-            *(replace(f, **values) for f, values in zip(pair, fields, strict=True)), temperature=temperature
-        )
+        features = (replace(image, **values) for image, values in zip(pair, fields, strict=True))
+        matches = soft_match(*features, temperature=temperature)
         return SOFT[0](matches) + 1e-4 * SOFT[6](matches) + MatchCount()(matches)
 
     with jax.enable_x64(True):
         pair = double(pair)
         for temperature in (0.02, 0.2):
-            fields = (chosen(features, PER_KEYPOINT) for features in pair)
-            check_gradients(total, (jnp.asarray(temperature), *fields), rng)
+            tree = jnp.asarray(temperature), *(fields_of(features, PER_KEYPOINT) for features in pair)
+            check_gradients(total, tree, rng)
 
 
 COLD = [replace(HARD[0], temperature=1e-4), replace(HARD[4], temperature=1e-3), replace(HARD[7], temperature=1e-4)]
-gradients = jax.jit(
-    jax.value_and_grad(lambda scorer, rows, matches: scorer(replace(matches, **rows)), argnums=(0, 1)),
-)
+gradients = jax.jit(jax.value_and_grad(lambda scorer, rows, matches: scorer(replace(matches, **rows)), argnums=(0, 1)))
 
 
-@named(HARD[3:9] + SOFT[5:6] + SOFT[8:] + COLD + RELATIVES)  # cold or warm, it is the same program
+@each_scorer(HARD[3:9] + SOFT[5:6] + SOFT[8:] + COLD + RELATIVES)  # cold or warm, it is the same program
 def test_degenerate_pairs_have_finite_gradients(scorer):
     """Empty, single, all alike, at a corner, without any weight or confidence; in single precision, beside NaN."""
-    corner = {
-        "distance": [0.0] * 4,
-        "ratio": [1.0] * 4,
-        "scores0": [0.0] * 4,
-        "scores1": [0.0] * 4,
-        "confidence": [0.0] * 4,
-    }
-    pairs = [
-        make_matches([], [], capacity=6, confidence=[], ratio=[]),
-        make_matches([[20, 30]], [[20, 30]], capacity=6, distance=[0.0], confidence=[1.0], ratio=[0.0]),
-        make_matches(
-            [[20, 30]] * 4, [[50, 60]] * 4, capacity=6, distance=[0.0] * 4, confidence=[1.0] * 4, ratio=[1.0] * 4
-        ),
-        make_matches([[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2, capacity=6, **corner),
-        make_matches(
-            [[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2, capacity=6, confidence=[1e-12] * 4, ratio=[0.5] * 4
-        ),
-    ]
-    for matches in pairs:
-        value, found = gradients(jax.tree.map(float, scorer), chosen(matches, PER_MATCH), matches)
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((value, found)))
-        assert all((np.asarray(rows)[~matches.mask] == 0).all() for rows in found[1].values())
+    corners = [[0, 0], [SIZE, SIZE]] * 2, [[SIZE, SIZE], [0, 0]] * 2
+    no_weight = {"distance": 0.0, "ratio": 1.0, "scores0": 0.0, "scores1": 0.0, "confidence": 0.0}
+    for points0, points1, entries in (
+        ([], [], {"confidence": 0.0, "ratio": 0.0}),
+        ([[20, 30]], [[20, 30]], {"distance": 0.0, "confidence": 1.0, "ratio": 0.0}),
+        ([[20, 30]] * 4, [[50, 60]] * 4, {"distance": 0.0, "confidence": 1.0, "ratio": 1.0}),
+        (*corners, no_weight),
+        (*corners, {"confidence": 1e-12, "ratio": 0.5}),
+    ):
+        entries = {name: [number] * len(points0) for name, number in entries.items()}
+        matches = make_matches(points0, points1, capacity=6, **entries)
+        value, (of_scorer, of_rows) = gradients(jax.tree.map(float, scorer), fields_of(matches, PER_MATCH), matches)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((value, of_scorer, of_rows)))
+        assert all((np.asarray(rows)[~matches.mask] == 0).all() for rows in of_rows.values())
 
 
 def test_a_match_as_near_to_two_keypoints_has_no_gradient_of_its_ratio():
     """Though that of a root is infinite there."""
     matches = make_matches([[1, 1]] * 2, [[2, 2]] * 2, ratio=[1.0, 0.75])
     weight = lambda exponent, ratio: jnp.sum(RatioWeight(exponent)(replace(matches, ratio=ratio)))  # noqa: E731
-    found = jax.grad(weight, argnums=(0, 1))(0.5, jnp.asarray(matches.ratio))
-    np.testing.assert_allclose(found[0], 0.5 * np.log(0.25), rtol=1e-6)
-    np.testing.assert_allclose(found[1], [0.0, -1.0], rtol=1e-6)
+    of_exponent, of_ratio = jax.grad(weight, argnums=(0, 1))(0.5, jnp.asarray(matches.ratio))
+    np.testing.assert_allclose(of_exponent, 0.5 * np.log(0.25), rtol=1e-6)
+    np.testing.assert_allclose(of_ratio, [0.0, -1.0], rtol=1e-6)
 
 
 def test_the_window_moves_in_whole_cells():
     matches = random_matches(np.random.default_rng(2), 20)
-    scorer = AnchorPoints(6, 4.0, temperature=0.5)
-    _, (found, _) = gradients(scorer, chosen(matches, PER_MATCH), matches)
-    assert found.window == 0.0
-    assert found.tolerance > 0.0
+    _, (of_scorer, _) = gradients(AnchorPoints(6, 4.0, temperature=0.5), fields_of(matches, PER_MATCH), matches)
+    assert of_scorer.window == 0.0
+    assert of_scorer.tolerance > 0.0

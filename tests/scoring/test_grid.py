@@ -2,33 +2,35 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 
-from mfvpr import score_candidates
 from mfvpr.scoring import GridAnchors
 from mfvpr.testing import check_scorer
 from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import make_matches, per_match
+from tests.scoring.batches import score
 
 pytestmark = pytest.mark.thorough
 
-_score = jax.jit(lambda scorer, matches: scorer(matches))
 OUTSIDE = {"unequal": -1000, "zero": 0}
 
 
 def cells(index, side, *, matched=None):
     """Matches of every cell of the candidate, or of those that are `matched`."""
     index, count = np.asarray(index).reshape(-1), side**2
-    some = np.arange(count) if matched is None else np.flatnonzero(matched)
-    points = np.zeros((len(some), 2))
-    return make_matches(points, points, index0=index[some], index1=some, count0=count, count1=count, capacity=count)
+    rows = np.arange(count) if matched is None else np.flatnonzero(matched)
+    return cell_matches(index[rows], rows, count, capacity=count)
 
 
-def shifted(rng, side, *, noise=0.4):
-    """Most cells of the candidate show the query a few cells further, flat numbers wrapping around; others anything."""
+def cell_matches(index0, index1, count, **options):
+    points = np.zeros((len(index0), 2))
+    return make_matches(points, points, index0=index0, index1=index1, count0=count, count1=count, **options)
+
+
+def random_index(rng, side, *, noise=0.4):
+    """Query cells: most are a few cells further than those of the candidate, flat numbers wrapping around."""
     index = (np.arange(side**2) + rng.integers(-2 * side, 2 * side)) % side**2
     return np.where(rng.random(side**2) < noise, rng.integers(0, side**2, side**2), index)
 
@@ -40,11 +42,12 @@ def test_agrees_with_the_loop(side, patch, outside, wrap):
     scorer = GridAnchors(side, patch, wrap, outside)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        index = shifted(rng, side, noise=0.4 * seed)
+        index = random_index(rng, side, noise=0.4 * seed)
         matched = np.ones(side**2, bool) if seed < 2 else rng.random(side**2) < 0.7
         grid = np.where(matched, index, None).reshape(side, side).tolist()
         expected = oracles.grid_anchors(grid, side, patch=patch, wrap=wrap, outside=OUTSIDE[outside])
-        got = _score(scorer, cells(index, side, matched=matched))
+        order = rng.permutation(side**2)
+        got = score(scorer, per_match(cells(index, side, matched=matched), lambda rows: rows[order]))  # noqa: B023
         assert got.dtype == np.float32
         assert got == expected
 
@@ -54,8 +57,8 @@ def test_minus_1000_may_be_a_number_that_is_expected():
     for side, meets in ((51, False), (54, True)):
         index = np.full((side, side), 10)
         half = GridAnchors(side).size // 2
-        inside_only = _score(GridAnchors(side, outside="unequal", wrap=False), cells(index, side))
-        got = _score(GridAnchors(side), cells(index, side))
+        inside_only = score(GridAnchors(side, outside="unequal", wrap=False), cells(index, side))
+        got = score(GridAnchors(side), cells(index, side))
         rows = np.arange(-half, half + 1)
         offsets = np.argwhere(10 + rows[:, None] * side + rows == -1000) - half
         expected = sum(
@@ -72,27 +75,14 @@ def test_an_image_agrees_with_itself_in_all_of_its_patches(side, size):
     scorer, half = GridAnchors(side), size // 2
     assert scorer.size == size
     near = sum(min(place + half, side - 1) - max(place - half, 0) + 1 for place in range(side))
-    assert _score(replace(scorer, wrap=False), cells(np.arange(side**2), side)) == near**2
+    assert score(replace(scorer, wrap=False), cells(np.arange(side**2), side)) == near**2
     assert side**2 * size**2 <= 2**24
 
 
-def test_a_batch_scores_as_its_pairs_in_any_order():
-    side, order = 7, np.random.default_rng(1).permutation(49)
-    pairs = [cells(shifted(np.random.default_rng(seed), side), side) for seed in range(4)]
-    pairs.append(cells(np.zeros(49, int), side, matched=np.zeros(49, bool)))
-    mixed = [per_match(pair, lambda rows: rows[order]) for pair in pairs]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *mixed)
-    got = score_candidates(GridAnchors(side), batch)
-    np.testing.assert_array_equal(got, [float(_score(GridAnchors(side), pair)) for pair in pairs])
-    assert got[-1] == 0
-
-
 def test_of_several_matches_of_one_cell_the_lowest_counts():
-    side, index1 = 3, [0, 4, 4, 4]
-    pair = make_matches(np.zeros((4, 2)), np.zeros((4, 2)), index0=[0, 7, 4, 5], index1=index1, count0=9, count1=9)
-    alone = make_matches(np.zeros((2, 2)), np.zeros((2, 2)), index0=[0, 4], index1=[0, 4], count0=9, count1=9)
-    got = [_score(GridAnchors(side, 3), one) for one in (pair, per_match(pair, lambda rows: rows[::-1]), alone)]
-    assert got == [4, 4, 4]
+    pair, alone = cell_matches([0, 7, 4, 5], [0, 4, 4, 4], 9), cell_matches([0, 4], [0, 4], 9)
+    for matches in (pair, per_match(pair, lambda rows: rows[::-1]), alone):
+        assert score(GridAnchors(3, 3), matches) == 4
 
 
 @pytest.mark.parametrize("options", [{}, {"wrap": False}, {"outside": "zero"}])
@@ -108,12 +98,11 @@ def test_other_keypoints_than_the_cells_of_the_grid_score_nan(change):
             getattr(pair, name)[3] = number
         else:
             pair = replace(pair, **{name: np.int32(number)})
-    assert np.isnan(_score(GridAnchors(7), pair))
-    nothing = replace(pair, mask=np.zeros(49, bool))
-    assert _score(GridAnchors(7), nothing) == 0
+    assert np.isnan(score(GridAnchors(7), pair))
+    assert score(GridAnchors(7), replace(pair, mask=np.zeros(49, bool))) == 0
 
 
-def test_what_cannot_be_scored_is_refused():
+def test_matches_without_indices_and_impossible_grids_raise():
     pair = replace(cells(np.arange(9), 3), index1=None)
     with pytest.raises(InputError, match="expected matches that know their keypoints"):
         GridAnchors(3)(pair)
@@ -123,5 +112,3 @@ def test_what_cannot_be_scored_is_refused():
     ):  # fmt: skip
         with pytest.raises(InputError, match=line):
             GridAnchors(**options)
-    with pytest.raises(ValueError, match="outside='one'"):
-        GridAnchors(outside="one")

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import mfvpr
 from mfvpr import Homography, score_candidates, score_grid
 from mfvpr.scoring import quads
-from mfvpr.types import per_match
 from mfvpr.utils import NoGradientError
 from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
-from tests.builders import SIZE, make_matches
+from tests.builders import SIZE, make_matches, per_match
+from tests.scoring.batches import stack
 
 pytestmark = pytest.mark.thorough
 
@@ -51,32 +50,22 @@ def misses(matrix, matches):
     return np.linalg.norm(ransac_oracle.mapped(matrix, matches.points1[real]) - matches.points0[real], axis=1)
 
 
-def stacked(pairs):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
-
-
 @pytest.mark.optimized
 @pytest.mark.parametrize(("count", "share"), [(5, 0.9), (8, 0.6), (40, 0.3), (120, 0.1), (120, 0.5), (300, 0.9)])
 @pytest.mark.parametrize("threshold", [8.0, 24.0])
 def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, threshold):
     for seed in range(3):
         matches = pair([seed, count], count, share)
-        found = estimate(Homography(threshold, 500.0, seed=seed), matches)
-        order = sampled_order(matches)[:count]
-        points1, points0 = matches.points1[order], matches.points0[order]
+        got = estimate(Homography(threshold, 500.0, seed=seed), matches)
+        points = np.where(matches.mask[:, None], np.concatenate([matches.points1, matches.points0], axis=-1), 0)
+        order = np.asarray(quads.canonical_order(points, matches.mask))[:count]
         inliers, samples, errors = ransac_oracle.estimate(
-            points1, points0, threshold=threshold, max_iterations=500, seed=seed
+            points[order, :2], points[order, 2:], threshold=threshold, max_iterations=500, seed=seed
         )
         sure = np.abs(errors - threshold) > 1e-3 * threshold
-        assert (np.asarray(found.inliers)[order][sure] == inliers[sure]).all()
-        assert abs(int(found.score) - inliers.sum()) <= (~sure).sum()
-        assert int(found.samples) == samples
-
-
-def sampled_order(matches):
-    """The order in which a pair's samples count its matches."""
-    points = np.concatenate([matches.points1, matches.points0], axis=-1)
-    return np.asarray(quads.canonical_order(np.where(matches.mask[:, None], points, 0), matches.mask))
+        assert (np.asarray(got.inliers)[order][sure] == inliers[sure]).all()
+        assert abs(int(got.score) - inliers.sum()) <= (~sure).sum()
+        assert int(got.samples) == samples
 
 
 def test_draws_are_distinct_and_every_set_is_as_likely():
@@ -95,33 +84,32 @@ def test_samples_are_the_first_draws_that_a_camera_can_see():
     key = jax.random.key(7)
     samples, count = quads.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
     drawn = np.asarray(quads.draw(key, 3, np.int32(30))).T
-    kept = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
-    assert int(count) == min(len(kept), quads.ROUND)
-    expected = points[np.array(kept[: int(count)])]
+    visible = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
+    assert int(count) == min(len(visible), quads.ROUND)
+    expected = points[np.array(visible[: int(count)])]
     np.testing.assert_array_equal(np.moveaxis(np.asarray(samples), 0, 2)[:, : int(count)].swapaxes(0, 1), expected)
 
 
 @pytest.mark.slow
 def test_company_order_and_padding_change_no_bit():
-    pairs = [pair(seed, count, share, capacity=128) for seed, (count, share) in enumerate(
-        [(100, 0.1), (3, 1.0), (0, 1.0), (60, 0.9), (128, 0.3)])]  # fmt: skip
-    together = np.asarray(score_candidates(Homography(), stacked(pairs)))
+    cases = (100, 0.1), (3, 1.0), (0, 1.0), (60, 0.9), (128, 0.3)
+    pairs = [pair(seed, *case, capacity=128) for seed, case in enumerate(cases)]
+    together = np.asarray(score_candidates(Homography(), stack(pairs)))
+    shuffle = np.random.default_rng(0).permutation(128)
     for matches, score in zip(pairs, together, strict=True):
-        shuffle = np.random.default_rng(0).permutation(128)
-        shuffled = replace(matches, mask=matches.mask[shuffle], **{
-            name: values[shuffle] for name, values in per_match(matches).items()})  # fmt: skip
+        shuffled = per_match(matches, lambda rows: rows[shuffle])
         wider = make_matches(matches.points0[matches.mask], matches.points1[matches.mask], capacity=205)
         for same in (matches, shuffled, wider):
             assert float(estimate(Homography(), same).score) == score
-        assert score_candidates(Homography(), stacked([matches] * 3)).tolist() == [score] * 3
+        assert score_candidates(Homography(), stack([matches] * 3)).tolist() == [score] * 3
 
 
-def test_a_plane_without_noise_is_found_to_a_pixels_thousandth():
+def test_a_plane_without_noise_is_estimated_to_a_hundredth_of_a_pixel():
     matches = pair(3, 50, 1.0, noise=0.0)
-    found = estimate(Homography(1.0, refit=True), matches)
-    assert int(found.score) == 50
-    np.testing.assert_allclose(found.matrix, PLANE / PLANE[2, 2], rtol=2e-3, atol=2e-5)
-    assert misses(found.matrix, matches).max() < 1e-2
+    got = estimate(Homography(1.0, refit=True), matches)
+    assert int(got.score) == 50
+    np.testing.assert_allclose(got.matrix, PLANE / PLANE[2, 2], rtol=2e-3, atol=2e-5)
+    assert misses(got.matrix, matches).max() < 1e-2
 
 
 @pytest.mark.slow
@@ -145,12 +133,11 @@ def test_least_squares_are_those_of_scipy():
 
 def test_msac_prefers_the_closer_of_two_models_with_as_many_inliers():
     matches = pair(6, 200, 0.5)
-    counted, close = (estimate(Homography(24.0, measure=measure), matches) for measure in ("inliers", "msac"))
-    errors = misses(close.matrix, matches)
-    inliers = errors <= 24
-    np.testing.assert_allclose(close.score, np.sum(1 - (errors[inliers] / 24) ** 2), rtol=1e-3)
-    other = misses(counted.matrix, matches)
-    assert float(close.score) >= np.sum(1 - (other[other <= 24] / 24) ** 2) - 1e-2
+    estimates = [estimate(Homography(24.0, measure=measure), matches) for measure in ("inliers", "msac")]
+    errors = (misses(model.matrix, matches) for model in estimates)
+    quality_of_inliers, quality = (np.sum(1 - (error[error <= 24] / 24) ** 2) for error in errors)
+    np.testing.assert_allclose(estimates[1].score, quality, rtol=1e-3)
+    assert float(estimates[1].score) >= quality_of_inliers - 1e-2
 
 
 @pytest.mark.optimized
@@ -159,7 +146,7 @@ def test_as_many_inliers_as_opencv():
     expected = [
         cv2.findHomography(*points, cv2.RANSAC, 24.0, maxIters=2000, confidence=0.995)[1].sum() for points in pairs
     ]
-    batch = stacked([make_matches(points0, points1) for points1, points0 in pairs])
+    batch = stack([make_matches(points0, points1) for points1, points0 in pairs])
     difference = np.asarray(score_candidates(Homography(24.0, refit=True), batch)) - expected
     assert np.median(difference) == 0
     assert np.mean(np.abs(difference) <= 2) >= 0.95
@@ -214,69 +201,52 @@ def test_a_match_counts_with_its_confidence():
     matches = pair(10, 60, 1.0, noise=0.5)
     confidence = np.zeros(CAPACITY, np.float32)
     confidence[:60] = np.random.default_rng(0).choice([0.0, 0.25, 1.0], 60)
-    sure = replace(matches, confidence=confidence)
-    assert score(sure) == confidence.sum()
+    assert score(replace(matches, confidence=confidence)) == confidence.sum()
     without = replace(matches, mask=confidence > 0, confidence=np.where(confidence > 0, 1, np.nan).astype(np.float32))
     assert score(without) == (confidence > 0).sum()
-
-
-def test_a_plane_counts_however_little_its_matches_do():
-    matches = replace(pair(10, 60, 1.0, noise=0.5), confidence=np.full(CAPACITY, 2.0**-6, np.float32))
-    assert float(estimate(Homography(), matches).score) == 60 / 64
+    assert score(replace(matches, confidence=np.full(CAPACITY, 2.0**-6, np.float32))) == 60 / 64
 
 
 @pytest.mark.slow
 def test_no_generator_of_jax_draws_otherwise_in_a_batch():
     pairs = [pair(seed, 60, 0.2, capacity=64) for seed in range(3)]
-    expected = [float(estimate(Homography(8.0), matches).score) for matches in pairs]
+    expected = [score(matches, 8.0) for matches in pairs]
     with jax.default_prng_impl("rbg"):
-        assert [float(estimate(Homography(8.0), matches).score) for matches in pairs] == expected
-        assert score_candidates(Homography(8.0), stacked(pairs)).tolist() == expected
+        assert [score(matches, 8.0) for matches in pairs] == expected
+        assert score_candidates(Homography(8.0), stack(pairs)).tolist() == expected
 
 
-@pytest.mark.parametrize(
-    "limits", [{"max_iterations": np.nan}, {"max_iterations": 0.0}, {"confidence": np.nan}, {"confidence": -1.0},
-               {"confidence": 0.0}]
-)  # fmt: skip
-def test_limits_that_are_none_score_nothing(limits):
-    assert np.isnan(estimate(Homography(**limits), pair(9, 40, 0.5)).score)
+@pytest.mark.parametrize(("limit", "numbers"), [("max_iterations", (np.nan, 0.0)), ("confidence", (np.nan, -1.0, 0.0))])
+def test_limits_without_meaning_score_nan(limit, numbers):
+    assert np.isnan([score(pair(9, 40, 0.5), **{limit: number}) for number in numbers]).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("measure", ["inliers", "msac"])
-def test_matches_of_several_types_are_scored(measure):
-    matches, scorer = pair(9, 40, 0.5), Homography(8.0, measure=measure)
-    expected = estimate(scorer, matches).score
+def test_distances_in_double_precision_change_no_score(measure):
+    matches = pair(9, 40, 0.5)
+    expected = score(matches, 8.0, measure=measure)
     with jax.enable_x64(True):
-        found = estimate(scorer, replace(matches, distance=matches.distance.astype(np.float64))).score
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+        got = score(replace(matches, distance=matches.distance.astype(np.float64)), 8.0, measure=measure)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
 @pytest.mark.slow
 def test_thresholds_and_iterations_are_swept_in_one_program():
-    batch = stacked([pair(seed, 80, 0.3) for seed in range(3)])
+    batch = stack([pair(seed, 80, 0.3) for seed in range(3)])
     grid = np.asarray(score_grid(Homography(), batch, threshold=[4.0, 8.0, 24.0], max_iterations=[20, 300]))
-    for row, threshold in enumerate([4.0, 8.0, 24.0]):
-        for column, iterations in enumerate([20.0, 300.0]):
-            expected = score_candidates(Homography(threshold, iterations), batch)
-            np.testing.assert_array_equal(grid[row, column], expected)
+    expected = [[score_candidates(Homography(threshold, iterations), batch) for iterations in (20.0, 300.0)]
+                for threshold in (4.0, 8.0, 24.0)]  # fmt: skip
+    np.testing.assert_array_equal(grid, expected)
     assert (grid[:, 1] >= grid[:, 0]).all()
 
 
 @pytest.mark.slow
-def test_nobody_gets_a_gradient_of_it():
+def test_gradients_raise_but_not_those_of_other_scores():
     matches = pair(11, 20, 0.8)
-    for wanted in (
-        lambda: jax.grad(lambda threshold: Homography(threshold)(matches))(8.0),
-        lambda: jax.grad(lambda points: Homography()(replace(matches, points0=points)))(matches.points0),
-    ):
-        with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
-            wanted()
+    with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
+        jax.grad(lambda threshold: Homography(threshold)(matches))(8.0)
+    with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
+        jax.grad(lambda points: Homography()(replace(matches, points0=points)))(matches.points0)
     beside = jax.grad(lambda scores: Homography()(matches) + jnp.sum(masked(scores, matches.mask)))(matches.scores0)
     np.testing.assert_array_equal(beside, matches.mask)
-
-
-def test_a_word_that_is_none():
-    with pytest.raises(ValueError, match=r"Homography\(measure='most'\): .*inliers, msac"):
-        Homography(measure="most")
-    assert mfvpr.Homography is Homography

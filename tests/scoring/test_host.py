@@ -1,4 +1,4 @@
-"""Scorers of the host, which others write: what is wrong with them is said, and what they did is not kept."""
+"""Scorers of users that run on the host: errors, and sweeps that do not store their scores."""
 
 from dataclasses import replace
 
@@ -13,10 +13,13 @@ from mfvpr.tuning import sweeps
 from mfvpr.types import Shortlist, per_match
 from mfvpr.utils import InputError
 from tests.builders import make_matches
-from tests.scoring.test_homography import plane_points, stacked
+from tests.scoring.batches import stack
+from tests.scoring.test_homography import plane_points
 
 COUNTS = (60, 120, 20)
-BATCH = stacked([make_matches(*plane_points(seed, count, 0.5), capacity=128) for seed, count in enumerate(COUNTS)])
+POINTS = [plane_points(seed, *case) for seed, case in enumerate(zip(COUNTS, (0.5, 0.2, 0.8), strict=True))]
+PAIRS = [make_matches(points0, points1, capacity=128, index0=np.arange(len(points0))) for points1, points0 in POINTS]
+BATCH = stack(PAIRS)
 LINES = {name: values[BATCH.mask] for name, values in per_match(BATCH).items()}
 ROW = replace(BATCH, mask=np.ones(200, bool), image_size0=BATCH.image_size0[0], **LINES)
 MATCHES = MatchSet.of([ROW], np.array([COUNTS]))
@@ -32,7 +35,7 @@ WAYS = {
 
 @mfvpr.value
 class Host:
-    """Whatever a function says of the masks."""
+    """Scores by `answer` from the masks."""
 
     shift: float = 0.0
 
@@ -48,23 +51,23 @@ def answer(masks):
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("wrong", [lambda _: 1.0, lambda _: np.ones(1), lambda masks: masks[:, :1]])
-def test_a_number_for_each_pair_is_expected(monkeypatch, way, wrong):
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda _: 1.0, r"\d+ pairs, got an array"), (lambda _: np.ones(1), r"\d+ pairs, got an array"),
+        (lambda masks: masks[:, :1], r"\d+ pairs, got an array"),
+        (lambda masks: masks.sum(axis=1) * 1j, "real numbers.* got complex"),
+        (lambda masks: ["x"] * len(masks), "real numbers.* got <U"),
+    ],
+)  # fmt: skip
+def test_a_real_number_for_each_pair_is_expected(monkeypatch, way, wrong, words):
     monkeypatch.setitem(globals(), "answer", wrong)
-    with pytest.raises(InputError, match=r"Host\.score_pairs: .*\d+ pairs, got an array"):
+    with pytest.raises(InputError, match=rf"Host\.score_pairs: .*{words}"):
         WAYS[way](Host())
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("wrong", [lambda masks: masks.sum(axis=1) * 1j, lambda masks: ["x"] * len(masks)])
-def test_real_numbers_are_expected(monkeypatch, way, wrong):
-    monkeypatch.setitem(globals(), "answer", wrong)
-    with pytest.raises(InputError, match=r"Host\.score_pairs: .*real numbers.* got (complex|<U)"):
-        WAYS[way](Host())
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_a_class_that_is_no_value_is_refused(way):
+def test_a_class_that_is_no_value_raises(way):
     class Plain(OpenCvHomography):
         pass
 
@@ -72,7 +75,7 @@ def test_a_class_that_is_no_value_is_refused(way):
         WAYS[way](Plain())
 
 
-def test_no_sweep_keeps_what_nobody_sees(monkeypatch, tmp_path):
+def test_no_sweep_stores_scores_of_code_that_may_change(monkeypatch, tmp_path):
     def first():
         return sweeps.sweep(Host(), SETTINGS, MATCHES, CANDIDATES, folder=tmp_path)[0, 0, 0, :3].tolist()
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from mfvpr import AggregatedScore, HistogramOfShifts, InputError, Matches, UnitWeight, score_candidates
+from mfvpr import AggregatedScore, HistogramOfShifts, InputError, UnitWeight, score_candidates
 from mfvpr.scoring.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
 from mfvpr.scoring.weights import match_weights
-from tests.builders import make_matches, per_match, random_matches
+from tests.builders import double, make_matches, per_match, random_matches
+from tests.scoring.batches import pair_of, stack
 
 pytestmark = pytest.mark.thorough
 
@@ -24,26 +25,19 @@ KEY = jax.random.key(0)
 def pairs(seed=0, counts=(40, 25, 0), capacity=50):
     """Several pairs, the last without a match; NaN on padding."""
     rng = np.random.default_rng(seed)
-    made = [random_matches(rng, count, capacity=capacity, sizes=SIZES) for count in counts]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *made)
+    return stack([random_matches(rng, count, capacity=capacity, sizes=SIZES) for count in counts])
 
 
 scores = jax.jit(score_candidates)
 weigh = jax.jit(LearnedWeight.__call__)
-
-
 both = pytest.mark.parametrize("names", [RELATIVE, ABSOLUTE])
+LEARNED = ("hidden", "hidden_bias", "output", "output_bias")
 
 
-def trained(names=ABSOLUTE, seed=1, hidden=5):
+def random_weight(names=ABSOLUTE):
     """A weight that is far from its start."""
-    start = LearnedWeight.create(KEY, pairs(), hidden, names=names)
-    rng = np.random.default_rng(seed)
-    learned = {
-        name: np.float32(rng.normal(size=getattr(start, name).shape))
-        for name in ("hidden", "hidden_bias", "output", "output_bias")
-    }
-    return replace(start, **learned)
+    start, rng = LearnedWeight.create(KEY, pairs(), 5, names=names), np.random.default_rng(1)
+    return replace(start, **{name: np.float32(rng.normal(size=getattr(start, name).shape)) for name in LEARNED})
 
 
 def raw_oracle(matches, k, names):
@@ -70,7 +64,8 @@ def raw_oracle(matches, k, names):
 
 def oracle(weight, matches, k):
     raw = raw_oracle(matches, k, weight.names)
-    inputs = [(raw[f] - float(weight.center[f])) / float(weight.scale[f]) for f in range(len(raw))]
+    center, scale = weight.center.tolist(), weight.scale.tolist()
+    inputs = [(raw[f] - center[f]) / scale[f] for f in range(len(raw))]
     total = float(weight.output_bias)
     for unit in range(len(weight.output)):
         drive = sum(inputs[f] * float(weight.hidden[f, unit]) for f in range(len(raw)))
@@ -90,10 +85,7 @@ def test_starts_as_the_unit_weight_in_a_scorer():
 def test_statistics_are_those_of_the_real_matches(names):
     matches = pairs()
     weight = LearnedWeight.create(KEY, matches, names=names)
-    real = [
-        raw_oracle(jax.tree.map(lambda leaf: leaf[pair], matches), k, names)  # noqa: B023
-        for pair, k in np.argwhere(matches.mask)
-    ]
+    real = [raw_oracle(pair_of(matches, pair), k, names) for pair, k in np.argwhere(matches.mask)]
     assert len(real) == 65
     np.testing.assert_allclose(weight.center, np.mean(real, axis=0), atol=1e-6)
     np.testing.assert_allclose(weight.scale, np.std(real, axis=0), rtol=1e-5)
@@ -106,16 +98,11 @@ def test_whole_pairs_of_padding_may_hold_anything(names):
     garbage = {f.name: getattr(matches, f.name).copy() for f in fields(matches)}
     for name, values in garbage.items():
         values[2] = False if name == "mask" else np.nan if np.issubdtype(values.dtype, np.floating) else -7
-    expected, got = (LearnedWeight.create(KEY, one, names=names) for one in (matches, replace(matches, **garbage)))
+    spoiled = replace(matches, **garbage)
+    expected, got = (LearnedWeight.create(KEY, batch, names=names) for batch in (matches, spoiled))
     jax.tree.map(np.testing.assert_array_equal, got, expected)
-
-    @jax.jit
-    def total(weight, padding):
-        return jnp.sum(match_weights(weight, padding))
-
-    value, gradient = jax.value_and_grad(total)(
-        trained(names), Matches(**{n: values[2] for n, values in garbage.items()})
-    )
+    total = jax.jit(lambda weight, padding: jnp.sum(match_weights(weight, padding)))
+    value, gradient = jax.value_and_grad(total)(random_weight(names), pair_of(spoiled, 2))
     assert value == 0
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
 
@@ -125,40 +112,33 @@ def test_a_constant_input_and_no_match_at_all_divide_by_1():
     weight = LearnedWeight.create(KEY, constant, names=("scores0", "ratio"))
     assert weight.scale[0] == 1
     assert weight.scale[1] == pytest.approx(0.3)
-    nothing = LearnedWeight.create(KEY, make_matches([], [], ratio=[], capacity=3))
-    assert np.all(nothing.center == 0)
-    assert np.all(nothing.scale == 1)
+    without_matches = LearnedWeight.create(KEY, make_matches([], [], ratio=[], capacity=3))
+    assert np.all(without_matches.center == 0)
+    assert np.all(without_matches.scale == 1)
 
 
 @both
 def test_values_equal_the_loops(names):
-    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(2)), trained(names)
+    matches, weight = pair_of(pairs(2)), random_weight(names)
     matches.distance[3] = matches.distance[5]  # equals share their ranks
-    expected = [oracle(weight, matches, k) for k in range(40)]
+    order = np.random.default_rng(5).permutation(50)  # padding in between
+    matches = per_match(matches, lambda rows: rows[order])
+    expected = [oracle(weight, matches, k) for k in np.flatnonzero(matches.mask)]
     assert np.ptp(expected) > 0.5
-    np.testing.assert_allclose(weigh(weight, matches)[:40], expected, rtol=2e-5)
-    assert np.all(np.isfinite(weigh(weight, matches)))
-
-
-@both
-def test_inputs_are_standardized(names):
-    matches = pairs(3, counts=(50, 50))
-    weight = LearnedWeight.create(KEY, matches, names=names)
-    inputs = np.concatenate(jax.jit(jax.vmap(weight.inputs))(matches))
-    np.testing.assert_allclose(inputs.mean(axis=0), 0, atol=1e-5)
-    np.testing.assert_allclose(inputs.std(axis=0), 1, rtol=1e-4)
+    weights = weigh(weight, matches)
+    np.testing.assert_allclose(weights[matches.mask], expected, rtol=2e-5)
+    assert np.all(np.isfinite(weights))
 
 
 def test_relative_inputs_are_those_of_other_units():
     """Another detector's scores, another length of descriptors; and more padding."""
-    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(7)), trained(RELATIVE)
+    matches, weight = pair_of(pairs(7)), random_weight(RELATIVE)
+    expected = weigh(weight, matches)[:40]
     other = replace(matches, scores0=np.float32(8) * matches.scores0 ** 3, scores1=matches.scores1 + 5,
                     distance=np.float32(4) * matches.distance)  # fmt: skip
-    np.testing.assert_allclose(weigh(weight, other)[:40], weigh(weight, matches)[:40], rtol=1e-5)
-    wider = per_match(
-        matches, lambda rows: np.concatenate([rows, np.full_like(rows, np.nan if rows.dtype == np.float32 else 0)])
-    )
-    np.testing.assert_allclose(weigh(weight, wider)[:40], weigh(weight, matches)[:40], rtol=1e-6)
+    np.testing.assert_allclose(weigh(weight, other)[:40], expected, rtol=1e-5)
+    wider = pair_of(pairs(7, capacity=100))
+    np.testing.assert_allclose(weigh(weight, wider)[:40], expected, rtol=1e-6)
 
 
 def test_inputs_by_name():
@@ -170,23 +150,15 @@ def test_inputs_by_name():
         LearnedWeight.create(KEY, pairs(), names=("ratio", "depth"))
 
 
-@both
-def test_order_of_matches_moves_along(names):
-    matches, weight = jax.tree.map(lambda leaf: leaf[0], pairs(4)), trained(names)
-    order = np.random.default_rng(5).permutation(len(matches.mask))
-    moved = per_match(matches, lambda rows: rows[order])
-    np.testing.assert_allclose(weigh(weight, moved), weigh(weight, matches)[order], rtol=1e-6)
-
-
 @pytest.mark.parametrize("bias", [-1e4, -90.0, 1e4])
 def test_always_above_0_and_finite(bias):
-    weights = weigh(replace(trained(), output_bias=np.float32(bias)), jax.tree.map(lambda leaf: leaf[0], pairs()))
+    weights = weigh(replace(random_weight(), output_bias=np.float32(bias)), pair_of(pairs()))
     assert np.all(weights > 0)
     assert np.all(np.isfinite(weights))
 
 
 def test_gradients_are_finite_and_statistics_have_none():
-    matches, weight = pairs(), trained()
+    matches, weight = pairs(), random_weight()
 
     @jax.jit
     def total(weight, points0, distance):
@@ -204,10 +176,8 @@ def test_gradients_are_finite_and_statistics_have_none():
 @both
 def test_gradients_equal_finite_differences(names):
     with jax.enable_x64(True):
-        double = lambda leaf: jnp.asarray(leaf, dtype=float) if leaf.dtype == np.float32 else leaf  # noqa: E731
-        matches = jax.tree.map(double, random_matches(np.random.default_rng(6), 7, sizes=SIZES))
-        weight = jax.tree.map(double, trained(names))
-        free = {name: getattr(weight, name) for name in ("hidden", "hidden_bias", "output", "output_bias")}
+        matches, weight = double((random_matches(np.random.default_rng(6), 7, sizes=SIZES), random_weight(names)))
+        free = {name: getattr(weight, name) for name in LEARNED}
 
         @jax.jit
         def total(free, points1, ratio):
@@ -216,8 +186,8 @@ def test_gradients_equal_finite_differences(names):
         check_grads(total, (free, matches.points1, matches.ratio), order=1, modes=["rev"])
 
 
-def test_matches_without_a_ratio_are_refused_with_the_mend():
+def test_matches_without_a_ratio_raise():
     matches = make_matches([(1, 2)], [(3, 4)])
-    for call in (trained(), trained().inputs, lambda matches: LearnedWeight.create(KEY, matches)):
+    for call in (random_weight(), random_weight().inputs, lambda matches: LearnedWeight.create(KEY, matches)):
         with pytest.raises(ValueError, match="match them with_ratio=True"):
             call(matches)

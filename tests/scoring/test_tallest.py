@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import (
-    AnchorPoints,
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     HistogramOfShifts,
@@ -24,22 +23,17 @@ from mfvpr.scoring import tallest
 from mfvpr.scoring.lattice import Lattice
 from mfvpr.scoring.tallest import tallest_bins
 from tests.builders import per_match, random_matches
+from tests.scoring.batches import pair_of, stack
 
 pytestmark = pytest.mark.thorough
 
 SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
 CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
 pairs = jax.jit(tallest_bins, static_argnums=3)
-score = jax.jit(lambda scorer, matches: scorer(matches))
 bounds = jax.jit(tallest.block_bounds, static_argnums=(3, 4))
 
 
-def stack(trees):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
-
-
 def search(shifts, weights, lattice, capacity):
-    """Of one pair."""
     return pairs(*stack([(shifts, weights, lattice)]), capacity)[0]
 
 
@@ -47,7 +41,8 @@ def search(shifts, weights, lattice, capacity):
 def matches():
     rng = np.random.default_rng(0)
     sizes = [((336, 336), (336, 336)), ((320, 240), (336, 200)), ((200, 300), (336, 336)), ((336, 336), (90, 30))]
-    return stack([random_matches(rng, n, capacity=60, sizes=s) for n, s in zip((60, 0, 1, 33), sizes, strict=True)])
+    cases = zip((60, 0, 1, 33), sizes, strict=True)
+    return stack([random_matches(rng, count, capacity=60, sizes=of_pair) for count, of_pair in cases])
 
 
 @st.composite
@@ -92,7 +87,7 @@ def all_bins(shifts, weights, lattice, dtype):
 
 @given(histograms())
 def test_no_bin_is_taller(histogram):
-    """Of float64 sums within what float32 rounds off of the votes; of weights 0 exactly 0."""
+    """Up to the rounding of votes to float32; exactly 0 for weights of 0."""
     shifts, weights, lattice, capacity = histogram
     assert capacity**2 * WEIGHTINGS > tallest.WORTHWHILE
     got = search(shifts, weights, lattice, capacity)
@@ -131,11 +126,11 @@ def test_most_blocks_are_left_out(monkeypatch):
     evaluated = []
     evaluate = tallest.evaluate_blocks
 
-    def noted(blocks, *inputs):
+    def record_blocks(blocks, *inputs):
         jax.debug.callback(lambda blocks: evaluated.extend(blocks.tolist()), blocks)
         return evaluate(blocks, *inputs)
 
-    monkeypatch.setattr(tallest, "evaluate_blocks", noted)
+    monkeypatch.setattr(tallest, "evaluate_blocks", record_blocks)
     jax.block_until_ready(jax.jit(partial(tallest.search_blocks, capacity=136))(shifts, pair.scores0[None], lattice))
     jax.effects_barrier()
     assert len(evaluated) == len(set(evaluated))
@@ -157,14 +152,14 @@ OPTIONS = [
 
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_a_grid_equals_pair_by_pair(matches, options):
-    """Every option, sizes of every pair its own, searched (5 px) and whole (15 px), empty and single pairs."""
+    """Every option, pairs of different sizes, searched (5 px) and whole (15 px), empty and single pairs."""
     matches = replace(matches, confidence=None) if "weight" in options else matches
     scorer, sigmas, bin_sizes = HistogramOfShifts(**options), [4.0, 30.0], [5.0, 15.0]
     got = score_grid(scorer, matches, sigma=sigmas, bin_size=bin_sizes)
-    for i, sigma in enumerate(sigmas):
-        for j, bin_size in enumerate(bin_sizes):
-            one = replace(scorer, sigma=sigma, bin_size=bin_size, max_bins=144)
-            np.testing.assert_allclose(got[i, j], score_candidates(one, matches), rtol=2e-6, atol=1e-6)
+    for sigma, row in zip(sigmas, got, strict=True):
+        scorers = [replace(scorer, sigma=sigma, bin_size=bin_size, max_bins=144) for bin_size in bin_sizes]
+        expected = [score_candidates(scorer, matches) for scorer in scorers]
+        np.testing.assert_allclose(row, expected, rtol=2e-6, atol=1e-6)
 
 
 def test_a_grid_with_weights_and_distances_equals_pair_by_pair(matches):
@@ -216,7 +211,7 @@ def test_no_width_no_score(matches, sigma):
 
 
 def test_derivatives_are_those_of_all_bins(matches):
-    """By points, weights and sigma, under jit and vmap, of what is searched."""
+    """With respect to points, weights and sigma, under jit and vmap, for bins that are searched."""
     scorer = HistogramOfShifts(max_bins=136)
 
     def of_grid(sigma, points1, scores0):
@@ -230,65 +225,39 @@ def test_derivatives_are_those_of_all_bins(matches):
 
     inputs = jnp.float32(12.0), jnp.asarray(matches.points1), jnp.asarray(matches.scores0)
     got, expected = (jax.jit(jax.grad(f, argnums=(0, 1, 2)))(*inputs) for f in (of_grid, of_pairs))
-    for one, other in zip(got, expected, strict=True):
-        assert np.isfinite(one).all()
-        np.testing.assert_allclose(one, other, rtol=2e-5, atol=1e-6)
+    for gradient, of_all_bins in zip(got, expected, strict=True):
+        assert np.isfinite(gradient).all()
+        np.testing.assert_allclose(gradient, of_all_bins, rtol=2e-5, atol=1e-6)
     sigmas = jnp.array([7.0, 12.0])
     batched = jax.jit(jax.vmap(lambda sigma: of_grid(sigma, *inputs[1:])))(sigmas)
     np.testing.assert_allclose(batched, [of_pairs(sigma, *inputs[1:]) for sigma in sigmas], rtol=2e-6)
 
 
-def test_other_values_compile_nothing(matches, compilations):
-    matches = jax.tree.map(jnp.asarray, matches)
-
-    def grid(shift):
-        axes = {"sigma": [5.0 + shift, 30.0], "bin_size": [5.0 + shift / 100, 15.0], "max_distance": [0.5, 1.0 + shift]}
-        return jax.block_until_ready(score_grid(HistogramOfShifts(), matches, **axes))
-
-    grid(0.0)
-    compilations.reset()
-    grid(1.0)
-    assert compilations.count == 0
-
-
 @pytest.mark.parametrize(
-    ("cell_weight", "first"), [("winner_sum", "query"), ("cell_sum", "candidate"), ("ones", "query")]
+    "options",
+    [{"bin_size": size, "max_bins": 136} for size in (0.0, -5.0, np.nan)]
+    + [{"shift_range": (-5.0, 5.0), "align": "zero_center"}, {"truncate": np.nan}, {"sigma": 0.0}, {"sigma": -5.0}],
+    ids=str,
 )
-def test_anchors_do_not_depend_on_the_slots(cell_weight, first):
-    """Fewer slots than cells, where occupied cells alone are compared, and more."""
-    scorer = AnchorPoints(num_bins=9, window=5.0, cell_weight=cell_weight, first=first, include_self=False)
-    for count in (0, 1, 60):
-        few, many = (random_matches(np.random.default_rng(2), count, capacity=slots) for slots in (60, 100))
-        np.testing.assert_allclose(score(scorer, few), score(scorer, many), rtol=1e-6)
-
-
-@pytest.mark.parametrize("bin_size", [0.0, -5.0, np.nan])
-def test_no_bins_no_score(matches, bin_size):
-    """Traced, so that nobody could refuse it; of thousands of bins XLA's maximum on a CPU would pass over NaN."""
-    got = jax.jit(lambda size: score_candidates(HistogramOfShifts(bin_size=size, max_bins=136), matches))(bin_size)
+def test_numbers_without_meaning_score_nan(matches, options):
+    """Traced, where nothing can raise; XLA's maximum over thousands of bins on a CPU would skip NaN."""
+    traced = {name: number for name, number in options.items() if isinstance(number, float)}
+    scorer = HistogramOfShifts(**{"max_bins": 45} | options)
+    got = jax.jit(lambda traced: score_candidates(replace(scorer, **traced), matches))(traced)
     np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1))
 
 
-@pytest.mark.parametrize(
-    ("scorer", "bins"),
-    [
-        (HistogramOfShifts(bin_size=1e8), (1, 1)),
-        (HistogramOfShifts(shift_range=(0.0, 30.0)), (1, 4)),
-        (HistogramOfShifts(shift_range=(-5.0, 5.0), align="zero_center"), None),
-        (HistogramOfShifts(truncate=np.nan), None),
-    ],
-)
-def test_there_is_always_a_bin_but_not_for_what_has_no_meaning(matches, scorer, bins):
-    got = score_candidates(scorer, matches)
-    np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1) if bins is None else False)
-    if bins is not None:
-        found = scorer.histogram(jax.tree.map(lambda leaf: leaf[0], matches))
-        assert (len(found.centers_x), len(found.centers_y)) == (max(bins), max(bins))
-        assert np.isfinite(found.scores).sum() == bins[0] * bins[1]
+@pytest.mark.parametrize(("options", "bins"), [({"bin_size": 1e8}, (1, 1)), ({"shift_range": (0.0, 30.0)}, (1, 4))])
+def test_there_is_always_a_bin(matches, options, bins):
+    scorer = HistogramOfShifts(**options)
+    assert np.isfinite(score_candidates(scorer, matches)).all()
+    got = scorer.histogram(pair_of(matches))
+    assert (len(got.centers_x), len(got.centers_y)) == (max(bins), max(bins))
+    assert np.isfinite(got.scores).sum() == bins[0] * bins[1]
 
 
 def test_bins_of_an_infinite_shift_are_no_numbers(matches):
-    pair = jax.tree.map(lambda leaf: leaf[0], matches)
+    pair = pair_of(matches)
     points = pair.points1.copy()
     points[np.flatnonzero(pair.mask)[0]] = np.inf
     assert np.isnan(HistogramOfShifts().histogram(replace(pair, points1=points)).scores).all()

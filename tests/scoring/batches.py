@@ -1,0 +1,20 @@
+"""Compiled scores, and batches of pairs."""
+
+import jax
+import numpy as np
+import pytest
+
+score = jax.jit(lambda scorer, matches: scorer(matches))
+
+
+def stack(pairs):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+
+
+def pair_of(batch, row=0):
+    return jax.tree.map(lambda leaf: leaf[row], batch)
+
+
+def each_scorer(scorers):
+    """Parametrize a test by scorers."""
+    return pytest.mark.parametrize("scorer", scorers, ids=lambda scorer: type(scorer).__name__)
