@@ -72,7 +72,6 @@ class Features:
         keypoints: `[..., N, 2]` (x, y), px.
         descriptors: `[..., N, D]`; this library's networks and RootSIFT have unit length, others may differ.
         scores: `[..., N]` detection scores, larger = better.
-        mask: `[..., N]` bool.
         image_size: `[..., 2]` (width, height), px.
     """
 
@@ -98,7 +97,6 @@ class Matches:
         distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] for unit length.
         scores0: `[..., K]` detection scores in the query.
         scores1: `[..., K]` detection scores in the candidate.
-        mask: `[..., K]` bool.
         image_size0: `[..., 2]` (width, height) of the query, px.
         image_size1: `[..., 2]` (width, height) of the candidate, px.
         ratio: `[..., K]` distance to the nearest descriptor of the candidate over the distance to the second nearest,
@@ -152,9 +150,9 @@ class Shortlist:
     """Best candidates of the retrieval for each query.
 
     Attributes:
-        indices: `[Q, C]` int32 database rows, best first, -1 = none.
-        scores: `[Q, C]` retrieval scores (cosine similarity).
-        mask: `[Q, C]` bool, False where the index is -1.
+        indices: database rows, int32, best first, -1 = none.
+        scores: retrieval scores (cosine similarity).
+        mask: False where the index is -1.
     """
 
     indices: Int[Array, "queries candidates"]
@@ -167,8 +165,8 @@ class Ranking:
     """A re-ranked shortlist.
 
     Attributes:
-        order: `[Q, C]` int32 positions into the shortlist, best first.
-        scores: `[Q, C]` re-ranking scores in the shortlist's order (not sorted).
+        order: positions into the shortlist, int32, best first.
+        scores: re-ranking scores in the shortlist's order (not sorted).
     """
 
     order: Int[Array, "queries candidates"]

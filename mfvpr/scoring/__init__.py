@@ -17,7 +17,7 @@ from mfvpr.scoring.lost import LostScore
 from mfvpr.scoring.phrases import VisualPhrases
 from mfvpr.scoring.rapid import RapidSpatialScore
 from mfvpr.scoring.registry import ALONE, PAPER, SCORERS
-from mfvpr.scoring.scorer import Scorer, check_host, on_host, require_real, score_pairs
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 
 __all__ = [
@@ -37,10 +37,6 @@ __all__ = [
     "Scorer",
     "ShiftHistogram",
     "VisualPhrases",
-    "check_host",
     "image_sizes",
     "match_shifts",
-    "on_host",
-    "require_real",
-    "score_pairs",
 ]

@@ -37,8 +37,7 @@ class AggregatedScore:
     clamp: bool = flag(False)
     temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32."""

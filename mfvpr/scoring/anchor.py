@@ -176,20 +176,16 @@ class AnchorPoints:
     def _reach(self) -> tuple[Array, Array]:
         """Lowest and highest offset of a cell in the window."""
         window = jnp.asarray(self.window, dtype=float)
-        half = jnp.floor(window / 2)
-        if self.window_mode == "half_floor":
-            return -half, half
-        if self.window_mode == "asymmetric":
-            return -half, window - half - 1
-        if self.window_mode == "odd_down":
-            half = jnp.floor((window - 1) / 2)
-            return -half, half
-        return -window, window
+        half, half_of_odd = jnp.floor(window / 2), jnp.floor((window - 1) / 2)
+        return {
+            "half_floor": (-half, half),
+            "asymmetric": (-half, window - half - 1),
+            "odd_down": (-half_of_odd, half_of_odd),
+            "radius": (-window, window),
+        }[self.window_mode]
 
 
-def _sums_by_key(
-    values: Float[Array, " slots"], keys: Int[Array, " slots"], num_keys: int, *, pairwise: bool
-) -> Float[Array, " slots"]:
+def _sums_by_key(values: Array, keys: Array, num_keys: int, *, pairwise: bool) -> Float[Array, " slots"]:
     """Sum of all `values` with the same key."""
     if pairwise:  # few values and very many keys
         return jnp.sum(jnp.where(keys[:, None] == keys[None], values[:, None], 0.0), axis=0)

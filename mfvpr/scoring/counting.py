@@ -21,8 +21,7 @@ class MatchCount:
 
     single: str = choice("count", "zero", note="a pair with one match")
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32."""

@@ -7,7 +7,7 @@ a patch of n x n cells around it. A cell of the patch agrees if index[anchor + o
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mfvpr.scoring.fields import check_choices, choice, flag, whole
 from mfvpr.scoring.weights import match_confidence
@@ -77,15 +77,12 @@ class GridAnchors:
         score = self._agreements(index, matched, cells)
         if self.wrap:
             score += self._agreements_outside(index, matched, cells)
-        counts = [jnp.asarray(count) for count in (matches.count0, matches.count1) if count is not None]
         usable = jnp.all((cell1 >= 0) & (cell1 < len(cells)) & (cell0 >= 0) & (cell0 < len(cells)))
-        for count in counts:
-            usable &= count == len(cells)
+        for count in (matches.count0, matches.count1):
+            usable &= count is None or jnp.asarray(count) == len(cells)
         return jnp.where(usable | ~jnp.any(real), score.astype(jnp.float32), jnp.nan)
 
-    def _agreements(
-        self, index: Int[Array, " cells"], matched: Bool[Array, " cells"], cells: Int[Array, " cells"]
-    ) -> Int[Array, ""]:
+    def _agreements(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
         """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
 
         Agreement is symmetric, so that half of the offsets suffice: those to the right, and those in the rows below.
@@ -116,9 +113,7 @@ class GridAnchors:
         counts = jax.lax.fori_loop(1, half + 1, lambda row, counts: counts + count_offsets(row, full_row), right)
         return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)
 
-    def _agreements_outside(
-        self, index: Int[Array, " cells"], matched: Bool[Array, " cells"], cells: Int[Array, " cells"]
-    ) -> Int[Array, ""]:
+    def _agreements_outside(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
         """Number of anchors that agree with the value of the padding around the grid."""
         side, half = self.side, self.size // 2
         row, column = jnp.divmod(cells, side)

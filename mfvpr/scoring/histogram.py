@@ -96,8 +96,7 @@ class HistogramOfShifts:
         None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
     )
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32: the (smooth) maximum over bins, 0 without matches."""
@@ -251,7 +250,7 @@ class HistogramOfShifts:
         return scores * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (scores.ndim - 1))
 
     def _lattice(self, matches: Matches) -> Lattice:
-        dtype = self._shifts(matches).dtype
+        dtype = match_shifts(matches).dtype
         bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
         first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
         return Lattice(first, num_bins, bin_size, self._deviation(dtype), truncate)
@@ -284,15 +283,11 @@ class HistogramOfShifts:
         num_bins = xp.maximum(xp.ceil((upper - edge) / bin_size - slack), 1)
         return edge + bin_size / 2, xp.where((bin_size > 0) & (lower <= upper), num_bins, 0)
 
-    def _shifts(self, matches: Matches) -> Array:
-        shifts = match_shifts(matches)
-        return shifts if self.direction == "candidate_minus_query" else -shifts
-
     def _shifts_by_scale(self, matches: Matches) -> Float[Array, "scales 2 slots"]:
         """Shifts along x and along y, at every scale."""
-        shifts = [self._shifts(compensate_scale(matches, scale)).T for scale in self.scales]
+        shifts = jnp.stack([match_shifts(compensate_scale(matches, scale)).T for scale in self.scales])
         # The barrier keeps the copy: strided coordinates would keep the exponentials from being vectorized.
-        return jax.lax.optimization_barrier(jnp.stack(shifts))
+        return jax.lax.optimization_barrier(shifts if self.direction == "candidate_minus_query" else -shifts)
 
     def _deviation(self, dtype: Any) -> Array:
         sigma = positive(self.sigma, dtype)

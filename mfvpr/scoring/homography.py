@@ -67,8 +67,7 @@ class Homography:
     per_feature: bool = flag(False)
     seed: int = whole(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32."""

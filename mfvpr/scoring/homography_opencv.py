@@ -35,8 +35,7 @@ class OpenCvHomography:
     estimator: str = choice("ransac", "magsac")
     few: str = choice("count", "zero", note="less than 4 matches")
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
         """Score of one pair, float32.

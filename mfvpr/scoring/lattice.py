@@ -57,8 +57,7 @@ def votes(
 ) -> tuple[Float[Array, "bins slots"], Float[Array, "bins slots"]]:
     """Unweighted votes of shifts along x and along y."""
     index = jnp.arange(capacity, dtype=shifts.dtype)
-    x, y = (votes_along(axis, index, shifts, lattice) for axis in (0, 1))
-    return x, y
+    return votes_along(0, index, shifts, lattice), votes_along(1, index, shifts, lattice)
 
 
 def votes_along(
@@ -105,7 +104,6 @@ def pool_bins(
     """
     votes_x, votes_y = votes(shifts, lattice, capacity)
     inside = lattice.inside(capacity)
-
     return map_rows(lambda weights: pool(bin_scores(votes_x, votes_y, weights), inside), weights)
 
 
@@ -150,23 +148,13 @@ def climb(
     return shift
 
 
-def _pull(
-    shift: Float[Array, "2"],
-    shifts: Float[Array, "slots 2"],
-    weights: Float[Array, " slots"],
-    deviation: Float[Array, ""],
-) -> tuple[Float[Array, "slots 2"], Float[Array, " slots"]]:
+def _pull(shift: Array, shifts: Array, weights: Array, deviation: Array) -> tuple[Array, Array]:
     """Offsets of the matches from a shift, and their weighted votes for it."""
     offsets = shifts - shift[None]
     return offsets, weights * jnp.exp(-0.5 * jnp.sum((offsets / deviation) ** 2, axis=-1))
 
 
-def _steps(
-    shift: Float[Array, "2"],
-    shifts: Float[Array, "slots 2"],
-    weights: Float[Array, " slots"],
-    deviation: Float[Array, ""],
-) -> Float[Array, "2 2"]:
+def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Float[Array, "2 2"]:
     """Newton's step and the step of mean shift, px; 0 without votes.
 
     For mean shift see Comaniciu & Meer, PAMI 2002. If the sum of votes is not concave, a multiple of the identity is

@@ -26,7 +26,8 @@ class LearnedWeight:
     """Learned match weight w = softplus(z), z = v . tanh(x M + b) + c, above 0, without unit.
 
     x are the standardized inputs of a match. `center` and `scale` are statistics without gradient, so that an optimizer
-    does not change them. Exclude them from weight decay with `optax.masked`.
+    does not change them. Exclude them from weight decay with `optax.masked`. A weight with the input `ratio` raises an
+    InputError for matches without a ratio.
 
     Attributes:
         center: mean of every input.
@@ -60,7 +61,7 @@ class LearnedWeight:
             names: names of the inputs.
 
         Raises:
-            InputError: the matches have no ratio, or a name is unknown.
+            InputError: a name is unknown.
         """
         if not names or isinstance(names, str) or len({*names}) < len(names):
             raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")
@@ -83,32 +84,18 @@ class LearnedWeight:
         )
 
     def __call__(self, matches: Matches) -> Float[jax.Array, " slots"]:
-        """Weights of one pair; finite on padding.
-
-        Raises:
-            InputError: the matches have no ratio.
-        """
+        """Weights of one pair; finite on padding."""
         weights = jax.nn.softplus(self.logits(matches))
         return jnp.maximum(weights, jnp.finfo(weights.dtype).tiny)  # softplus may underflow
 
     def logits(self, matches: Matches) -> Float[jax.Array, " slots"]:
-        """z of one pair: log-odds that a match is correct, if the training taught this.
-
-        Raises:
-            InputError: the matches have no ratio.
-        """
+        """z of one pair: log-odds that a match is correct, if the training taught this."""
         exact = jax.lax.Precision.HIGHEST
         hidden = jnp.tanh(jnp.matmul(self.inputs(matches), self.hidden, precision=exact) + self.hidden_bias[None])
         return jnp.matmul(hidden, self.output, precision=exact) + self.output_bias
 
     def inputs(self, matches: Matches) -> Float[jax.Array, "slots inputs"]:
-        """Standardized inputs of every match.
-
-        `center + scale * inputs` undoes the standardization.
-
-        Raises:
-            InputError: the matches have no ratio.
-        """
+        """Standardized inputs of every match; `center + scale * inputs` undoes the standardization."""
         center, scale = jax.lax.stop_gradient((jnp.asarray(self.center), jnp.asarray(self.scale)))
         return (_raw_inputs(matches, self.names) - center[None]) / scale[None]
 
@@ -125,7 +112,7 @@ def _field(name: str, matches: Matches) -> Array:
 
 def _rank(name: str, matches: Matches) -> Array:
     """Share of the pair's matches with a smaller value, in (0, 1); equal values count half."""
-    values = masked(as_float(getattr(matches, name)), matches.mask)
+    values = masked(_field(name, matches), matches.mask)
     return jax.lax.stop_gradient(jnp.vectorize(_mid_ranks, signature="(k),(k)->(k)")(values, matches.mask))
 
 

@@ -37,8 +37,7 @@ class LostScore:
     form: str = choice("weighted", "unweighted", "described")
     mirrored: bool = flag(False, "views from opposite directions")
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32."""

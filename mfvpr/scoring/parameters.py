@@ -17,15 +17,11 @@ from mfvpr.types import Array
 def numbers(scorer: Any) -> dict[str, Any]:
     """Numbers of a scorer by dotted name, which a grid may vary; also a `temperature` of None."""
     leaves = jax.tree_util.tree_leaves_with_path(scorer, is_leaf=lambda leaf: leaf is None)
-    by_name = {
+    return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
         for path, leaf in leaves
         if path and all(isinstance(key, GetAttrKey) for key in path)
-    }
-    return {
-        name: leaf
-        for name, leaf in by_name.items()
-        if _is_number(leaf) or (leaf is None and name.rpartition(".")[2] == "temperature")
+        if _is_number(leaf) or (leaf is None and path[-1].name == "temperature")
     }
 
 
@@ -62,7 +58,7 @@ def with_capacity(
         scorer: any scorer, or a structure of scorers; parts are looked up at any depth.
         image_size0: px, of queries.
         image_size1: px, of candidates.
-        multiple: capacities are multiples of it, so that many values share few programs.
+        multiple: capacities are rounded up to a multiple of it, so that many values share few programs.
     """
     has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731
 

@@ -32,8 +32,7 @@ class RapidSpatialScore:
     size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = what reach says")
     per_feature: bool = flag(False)
 
-    def __post_init__(self) -> None:
-        check_choices(self)
+    __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair, float32.

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float
 
 from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
@@ -21,12 +21,9 @@ def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
 def compensate_scale(matches: Matches, scale: float) -> Matches:
     """Matches of one pair, rescaled as if both images showed the place at the same size.
 
-    Points are scaled about the centers of their images: those of the query by sqrt(scale), those of the candidate by
-    1 / sqrt(scale). This treats both images alike, and position errors count the same in both.
-
-    Args:
-        matches: `[K, ...]`.
-        scale: size of the place in the candidate relative to the query.
+    `scale` is the size of the place in the candidate relative to the query. Points are scaled about the centers of
+    their images: those of the query by sqrt(scale), those of the candidate by 1 / sqrt(scale). This treats both images
+    alike, and position errors count the same in both.
     """
     if scale == 1:
         return matches
@@ -36,9 +33,7 @@ def compensate_scale(matches: Matches, scale: float) -> Matches:
     return replace(matches, points0=points0, points1=points1)
 
 
-def _scale_about_center(
-    points: Num[Array, "slots 2"], image_size: Num[Array, "2"], factor: float
-) -> Float[Array, "slots 2"]:
+def _scale_about_center(points: Array, image_size: Array, factor: float) -> Float[Array, "slots 2"]:
     center = at_least_single(image_size)[None] / 2
     return center + factor * (at_least_single(points) - center)
 
@@ -73,14 +68,9 @@ def where_usable(
     weights: Float[Array, "_ slots"],
     usable: Bool[Array, ""],
 ) -> Float[jax.Array, "*weightings"]:
-    """Values of one pair where they mean something; 0 without matches, NaN if not usable.
+    """Values of one pair; 0 without matches, NaN if not usable.
 
-    Args:
-        values: `[W]`, or of any shape with a single weighting.
-        matches: of the pair.
-        shifts: of the matches; a shift that is not finite makes all values NaN.
-        weights: of the matches, by weighting; a weight that is not finite makes its value NaN.
-        usable: False makes all values NaN.
+    A shift that is not finite makes all values NaN; a weight that is not finite makes the values of its weighting NaN.
     """
     usable = usable & are_finite(shifts, weights)
     return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)

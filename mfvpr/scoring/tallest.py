@@ -129,12 +129,7 @@ def block_bounds(
 
 
 def _block_votes(
-    shifts: Float[Array, " slots"],
-    axis: int,
-    start: Float[Array, " blocks"],
-    lattice: Lattice,
-    side: int,
-    narrow: Array,
+    shifts: Array, axis: int, start: Array, lattice: Lattice, side: int, narrow: Array
 ) -> Float[Array, "blocks slots"]:
     """Votes along one axis for the first bin of narrow blocks, else the nearest."""
     last = lattice.num_bins[axis] - 1

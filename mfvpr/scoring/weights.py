@@ -39,7 +39,7 @@ class RatioWeight:
 
     The ratio is the distance to the nearest over the distance to the second nearest descriptor. It tells how ambiguous
     a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two keypoints of the candidate equally has
-    weight 0. This weight is not from the paper.
+    weight 0. This weight is not from the paper. Matches without a ratio raise an InputError.
 
     Attributes:
         exponent: a larger exponent emphasizes unambiguous matches; no value is better than 1.
@@ -48,11 +48,6 @@ class RatioWeight:
     exponent: float | Array = 1.0
 
     def __call__(self, matches: Matches) -> Float[jax.Array, "*batch slots"]:
-        """Weights of the matches.
-
-        Raises:
-            InputError: the matches have no ratio.
-        """
         lead = 1.0 - match_ratio(matches)
         is_zero = (lead <= 0) & jnp.isfinite(lead)  # the derivatives of the power would be infinite
         return jnp.where(is_zero, 0.0, jnp.where(is_zero, 1.0, lead) ** jnp.asarray(self.exponent, lead.dtype))
