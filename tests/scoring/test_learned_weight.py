@@ -2,7 +2,7 @@
 
 import math
 import operator
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -95,10 +95,9 @@ def test_statistics_are_those_of_the_real_matches(names):
 @both
 def test_whole_pairs_of_padding_may_hold_anything(names):
     matches = pairs()
-    garbage = {f.name: getattr(matches, f.name).copy() for f in fields(matches)}
-    for name, values in garbage.items():
-        values[2] = False if name == "mask" else np.nan if np.issubdtype(values.dtype, np.floating) else -7
-    spoiled = replace(matches, **garbage)
+    spoiled = jax.tree.map(np.copy, matches)
+    for values in jax.tree.leaves(spoiled):
+        values[2] = {"b": False, "f": np.nan, "i": -7}[values.dtype.kind]
     expected, got = (LearnedWeight.create(KEY, batch, names=names) for batch in (matches, spoiled))
     jax.tree.map(np.testing.assert_array_equal, got, expected)
     total = jax.jit(lambda weight, padding: jnp.sum(match_weights(weight, padding)))

@@ -89,6 +89,9 @@ def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
     got = score(replace(scorer, temperature=temperature), matches)
     # Of up to 900 bins: the temperature times a logarithm near 7, in single precision.
     np.testing.assert_allclose(got, expected, rtol=2e-5, atol=4e-6 * (1 + temperature))
+    hard = score(scorer, matches)
+    slack = 1e-6 * (1 + abs(hard) + temperature)
+    assert hard - temperature * np.log(900) - slack <= got <= hard + slack
 
 
 @draws(ANCHORS, [0.02, 0.3, 1.0, 3.0])
