@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int, Num
 
 from mfvpr.matching.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.reranking.grids import score_settings
@@ -20,14 +21,14 @@ from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_con
 from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.threads import ordered_map
 
-PaddedBatch = tuple[np.ndarray, Matches]  # positions [n] of its pairs, and their Matches [P, K, ...]
+PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 
 
 def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
     devices: Sequence[Device] | None = None, track: Track = no_progress,
-) -> dict[str, np.ndarray]:  # fmt: skip
-    """Scores `[Q, C]` float32 by name of the scorer; NaN without a candidate.
+) -> dict[str, Float[np.ndarray, "queries candidates"]]:  # fmt: skip
+    """Scores, float32, by name of the scorer; NaN without a candidate.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values
     (histograms: up to the next multiple of 8 bins). A pair without matches scores 0.
@@ -104,8 +105,12 @@ def run_batches(
     return iter(run_all(run_batch, enumerate(batches)))
 
 
-def fuse_all(match_set: MatchSet | Scales, scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Fused scores `[..., Q, C]` from scores `[S, ..., Q, C]` of all scales; `mask` is `[Q, C]`."""
+def fuse_all(
+    match_set: MatchSet | Scales,
+    scores: Num[np.ndarray, "scales *batch queries candidates"],
+    mask: Bool[np.ndarray, "queries candidates"],
+) -> Float[np.ndarray, "*batch queries candidates"]:
+    """Fused scores of all scales."""
     if not isinstance(match_set, Scales):
         return scores[0]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)

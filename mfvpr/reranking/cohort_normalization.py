@@ -13,6 +13,7 @@ score high with each other and are treated as hubs.
 """
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.datasets import QuerySequence
@@ -46,16 +47,18 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
     return without_neighbors(QuerySequence("cohort", database.folder, None), number, equal_rows, int(neighbors))
 
 
-def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, name: str = "a scorer") -> np.ndarray:
-    """Hubness of each database image, `[N]` float64 above 0.
+def hubness(
+    candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"], num_database: int, *, name: str = "a scorer"
+) -> Float[np.ndarray, " database"]:
+    """Hubness of each database image, float64 above 0.
 
     The hubness is the mean score of the image with other places, over the mean of all scores. `PRIOR` average scores
     are added to the scores of each image. The hubness is 1 for an image without scores, and if all scores are 0.
 
     Args:
-        candidates: `[M, C]` of the cohort's images.
-        scores: `[M, C]` of the candidates; scores that are not finite are ignored.
-        num_database: N.
+        candidates: of the cohort's images.
+        scores: of the candidates; scores that are not finite are ignored.
+        num_database: number of database images.
         name: name of the scorer, for the error.
 
     Raises:
@@ -70,15 +73,21 @@ def hubness(candidates: Shortlist, scores: np.ndarray, num_database: int, *, nam
     return (sums + PRIOR) / (np.bincount(rows, minlength=num_database) + PRIOR)
 
 
-def by_hubness(candidates: Shortlist, scores: np.ndarray, hubness: np.ndarray, *, name: str = "a scorer") -> np.ndarray:
-    """Scores `[Q, C]` divided by the hubness of the candidates, NumPy float32.
+def by_hubness(
+    candidates: Shortlist,
+    scores: Num[np.ndarray, "queries candidates"],
+    hubness: Float[np.ndarray, " database"],
+    *,
+    name: str = "a scorer",
+) -> Float[np.ndarray, "queries candidates"]:
+    """Scores divided by the hubness of the candidates, float32.
 
     A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
 
     Args:
-        candidates: `[Q, C]` of a sequence.
-        scores: `[Q, C]` of the candidates.
-        hubness: `[N]`, see the function `hubness`.
+        candidates: of a sequence.
+        scores: of the candidates.
+        hubness: see the function `hubness`.
         name: name of the scorer, for the error.
 
     Raises:

@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
@@ -36,8 +37,10 @@ class FrameCorrelation:
             raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
                              "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
 
-    def __call__(self, candidates: Shortlist, scores: np.ndarray) -> np.ndarray:
-        """Correlated scores `[Q, C]` of a sequence, from scores `[Q, C]`; NumPy float32.
+    def __call__(
+        self, candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"]
+    ) -> Float[np.ndarray, "queries candidates"]:
+        """Correlated scores of a sequence, float32.
 
         Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
         """
@@ -51,8 +54,10 @@ class FrameCorrelation:
             before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
         return correlated.astype(np.float32)
 
-    def _gains(self, rows: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """Largest relative gains `[n]` of rows; `before` `[previous, 2]` are places and scores."""
+    def _gains(
+        self, rows: Float[np.ndarray, " candidates"], before: Float[np.ndarray, "previous 2"]
+    ) -> Float[np.ndarray, " candidates"]:
+        """Largest relative gains of rows; `before` are places and scores."""
         places, scores = before.T
         best = scores.max()
         strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))

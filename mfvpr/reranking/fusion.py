@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Num
 
 from mfvpr.reranking.cohort_normalization import by_hubness
 from mfvpr.reranking.frame_correlation import FrameCorrelation
@@ -71,8 +72,10 @@ class Fusion:
                 raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
                                  f"{weight!r}")  # fmt: skip
 
-    def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Combined scores `[Q, C]`, NumPy, from scores `[Q, C]` by name of the scorer."""
+    def __call__(
+        self, main: str, candidates: Shortlist, scores: Mapping[str, Num[np.ndarray, "queries candidates"]]
+    ) -> Float[np.ndarray, "queries candidates"]:
+        """Combined scores, from scores by name of the scorer."""
         if self.c != "zscore":
             return fuse_shortlist(candidates, scores[main], self.c, filter_score=self.filter_score)
         parts = {FILTER: filter_scores(candidates, self.filter_score)}
@@ -83,22 +86,20 @@ class Fusion:
 
 def rank_sequence(
     matched: Matched,
-    scores: Mapping[str, np.ndarray],
+    scores: Mapping[str, Num[np.ndarray, "queries candidates"]],
     fused: Mapping[str, Fusion],
     correlated: Mapping[str, FrameCorrelation],
     ties: Ties,
     *,
-    hubness: Mapping[str, np.ndarray] | None = None,
+    hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:
     """Rankings of a sequence by name of the system.
 
     Args:
         matched: the sequence.
-        scores: `[Q, C]` by name of the scorer.
-        fused: see `mfvpr.evaluate`.
-        correlated: see `mfvpr.evaluate`.
-        ties: see `mfvpr.evaluate`.
-        hubness: `[N]` by name of the scorer; None = no score normalization with a cohort.
+        scores: by name of the scorer.
+        fused, correlated, ties: see `mfvpr.evaluate`.
+        hubness: by name of the scorer; None = no score normalization with a cohort.
     """
     candidates, scores = matched.candidates, {**scores}
     scores |= {

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from mfvpr.matching.nearest_neighbors import filter_matches
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
@@ -31,7 +32,7 @@ from mfvpr.utils.numerics import (
 WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a match counts
 
 
-def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Array:
+def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Float[jax.Array, "*grid candidates"]:
     """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
 
     The grid is one traced computation for each capacity of bins that its values need, so that fine bins do not slow
@@ -89,9 +90,13 @@ def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] 
 
 
 def by_capacity(
-    scorer: Any, settings: Mapping[str, Array], num_settings: int, image_size0: Array, image_size1: Array
-) -> list[tuple[Any, np.ndarray]]:
-    """Group settings `[G]` by the capacity of bins that they need: (scorer, rows of settings).
+    scorer: Any,
+    settings: Mapping[str, Num[Array, " settings"]],
+    num_settings: int,
+    image_size0: Num[Array, "*pairs0 2"],
+    image_size1: Num[Array, "*pairs1 2"],
+) -> list[tuple[Any, Int[np.ndarray, " _"]]]:
+    """Group settings by the capacity of bins that they need: (scorer, rows of settings).
 
     There is one group if the scorer needs no capacity or has one, or if settings are traced. Capacities are multiples
     of 8 bins, which keeps programs few and padding small.
@@ -109,8 +114,11 @@ def by_capacity(
 
 
 def score_settings(
-    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
-) -> Array:
+    scorer: Any,
+    matches: Matches,
+    settings: Mapping[str, Num[Array, " settings"]],
+    weightings: Mapping[str, Num[Array, " weightings"]],
+) -> Num[Array, "_ _ ..."]:
     """Scores `[G, W, C]` of candidates for every combination of G settings and W weightings.
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
@@ -119,8 +127,8 @@ def score_settings(
     Args:
         scorer: its other parameters stay; a histogram needs a capacity that suffices for every `bin_size`.
         matches: `[C, K, ...]`.
-        settings: `[G]` values of the scorer's numeric parameters; none: G = 1.
-        weightings: `[W]` values that only change how much a match counts, which are cheap to vary: `max_distance`
+        settings: G values of the scorer's numeric parameters; none: G = 1.
+        weightings: W values that only change how much a match counts, which are cheap to vary: `max_distance`
             (larger distances do not count) and `weight` (the index of the scorer's `ChosenWeight`); none: W = 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
@@ -169,8 +177,10 @@ def _apply_weighting(scorer: Any, matches: Matches, weighting: Mapping[str, Arra
     return replace(scorer, weight=replace(scorer.weight, index=weighting["weight"])), near
 
 
-def _weights_of_pair(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
-    """Weights `[W, K]` of one pair's matches."""
+def _weights_of_pair(
+    scorer: Any, weightings: Mapping[str, Array], matches: Matches
+) -> Float[jax.Array, "weightings slots"]:
+    """Weights of one pair's matches."""
 
     def weigh(weighting: dict[str, Array]) -> Array:
         varied, near = _apply_weighting(scorer, matches, weighting)

@@ -9,6 +9,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Num, Shaped
 
 from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
@@ -22,8 +23,8 @@ FilterScore = Literal["cosine", "negative_euclidean"]
 BIN_STEP = 8  # capacities of histograms are multiples of it
 
 
-def score_candidates(scorer: Scorer, matches: Matches) -> Array:
-    """Scores `[C]` of matches `[C, K, ...]`.
+def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " candidates"]:
+    """Scores of matches `[C, K, ...]`.
 
     The program is compiled once per shape, and reused for other numbers in the scorer. A scorer that is or holds a
     plain function runs operation by operation. Capacities (`max_bins` of the histogram) are fitted to the image sizes;
@@ -37,7 +38,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Array:
 
 
 @compiled
-def _score_candidates(scorer: Scorer, matches: Matches) -> Array:
+def _score_candidates(scorer: Scorer, matches: Matches) -> jax.Array:
     return jax.vmap(scorer)(matches)
 
 
@@ -49,8 +50,8 @@ def check_candidates(matches: Matches) -> None:
                          "[K] the score is scorer(matches)")  # fmt: skip
 
 
-def matched_sizes(matches: Matches) -> tuple[Array, Array]:
-    """Sizes `[..., 2]` of both images, without pairs that have no matches and arbitrary sizes."""
+def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array, "*pairs1 2"]]:
+    """Sizes of both images, without pairs that have no matches and arbitrary sizes."""
     sizes = matches.image_size0, matches.image_size1
     if not is_concrete((matches.mask, sizes)):
         return sizes
@@ -59,21 +60,28 @@ def matched_sizes(matches: Matches) -> tuple[Array, Array]:
     return size0, size1
 
 
-def combine(filter_scores: Array, rerank_scores: Array, *, c: float | Array = 1e6) -> Array:
+def combine(
+    filter_scores: Num[Array, "*batch candidates"],
+    rerank_scores: Num[Array, "*batch candidates"],
+    *,
+    c: float | Array = 1e6,
+) -> Num[Array, "*batch candidates"]:
     """Combined score s = c s_f + s_r, equation 4 (paper, section IV-E).
 
     Args:
         filter_scores: s_f, retrieval scores.
-        rerank_scores: s_r, re-ranking scores, of the same shape.
+        rerank_scores: s_r, re-ranking scores.
         c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
     return c * filter_scores + rerank_scores
 
 
-def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Array:
-    """The c `[]` with which both scores have the same standard deviation.
+def balancing_c(
+    filter_scores: Num[Array, " candidates"], rerank_scores: Num[Array, " candidates"], mask: Bool[Array, " candidates"]
+) -> Float[jax.Array, ""]:
+    """The c with which both scores of one query's candidates have the same standard deviation.
 
-    Scores and mask are `[C]`, of one query's candidates. The paper sets c by hand; this value adapts to detectors with
+    The paper sets c by hand; this value adapts to detectors with
     scores in other units.
     """
 
@@ -86,8 +94,13 @@ def balancing_c(filter_scores: Array, rerank_scores: Array, mask: Array) -> Arra
 
 
 @compiled
-def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | None) -> Array:
-    """Combined scores `[Q, C]` of several queries; None as `c` is `balancing_c` of each query."""
+def fuse(
+    filter_scores: Num[Array, "queries candidates"],
+    scores: Num[Array, "queries candidates"],
+    mask: Bool[Array, "queries candidates"],
+    c: float | Array | None,
+) -> Float[jax.Array, "queries candidates"]:
+    """Combined scores of several queries; None as `c` is `balancing_c` of each query."""
     if c is None:
         c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
     filter_scores, scores = masked(filter_scores, mask), masked(scores, mask)
@@ -95,13 +108,17 @@ def fuse(filter_scores: Array, scores: Array, mask: Array, c: float | Array | No
 
 
 def fuse_shortlist(
-    candidates: Shortlist, scores: np.ndarray, c: float | None, *, filter_score: FilterScore = "cosine"
-) -> np.ndarray:
-    """Combined scores `[Q, C]` of retrieval and re-ranking, NumPy; NaN without a candidate.
+    candidates: Shortlist,
+    scores: Num[np.ndarray, "queries candidates"],
+    c: float | None,
+    *,
+    filter_score: FilterScore = "cosine",
+) -> Float[np.ndarray, "queries candidates"]:
+    """Combined scores of retrieval and re-ranking; NaN without a candidate.
 
     Args:
         candidates: shortlist with cosine similarities.
-        scores: `[Q, C]` re-ranking scores.
+        scores: re-ranking scores.
         c: weight of the retrieval score; None is `balancing_c` of each query.
         filter_score: kind of retrieval score, see `filter_scores`.
     """
@@ -109,8 +126,8 @@ def fuse_shortlist(
     return np.asarray(or_nan(fused, candidates.mask))
 
 
-def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.ndarray:
-    """Retrieval scores `[Q, C]`: cosine similarity, or minus the Euclidean distance.
+def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> Float[np.ndarray, "queries candidates"]:
+    """Retrieval scores: cosine similarity, or minus the Euclidean distance.
 
     Raises:
         InputError: `kind` is unknown, or `negative_euclidean` of scores above 1.
@@ -126,16 +143,20 @@ def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> np.nda
 
 
 def fuse_scales(
-    scores: Array, mask: Array, weights: Array | None = None, *, normalize: Literal["zscore", "none"] = "zscore"
-) -> Array:
-    """Weighted sum `[..., C]` of the scores of S scales or scorers; NaN without a candidate.
+    scores: Num[Array, "*batch candidates scales"],
+    mask: Bool[Array, "... candidates"],
+    weights: Num[Array, " scales"] | None = None,
+    *,
+    normalize: Literal["zscore", "none"] = "zscore",
+) -> Float[jax.Array, "*batch candidates"]:
+    """Weighted sum of the scores of S scales or scorers; NaN without a candidate.
 
     Patch-NetVLAD fuses patch sizes in this way.
 
     Args:
-        scores: `[..., C, S]` of a query's candidates.
-        mask: `[..., C]` bool; leading axes may be missing.
-        weights: `[S]`; None = 1 each.
+        scores: of a query's candidates.
+        mask: leading axes may be missing.
+        weights: of the scales; None = 1 each.
         normalize: "zscore" first gives each scale mean 0 and standard deviation 1 over the query's candidates, or 0 if
             all scores are equal. A score that is not finite is left out of mean and deviation, and affects only the sum
             of its own candidate. "none" leaves the scores as they are, for pairs without other candidates.
@@ -158,8 +179,8 @@ def _fuse_scales(scores: Array, mask: Array, weights: Array | None, *, normalize
     return jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
 
 
-def _standardize(scores: Array, mask: Array) -> Array:
-    """Scores `[C]` with mean 0 and standard deviation 1 over the finite scores of candidates."""
+def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Array:
+    """Scores with mean 0 and standard deviation 1 over the finite scores of candidates."""
     finite = mask & jnp.isfinite(scores)
     # Relative to the maximum, equal scores deviate by exactly 0, without rounding.
     maximum = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
@@ -180,8 +201,10 @@ def breaks_ties_by_row(ties: Ties) -> bool:
     return ties == "index"
 
 
-def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "filter") -> np.ndarray:
-    """Positions `[Q, C]` into the shortlist, best first, missing candidates last, NumPy.
+def rank_shortlist(
+    candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"], *, ties: Ties = "filter"
+) -> Int[np.ndarray, "queries candidates"]:
+    """Positions into the shortlist, best first, missing candidates last.
 
     Equal scores keep the order of the retrieval, or are ordered by database index.
     """
@@ -189,11 +212,16 @@ def rank_shortlist(candidates: Shortlist, scores: np.ndarray, *, ties: Ties = "f
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 
-def rank(scores: Array, mask: Array | None = None, *, tie_break: Array | None = None) -> Array:
-    """Positions `[..., C]` int32 in descending order of `scores` `[..., C]`.
+def rank(
+    scores: Shaped[Array, "*batch candidates"],
+    mask: Bool[Array, "*batch candidates"] | None = None,
+    *,
+    tie_break: Shaped[Array, "*batch candidates"] | None = None,
+) -> Int[jax.Array, "*batch candidates"]:
+    """Positions, int32, in descending order of `scores`.
 
-    Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break` `[..., C]`, such as the
-    database index. NaN comes after all numbers, masked entries last.
+    Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break`, such as the database
+    index. NaN comes after all numbers, masked entries last.
     """
     return _rank(_in_32_bits(scores), mask, _in_32_bits(tie_break))
 
@@ -218,6 +246,8 @@ def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
     return jnp.lexsort(keys, axis=-1).astype(jnp.int32)
 
 
-def rerank(scores: Array, mask: Array | None = None) -> Ranking:
-    """Ranking of a shortlist by the re-ranking `scores` `[..., C]` of its candidates."""
+def rerank(
+    scores: Float[Array, "queries candidates"], mask: Bool[Array, "queries candidates"] | None = None
+) -> Ranking:
+    """Ranking of a shortlist by the re-ranking scores of its candidates."""
     return Ranking(order=rank(scores, mask), scores=scores)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matching.match_set import MatchSet, Scales
@@ -33,10 +34,10 @@ class Matched:
 
 @dataclass(frozen=True)
 class Ranked:
-    """Ranking of a sequence: database rows `[Q, C]`, best first, and scores in this order."""
+    """Ranking of a sequence: database rows, best first, and scores in this order."""
 
-    rows: np.ndarray
-    scores: np.ndarray
+    rows: Int[np.ndarray, "queries candidates"]
+    scores: Float[np.ndarray, "queries candidates"]
 
     @property
     def shortlist(self) -> Shortlist:

@@ -11,23 +11,26 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.core import Tracer
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Num, Shaped
 
 from mfvpr.utils.errors import NoGradientError
 
 if TYPE_CHECKING:  # type checkers do not see that `jax.Device` is a class
     from jaxlib._jax import Device
+
+    Array = Any
 else:
     Device = jax.Device
+    Array = jax.Array | np.ndarray | np.generic
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Tree = TypeVar("Tree")
 
 
-def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
+def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLike = 0.0) -> Shaped[jax.Array, "..."]:
     """`values` where `mask`, `fill` elsewhere; trailing axes of `values` that `mask` lacks are broadcast.
 
     Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
@@ -36,7 +39,7 @@ def masked(values: Array, mask: Array, fill: ArrayLike = 0.0) -> Array:
     return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
 
 
-def or_nan(values: Array, mask: Array) -> Array:
+def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
     """`values` where `mask`, NaN elsewhere.
 
     Without tracing, NumPy makes the NaN: `jax_debug_nans` would stop at a NaN from a compiled program.
@@ -46,25 +49,29 @@ def or_nan(values: Array, mask: Array) -> Array:
     return jnp.where(mask, values, jnp.nan)
 
 
-def as_float(values: ArrayLike) -> Array:
+def as_float(values: ArrayLike) -> Float[jax.Array, "..."]:
     """`values` of floating point unchanged, other values in the default float type."""
     values = jnp.asarray(values)
     return values if jnp.issubdtype(values.dtype, jnp.floating) else values.astype(float)
 
 
-def at_least_single(values: ArrayLike) -> Array:
+def at_least_single(values: ArrayLike) -> Float[jax.Array, "..."]:
     """`values` as `as_float`, and float16 or bfloat16 as float32, which holds their products exactly."""
     values = as_float(values)
     return values.astype(jnp.float32) if jnp.finfo(values.dtype).bits < 32 else values
 
 
-def positive(value: ArrayLike | None, dtype: Any) -> Array:
+def positive(value: ArrayLike | None, dtype: Any) -> Float[jax.Array, "..."]:
     """A width or a temperature if it is above 0, else NaN, which makes the score NaN."""
     value = jnp.asarray(value, dtype=dtype)
     return jnp.where(value > 0, value, jnp.nan)
 
 
-def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Array:
+def masked_mean(
+    values: Float[Array, " entries *rest"],
+    mask: Bool[Array, " entries"],
+    weights: Num[Array, " entries"] | None = None,
+) -> Float[jax.Array, "*rest"]:
     """(Weighted) mean over axis 0 of the real entries; 0 where there are none."""
     weights = masked(jnp.ones(mask.shape, values.dtype) if weights is None else weights, mask)
     total = jnp.sum(weights)
@@ -72,7 +79,7 @@ def masked_mean(values: Array, mask: Array, weights: Array | None = None) -> Arr
     return jnp.sum(weighted, axis=0) / jnp.where(total == 0, 1.0, total)
 
 
-def masked_median(values: Array, mask: Array) -> Array:
+def masked_median(values: Float[Array, " entries *rest"], mask: Bool[Array, " entries"]) -> Float[jax.Array, "*rest"]:
     """Median over axis 0 of the real entries (mean of the middle two when even); 0 where there are none."""
     if len(mask) == 0:
         return jnp.zeros(values.shape[1:], values.dtype)
@@ -82,12 +89,12 @@ def masked_median(values: Array, mask: Array) -> Array:
     return jnp.where(real > 0, middle, 0.0)
 
 
-def where_finite(score: Array, *inputs: Array) -> Array:
+def where_finite(score: Float[Array, "*batch"], *inputs: Num[Array, "..."]) -> Float[jax.Array, "*batch"]:
     """`score` if all inputs are finite, else NaN, which ranks last."""
     return jnp.where(jnp.all(jnp.stack([jnp.all(jnp.isfinite(values)) for values in inputs])), score, jnp.nan)
 
 
-def safe_sqrt(squared: Array) -> Array:
+def safe_sqrt(squared: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
     """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
@@ -116,8 +123,8 @@ def round_up(size: int, multiple: int) -> int:
     return max(1, -(-size // multiple)) * multiple
 
 
-def masked_std(values: Array, mask: Array) -> Array:
-    """Standard deviation of all real entries, `[]`, with a gradient of 0 where it is 0; 0 where there are none."""
+def masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
+    """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
     values, mask = values.reshape(-1), mask.reshape(-1)
     return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
 
@@ -213,7 +220,7 @@ def platform(tree: Any) -> str:
 def device_of(tree: Any) -> Device:
     """Device of the first array; without arrays, JAX's default."""
     for leaf in jax.tree.leaves(tree):
-        if isinstance(leaf, Array) and not isinstance(leaf, Tracer):
+        if isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer):
             return next(iter(leaf.devices()))
     default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return default if isinstance(default, Device) else jax.local_devices(backend=default)[0]

@@ -10,6 +10,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Int, Shaped
 
 Row = Mapping[str, np.ndarray]  # [n, ...] by name
 Tree = TypeVar("Tree")
@@ -17,13 +18,13 @@ Tree = TypeVar("Tree")
 
 def pad_rows(
     rows: Sequence[Row], capacity: int, *, total: int | None = None
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Rows `[n_i, ...]` as arrays `[R, capacity, ...]` by name, 0 beyond their ends, and the mask `[R, capacity]`.
+) -> tuple[dict[str, Shaped[np.ndarray, "rows slots ..."]], Bool[np.ndarray, "rows slots"]]:
+    """Rows as padded arrays by name, 0 beyond the ends of the rows, and the mask.
 
     Args:
         rows: at least one, of the same names; none longer than `capacity`.
         capacity: slots of a row.
-        total: R, with empty rows beyond `rows`. By default the number of rows.
+        total: number of rows of the arrays, those beyond `rows` are empty. By default the number of `rows`.
     """
     total = len(rows) if total is None else total
     arrays = {name: np.empty((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
@@ -38,8 +39,8 @@ def pad_rows(
     return arrays, np.arange(capacity) < counts[:, None]
 
 
-def split(flat: Row, counts: np.ndarray) -> list[dict[str, np.ndarray]]:
-    """Rows of lengths `counts` `[R]`, as views of arrays that hold one row after the other."""
+def split(flat: Row, counts: Int[np.ndarray, " rows"]) -> list[dict[str, np.ndarray]]:
+    """Rows of lengths `counts`, as views of arrays that hold one row after the other."""
     ends = np.cumsum(counts)
     return [
         {name: values[end - count : end] for name, values in flat.items()}
@@ -52,7 +53,7 @@ def join_rows(rows: Sequence[Row]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
 
-def sizes(counts: np.ndarray, quantiles: Sequence[float], step: int) -> np.ndarray:
+def sizes(counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int) -> Int[np.ndarray, " capacities"]:
     """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts` with little padding.
 
     They are quantiles over all rows that are not empty, so that the shape of a row does not depend on its batch.
@@ -63,7 +64,9 @@ def sizes(counts: np.ndarray, quantiles: Sequence[float], step: int) -> np.ndarr
     return np.unique(np.ceil(np.quantile(lengths, quantiles) / step).astype(int) * step)
 
 
-def worthwhile(capacities: np.ndarray, counts: np.ndarray, saving: float) -> np.ndarray:
+def worthwhile(
+    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
+) -> Int[np.ndarray, " _"]:
     """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
     lengths = counts[counts > 0]
     while len(capacities) > 1:
@@ -75,13 +78,13 @@ def worthwhile(capacities: np.ndarray, counts: np.ndarray, saving: float) -> np.
     return capacities
 
 
-def fitting(capacities: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def fitting(capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
     """The smallest of ascending `capacities` that holds each of `counts`."""
     return capacities[np.searchsorted(capacities, counts)]
 
 
-def repeat_last(values: np.ndarray, total: int) -> np.ndarray:
-    """`values` `[n, ...]`, n > 0, with its last entry repeated up to `total` entries."""
+def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np.ndarray, " _ *rest"]:
+    """`values`, at least one, with the last entry repeated up to `total` entries."""
     return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
 
 
@@ -90,8 +93,8 @@ def at_least_one(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
 
 
-def in_front(tree: Tree, mask: jax.Array, capacity: int) -> Tree:
-    """Entries of arrays `[n, ...]` where `mask` `[n]` is set, in their order, in `capacity` slots. Traced or not.
+def in_front(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tree:
+    """Entries of arrays `[n, ...]` where the mask is set, in their order, in `capacity` slots. Traced or not.
 
     Entries beyond the capacity are dropped; the values of unused slots are arbitrary.
     """

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import eigh
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
@@ -20,30 +21,29 @@ class Whitening:
     """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`.
 
     Attributes:
-        mean: `[D]`.
-        components: `[D', D]`, most variance first; 0 without variance.
-        origin: fingerprint of the vectors' recipe, the only one that may be whitened with it; "" = any of D numbers.
+        components: most variance first; 0 without variance.
+        origin: fingerprint of the vectors' recipe, the only one that may be whitened with it; "" = any vectors.
     """
 
-    mean: np.ndarray
-    components: np.ndarray
+    mean: Float[np.ndarray, " dimensions"]
+    components: Float[np.ndarray, "components dimensions"]
     origin: str = ""
 
     @property
     def dimension(self) -> int:
-        """D'."""
+        """Number of components."""
         return len(self.components)
 
 
-def fit_whitening(sample: np.ndarray, dimension: int) -> Whitening:
-    """Fit a whitening to a sample `[n, D]` float32 or float64, in double precision.
+def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: int) -> Whitening:
+    """Fit a whitening to a sample of vectors, float32 or float64, in double precision.
 
     As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
     each component (the first of several) positive.
 
     Args:
         sample: finite.
-        dimension: D'.
+        dimension: number of components.
 
     Returns:
         Arrays of the sample's type.

@@ -1,6 +1,7 @@
 """Rows of their own length, padded and back."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -96,5 +97,5 @@ def test_what_is_set_comes_to_the_front(mask, capacity):
 
 
 def test_nothing_can_be_indexed():
-    [got] = jax.tree.leaves(ragged.in_front({"a": np.zeros((0, 2), np.float32)}, np.zeros(0, bool), 3))
+    [got] = jax.tree.leaves(ragged.in_front({"a": np.zeros((0, 2), np.float32)}, jnp.zeros(0, bool), 3))
     assert got.shape == (3, 2)
