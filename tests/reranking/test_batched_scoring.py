@@ -30,23 +30,25 @@ def data():
     return make_set()
 
 
+def select(matches, slots):
+    entries = {name: values[slots] for name, values in match_sets.per_match(matches).items()}
+    return replace(matches, **entries, mask=matches.mask[slots])
+
+
 @pytest.fixture(scope="module")
 def two_scales(data):
     """The second scale has fewer matches of its own, and a query that it says nothing of."""
     match_set, candidates = data
-    keep = [np.arange(len(one.mask)) % 3 > 0 for one in match_set.matches]
+    keep = [np.arange(len(matches.mask)) % 3 > 0 for matches in match_set.matches]
     keep[1][:] = False
     ends = np.cumsum(match_set.counts, axis=1)
     counts = np.array([[part.sum() for part in np.split(k, e)[:-1]] for k, e in zip(keep, ends, strict=True)])
-    fewer = [
-        replace(one, **{name: values[k] for name, values in match_sets.per_match(one).items()}, mask=one.mask[k])
-        for one, k in zip(match_set.matches, keep, strict=True)
-    ]
+    fewer = [select(matches, slots) for matches, slots in zip(match_set.matches, keep, strict=True)]
     return Scales([match_set, MatchSet(fewer, counts, 64)], WEIGHTS), candidates
 
 
 def devices_agree():
-    """What a process with 8 devices checks."""
+    """Runs in a process with 8 devices."""
     import jax
 
     from mfvpr.reranking import batched_scoring
@@ -61,55 +63,49 @@ def devices_agree():
         placed.append((matches.mask.shape, *matches.mask.devices()))
         return matches.mask.sum(axis=1)
 
-    made = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
-    for places, counts in batched_scoring.run_batches(program, (), made, devices=devices):
+    batches = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
+    for places, counts in batched_scoring.run_batches(program, (), batches, devices=devices):
         np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
 
-    alone, together = (stages.score({"it": plain}, match_set, candidates, devices=some) for some in (None, devices))
-    np.testing.assert_array_equal(alone["it"], together["it"], strict=True)
-    assert len(np.unique(alone["it"])) > CANDIDATES
+    alone, shared = (stages.score({"a": plain}, match_set, candidates, devices=on)["a"] for on in (None, devices))
+    np.testing.assert_array_equal(alone, shared, strict=True)
+    assert len(np.unique(alone)) > CANDIDATES
     settings = [{"max_distance": limit, "c": 0.1} for limit in (0.8, 1.5)]
-    alone, together = (
-        sweeps.sweep(plain, settings, match_set, candidates, devices=some) for some in (None, devices[3:5])
-    )
-    np.testing.assert_array_equal(alone, together)
+    alone, shared = (sweeps.sweep(plain, settings, match_set, candidates, devices=on) for on in (None, devices[3:5]))
+    np.testing.assert_array_equal(alone, shared)
 
 
 def test_devices_share_the_batches_and_change_no_bit():
     code = "from tests.reranking.test_batched_scoring import devices_agree; devices_agree()"
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=100
-    )
-    assert done.returncode == 0, done.stderr
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, timeout=100, check=True)
 
 
 def test_scores_of_scales_are_fused_over_the_candidates_of_a_query(two_scales):
     scales, candidates = two_scales
-    got = stages.score(SCORERS, scales, candidates)
-    each = [stages.score(SCORERS, one, candidates) for one in scales.match_sets]
+    fused = stages.score(SCORERS, scales, candidates)
+    by_scale = [stages.score(SCORERS, match_set, candidates) for match_set in scales.match_sets]
     for name in SCORERS:
-        assert not each[1][name][1].any()
-        assert got[name].dtype == np.float32
+        assert not by_scale[1][name][1].any()
+        assert fused[name].dtype == np.float32
         for query in range(QUERIES):
-            batched_scoring = np.stack([batched_scoring[name][query] for batched_scoring in each], axis=-1)
-            expected = oracles.fuse_scales(batched_scoring, candidates.mask[query], WEIGHTS, "zscore")
-            np.testing.assert_allclose(got[name][query], expected, rtol=1e-4, atol=1e-5)
+            scores = np.stack([scale_scores[name][query] for scale_scores in by_scale], axis=-1)
+            expected = oracles.fuse_scales(scores, candidates.mask[query], WEIGHTS, "zscore")
+            np.testing.assert_allclose(fused[name][query], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_one_scale_as_it_is_scores_as_without(data):
     match_set, candidates = data
-    alone = stages.score(SCORERS, match_set, candidates)
-    one = stages.score(SCORERS, Scales([match_set], normalize="none"), candidates)
-    for name in SCORERS:
-        np.testing.assert_array_equal(one[name], alone[name])
+    scores = stages.score(SCORERS, Scales([match_set], normalize="none"), candidates)
+    for name, expected in stages.score(SCORERS, match_set, candidates).items():
+        np.testing.assert_array_equal(scores[name], expected)
 
 
 @pytest.mark.parametrize("normalize", ["zscore", "none"])
-def test_sweeps_of_scales_rank_by_the_fused_scores_of_what_is_ranked(two_scales, normalize, tmp_path):
+def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tmp_path):
     scales, candidates = two_scales
     scales = replace(scales, normalize=normalize)
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.7
@@ -121,14 +117,13 @@ def test_sweeps_of_scales_rank_by_the_fused_scores_of_what_is_ranked(two_scales,
     for seen, by_setting in zip((candidates.mask, view & candidates.mask), got, strict=True):
         listed = replace(candidates, mask=seen)
         for rows, setting in zip(by_setting, settings, strict=True):
-            scorer = {"it": mfvpr.AggregatedScore(mean=setting["mean"])}
-            fused = ranking.fuse_shortlist(listed, stages.score(scorer, scales, listed)["it"], setting["c"])
-            order = ranking.rank_shortlist(listed, fused)
+            scores = stages.score({"sum": mfvpr.AggregatedScore(mean=setting["mean"])}, scales, listed)["sum"]
+            order = ranking.rank_shortlist(listed, ranking.fuse_shortlist(listed, scores, setting["c"]))
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
 
 
-def test_blocks_of_other_weights_or_scales_are_not_taken(two_scales, tmp_path):
+def test_blocks_of_other_weights_or_scales_are_not_read(two_scales, tmp_path):
     scales, candidates = two_scales
     first, second = scales.match_sets
     cases = [
@@ -137,19 +132,20 @@ def test_blocks_of_other_weights_or_scales_are_not_taken(two_scales, tmp_path):
     ]  # fmt: skip
     for number, case in enumerate(cases, start=1):
         expected = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates)
-        kept = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
-        np.testing.assert_array_equal(kept, expected)
+        stored = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
+        np.testing.assert_array_equal(stored, expected)
         assert len(list(tmp_path.iterdir())) == number
 
 
-def test_scales_that_do_not_belong_together_are_refused(data):
+def test_scales_of_other_queries_or_weights_raise(data):
     match_set, _ = data
-    with pytest.raises(mfvpr.InputError, match=r"queries and candidates, got \[\(2, 5"):
-        Scales([match_set, match_set.take(range(2))])
-    with pytest.raises(mfvpr.InputError, match=r"weight .*2 scales, got 1"):
-        Scales([match_set] * 2, [1.0])
-    with pytest.raises(mfvpr.InputError, match="expected match sets"):
-        Scales([])
+    for words, *arguments in (
+        (r"queries and candidates, got \[\(2, 5", [match_set, match_set.take(range(2))]),
+        (r"weight .*2 scales, got 1", [match_set] * 2, [1.0]),
+        ("expected match sets", []),
+    ):
+        with pytest.raises(mfvpr.InputError, match=words):
+            Scales(*arguments)
 
 
 def test_progress_is_of_the_batches_of_all_scales(two_scales):
@@ -161,8 +157,6 @@ def test_progress_is_of_the_batches_of_all_scales(two_scales):
 
 def test_nothing_matches_anywhere(data):
     match_set, candidates = data
-    nothing = [replace(one, **{n: v[:0] for n, v in match_sets.per_match(one).items()}, mask=one.mask[:0])
-               for one in match_set.matches]  # fmt: skip
-    batched_scoring = stages.score(SCORERS, MatchSet(nothing, 0 * match_set.counts, 64), candidates)
-    for values in batched_scoring.values():
-        np.testing.assert_array_equal(values, np.where(candidates.mask, 0.0, np.nan))
+    empty = MatchSet([select(matches, slice(0)) for matches in match_set.matches], 0 * match_set.counts, 64)
+    for scores in stages.score(SCORERS, empty, candidates).values():
+        np.testing.assert_array_equal(scores, np.where(candidates.mask, 0.0, np.nan))

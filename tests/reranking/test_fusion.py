@@ -8,25 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mfvpr
-from mfvpr.datasets import folder_dataset, sequences_dataset
+from mfvpr.datasets import sequences_dataset
 from mfvpr.evaluation import match_sequence, stages
-from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.fusion import rank_sequence
 from mfvpr.reranking.ranking import rank_shortlist
-from mfvpr.retrieval import Retrieval
 from mfvpr.types import Shortlist
 from tests import oracles
+from tests.reranking.conftest import SCORERS, SIFT, VLAD
 
 pytestmark = pytest.mark.thorough
 
-SIFT = Sift(max_keypoints=60, image_size=(160, 120))
-VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
-SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 BOTH = Fusion("zscore", weights={"filter": 0.5, "count": 2.0})
 
 
-def made_up(num_queries=6, num_candidates=9):
+def random_scores(num_queries=6, num_candidates=9):
     """A shortlist with rows that are not full, and scores of two scorers in units of their own."""
     rng = np.random.default_rng(0)
     mask = np.arange(num_candidates) < rng.integers(2, num_candidates + 1, (num_queries, 1))
@@ -39,44 +35,39 @@ def made_up(num_queries=6, num_candidates=9):
     return Shortlist(np.where(mask, rows, -1), np.where(mask, cosine, 0).astype(np.float32), mask), scores
 
 
-def expected(candidates, parts, weights):
-    """In float64, query by query."""
+def assert_fused(fused, candidates, parts, weights):
+    """The scores are those of the oracle, in float64, query by query."""
     stacked = np.stack(parts, axis=-1).astype(np.float64)
-    return np.array(
-        [oracles.fuse_scales(*one, weights, "zscore") for one in zip(stacked, candidates.mask, strict=True)]
-    )
+    for query, mask in enumerate(candidates.mask):
+        expected = oracles.fuse_scales(stacked[query], mask, weights, "zscore")
+        np.testing.assert_allclose(fused[query], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_scores_are_summed_as_standardized():
-    candidates, scores = made_up()
-    how = Fusion("zscore", weights={"filter": 0.5, "a": 3.0, "b": 0.25})
-    got = how("a", candidates, scores)
-    assert got.dtype == np.float32
-    np.testing.assert_allclose(
-        got, expected(candidates, [candidates.scores, scores["a"], scores["b"]], [0.5, 3.0, 0.25]), rtol=1e-4, atol=1e-5
-    )
-    one = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # the filter counts 1
-    np.testing.assert_allclose(
-        one, expected(candidates, [candidates.scores, scores["a"]], [1.0, 3.0]), rtol=1e-4, atol=1e-5
-    )
+def test_standardized_scores_are_summed():
+    candidates, scores = random_scores()
+    fused = Fusion("zscore", weights={"filter": 0.5, "a": 3.0, "b": 0.25})("a", candidates, scores)
+    assert fused.dtype == np.float32
+    assert_fused(fused, candidates, [candidates.scores, scores["a"], scores["b"]], [0.5, 3.0, 0.25])
+    fused = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # the filter counts 1
+    assert_fused(fused, candidates, [candidates.scores, scores["a"]], [1.0, 3.0])
 
 
 def test_the_filter_s_score_may_be_a_distance():
-    candidates, scores = made_up()
-    got = Fusion("zscore", "negative_euclidean")("a", candidates, scores)
+    candidates, scores = random_scores()
+    fused = Fusion("zscore", "negative_euclidean")("a", candidates, scores)
     distance = -np.sqrt(2 - 2 * candidates.scores.astype(np.float64))
-    np.testing.assert_allclose(got, expected(candidates, [distance, scores["a"]], [1, 1]), rtol=1e-4, atol=1e-4)
+    assert_fused(fused, candidates, [distance, scores["a"]], [1, 1])
 
 
 @pytest.mark.parametrize("unit", ["a", "b"])
 def test_it_ranks_as_a_balanced_c_and_has_no_unit(unit):
-    candidates, scores = made_up()
-    got = Fusion("zscore")(unit, candidates, scores)
+    candidates, scores = random_scores()
+    fused = Fusion("zscore")(unit, candidates, scores)
     balanced = Fusion()(unit, candidates, scores)
-    np.testing.assert_array_equal(rank_shortlist(candidates, got), rank_shortlist(candidates, balanced))
-    by_query = np.arange(1, 1 + len(got))[:, None]  # other units for every query
-    other = Fusion("zscore")(unit, candidates, {unit: 100 * by_query * scores[unit] - 7 * by_query})
-    np.testing.assert_allclose(other, got, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(rank_shortlist(candidates, fused), rank_shortlist(candidates, balanced))
+    by_query = np.arange(1, 1 + len(fused))[:, None]  # other units for every query
+    scaled = Fusion("zscore")(unit, candidates, {unit: 100 * by_query * scores[unit] - 7 * by_query})
+    np.testing.assert_allclose(scaled, fused, rtol=1e-3, atol=1e-3)
 
 
 ROUGH = st.one_of(st.sampled_from([0.0, 3.0, np.nan, np.inf, -np.inf]), st.integers(-20, 20).map(float))
@@ -84,15 +75,14 @@ ROUGH = st.one_of(st.sampled_from([0.0, 3.0, np.nan, np.inf, -np.inf]), st.integ
 
 @given(st.lists(ROUGH, min_size=10, max_size=10), st.integers(0, 5))
 def test_what_is_not_finite_is_its_candidate_s_alone(values, count):
-    candidates, _ = made_up(1, 5)
+    candidates, _ = random_scores(1, 5)
     candidates = replace(candidates, mask=np.arange(5)[None] < count)
     first, second = np.array(values, np.float32).reshape(2, 1, 5)
-    got = BOTH("a", candidates, {"a": first, "count": second})
+    fused = BOTH("a", candidates, {"a": first, "count": second})
     with np.errstate(invalid="ignore"):
-        oracle = expected(candidates, [candidates.scores, first, second], [0.5, 1.0, 2.0])
-    np.testing.assert_allclose(got, oracle, rtol=1e-4, atol=1e-4)
+        assert_fused(fused, candidates, [candidates.scores, first, second], [0.5, 1.0, 2.0])
     finite = candidates.mask & np.isfinite(first) & np.isfinite(second)
-    np.testing.assert_array_equal(np.isfinite(got), finite)
+    np.testing.assert_array_equal(np.isfinite(fused), finite)
 
 
 def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
@@ -108,58 +98,48 @@ def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
 
 
 @pytest.mark.parametrize(
-    ("weights", "system"),
-    [
-        ({}, "a + filter"),
-        ({"filter": 2.0, "a": 0.5}, "a + filter"),
-        ({"b": 1.0, "filter": 2.0}, "a + b + filter"),
-        ({"c": 1.0, "a": 1.0, "b": 1.0}, "a + c + b + filter"),
-    ],
+    ("names", "system"),
+    [("", "a + filter"), ("filter a", "a + filter"), ("b filter", "a + b + filter"), ("c a b", "a + c + b + filter")],
 )
-def test_a_system_is_called_by_what_takes_part(weights, system):
-    assert Fusion("zscore", weights=weights).system("a") == system
+def test_a_system_is_called_by_what_takes_part(names, system):
+    assert Fusion("zscore", weights=dict.fromkeys(names.split(), 2.0)).system("a") == system
 
 
 @pytest.fixture(scope="module")
-def dataset(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
-
-
-@pytest.fixture(scope="module")
-def matched(dataset):
+def sequence_matches(dataset):
     return match_sequence(dataset, dataset.only, SIFT, VLAD, 5)
 
 
-def ranked(matched, *how):
-    return rank_sequence(matched, stages.score(SCORERS, matched.by_scale, matched.candidates), *how)
+def rank_by(matched, fused, correlated):
+    return rank_sequence(
+        matched, stages.score(SCORERS, matched.by_scale, matched.candidates), fused, correlated, "filter"
+    )
 
 
-def test_systems_of_several_scores_are_ranked_beside_the_others(matched):
+def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches):
     fused = {"histogram": BOTH, "count": Fusion("zscore")}
     correlated = {"histogram + count + filter": FrameCorrelation(1)}
-    systems = ranked(matched, fused, correlated, "filter")
+    systems = rank_by(sequence_matches, fused, correlated)
     assert [*systems] == ["filter", *SCORERS, "histogram + count + filter", "count + filter",
                           "histogram + count + filter + frames"]  # fmt: skip
-    alone = ranked(matched, {"count": Fusion()}, {}, "filter")
+    alone = rank_by(sequence_matches, {"count": Fusion()}, {})
     for name in ("filter", *SCORERS):
         np.testing.assert_array_equal(systems[name].scores, alone[name].scores)
     np.testing.assert_array_equal(systems["count + filter"].rows, alone["count + filter"].rows)
 
-    def listed(name):  # scores in the order of the shortlist
-        order = [[*rows].index(row) for rows, of in zip(systems[name].rows, matched.candidates.indices, strict=True)
-                 for row in of]  # fmt: skip
-        return np.take_along_axis(systems[name].scores, np.reshape(order, systems[name].rows.shape), axis=1)
+    by_row = {
+        name: np.take_along_axis(system.scores, np.argsort(system.rows, axis=1), axis=1)
+        for name, system in systems.items()
+    }
+    assert sequence_matches.candidates.mask.all()
+    parts = [by_row[name] for name in ("filter", *SCORERS)]
+    assert_fused(by_row["histogram + count + filter"], sequence_matches.candidates, parts, [0.5, 1.0, 2.0])
 
-    parts = [matched.candidates.scores, listed("histogram"), listed("count")]
-    oracle = expected(matched.candidates, parts, [0.5, 1.0, 2.0])
-    np.testing.assert_allclose(listed("histogram + count + filter"), oracle, rtol=1e-4, atol=1e-4)
 
-
-def test_scores_of_several_scales_are_fused_again_with_the_filter(matched):
+def test_scores_of_several_scales_are_fused_again_with_the_filter(sequence_matches):
     """They are standardized sums themselves."""
-    twice = replace(matched, matches=matched.matches * 2, weights=(1.0, 1.0))
-    systems = ranked(twice, {"histogram": Fusion("zscore")}, {}, "filter")
-    once = ranked(matched, {"histogram": Fusion("zscore")}, {}, "filter")
+    twice = replace(sequence_matches, matches=sequence_matches.matches * 2, weights=(1.0, 1.0))
+    systems, once = (rank_by(matched, {"histogram": Fusion("zscore")}, {}) for matched in (twice, sequence_matches))
     name = "histogram + filter"
     np.testing.assert_allclose(systems[name].scores, once[name].scores, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(systems["histogram"].scores.mean(axis=1), 0, atol=1e-5)
@@ -171,8 +151,8 @@ def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
         folder.symlink_to(small_street / "queries")
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     options = {"candidates": 5, "fused": {"histogram": BOTH}}
-    one, both = (mfvpr.evaluate(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several))
-    [whole] = one.systems["histogram + count + filter"]
-    for ranked in both.systems["histogram + count + filter"]:
-        np.testing.assert_array_equal(ranked.rows, whole.rows)
-        np.testing.assert_array_equal(ranked.scores, whole.scores)
+    results = [mfvpr.evaluate(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several)]
+    [alone], rankings = (result.systems["histogram + count + filter"] for result in results)
+    for ranking in rankings:
+        np.testing.assert_array_equal(ranking.rows, alone.rows)
+        np.testing.assert_array_equal(ranking.scores, alone.scores)

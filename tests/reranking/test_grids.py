@@ -1,5 +1,6 @@
 """Grids of parameters against scores of their combinations, one by one."""
 
+import itertools
 from dataclasses import replace
 from functools import partial
 
@@ -29,48 +30,48 @@ from tests.scorers import FOREIGN, Strongest, Wrapped, plain, title
 pytestmark = pytest.mark.thorough
 
 
+def random_pairs(counts, **options):
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *[random_matches(rng, count, **options) for count in counts])
+
+
 @pytest.fixture
 def matches():
-    rng = np.random.default_rng(0)
-    pairs = [random_matches(rng, count, capacity=40) for count in (40, 0, 12)]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+    return random_pairs((40, 0, 12), capacity=40)
 
 
-def test_histogram_grid_equals_the_loop(matches):
-    sigmas, bin_sizes = [10.0, 22.5, 40.0], [8.0, 15.0]
-    got = score_grid(HistogramOfShifts(), matches, sigma=sigmas, bin_size=bin_sizes)
-    assert got.shape == (3, 2, 3)
-    for i, sigma in enumerate(sigmas):
-        for j, bin_size in enumerate(bin_sizes):
-            expected = score_candidates(HistogramOfShifts(sigma=sigma, bin_size=bin_size), matches)
-            np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+@pytest.mark.parametrize(
+    ("scorer", "axes", "rtol"),
+    [
+        (HistogramOfShifts, {"sigma": [10.0, 22.5, 40.0], "bin_size": [8.0, 15.0]}, 2e-6),
+        (AnchorPoints, {"window": [2, 10], "tolerance": [1.0, 3.0, 4.5]}, 2e-6),
+        (AnchorPoints, {"temperature": [0.1, 0.5]}, 2e-6),
+        (Strongest, {"place": [0, 1, 3]}, 1e-7),  # whole numbers stay whole
+    ],
+)
+def test_grids_equal_the_loop(matches, scorer, axes, rtol):
+    scores = score_grid(scorer(), matches, **axes)
+    settings = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    expected = [score_candidates(scorer(**setting), matches) for setting in settings]
+    assert scores.shape == (*map(len, axes.values()), 3)
+    np.testing.assert_allclose(scores.reshape(-1, 3), expected, rtol=rtol)
 
 
-def test_anchor_grid_equals_the_loop(matches):
-    got = score_grid(AnchorPoints(), matches, window=[2, 10], tolerance=[1.0, 3.0, 4.5])
-    expected = [
-        [score_candidates(AnchorPoints(window=w, tolerance=t), matches) for t in (1.0, 3.0, 4.5)] for w in (2, 10)
-    ]
-    np.testing.assert_allclose(got, expected, rtol=2e-6)
-
-
-def test_axes_come_in_the_order_in_which_they_are_given(matches):
+def test_axes_keep_their_order(matches):
     """Though distances are varied within each setting of the scorer."""
     axes = {"max_distance": [0.7, 1.5], "window": [2, 6, 10]}
-    got = score_grid(AnchorPoints(), matches, **axes)
-    turned = score_grid(AnchorPoints(), matches, **dict(reversed(axes.items())))
-    assert got.shape == (2, 3, 3)
-    np.testing.assert_array_equal(got, np.swapaxes(turned, 0, 1))
+    scores = score_grid(AnchorPoints(), matches, **axes)
+    transposed = score_grid(AnchorPoints(), matches, **dict(reversed(axes.items())))
+    assert scores.shape == (2, 3, 3)
+    np.testing.assert_array_equal(scores, np.swapaxes(transposed, 0, 1))
 
 
 @pytest.mark.parametrize("cores", [2, 3])
 def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch):
     monkeypatch.setattr(grids, "available_cpus", lambda: cores)
-    rng = np.random.default_rng(0)
-    pairs = [random_matches(rng, count, capacity=8) for count in rng.integers(0, 9, 13)]
-    pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
-    got = score_grid(MatchCount(), replace(pairs, confidence=None), max_distance=[0.7, 1.5])
-    np.testing.assert_array_equal(got, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
+    pairs = random_pairs(np.random.default_rng(1).integers(0, 9, 13), capacity=8)
+    scores = score_grid(MatchCount(), replace(pairs, confidence=None), max_distance=[0.7, 1.5])
+    np.testing.assert_array_equal(scores, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
 
 
 def test_kinds_of_weights_and_distances_are_axes_too(matches):
@@ -86,18 +87,11 @@ def test_kinds_of_weights_and_distances_are_axes_too(matches):
 def test_no_program_is_mistaken_for_that_of_another_weight():
     """Pytrees that `jit` cannot tell apart share a program now and then, by the luck of their hashes."""
     weights = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()]
-    made = [HistogramOfShifts, AnchorPoints, AggregatedScore]
-    values = [MatchCount(), *weights, *(scorer(weight=weight) for scorer in made for weight in weights)]
+    scorers = [HistogramOfShifts, AnchorPoints, AggregatedScore]
+    values = [MatchCount(), *weights, *(scorer(weight=weight) for scorer in scorers for weight in weights)]
     values += [ChosenWeight((first, second), 0) for first in weights for second in weights]
     structures = [jax.tree.structure(value) for value in values]
-    for place, one in enumerate(structures):
-        assert [other == one for other in structures].index(True) == place
-
-
-def test_temperature_is_an_axis_of_a_hard_scorer(matches):
-    got = score_grid(AnchorPoints(), matches, temperature=[0.1, 0.5])
-    expected = [score_candidates(AnchorPoints(temperature=t), matches) for t in (0.1, 0.5)]
-    np.testing.assert_allclose(got, expected, rtol=2e-6)
+    assert [structures.index(structure) for structure in structures] == [*range(len(values))]
 
 
 def test_fine_bins_do_not_tax_coarse_ones(matches):
@@ -137,48 +131,37 @@ def test_other_grid_values_cost_no_trace(matches):
         (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),
     ],
 )
-def test_wrong_axes_are_named(matches, scorer, axes, words):
+def test_wrong_axes_raise(matches, scorer, axes, words):
     with pytest.raises(ValueError, match=words):
         score_grid(scorer, matches, **axes)
 
 
 def test_parameters_of_parts_are_axes_by_dotted_names(matches):
-    got = score_grid(
-        Wrapped(), matches, **{"inner.sigma": [10.0, 30.0], "share": [0.0, 1.0, 2.0], "inner.bin_size": [8.0, 15.0]}
-    )
-    assert got.shape == (2, 3, 2, 3)
-    for i, sigma in enumerate((10.0, 30.0)):
-        for j, share in enumerate((0.0, 1.0, 2.0)):
-            for k, bin_size in enumerate((8.0, 15.0)):
-                scorer = Wrapped(HistogramOfShifts(sigma=sigma, bin_size=bin_size), share)
-                np.testing.assert_allclose(got[i, j, k], score_candidates(scorer, matches), rtol=2e-6)
-
-
-def test_whole_numbers_stay_whole_where_they_are_meant_to(matches):
-    got = score_grid(Strongest(), matches, place=[0, 1, 3])
-    expected = [score_candidates(Strongest(place), matches) for place in (0, 1, 3)]
-    np.testing.assert_allclose(got, expected)
+    axes = {"inner.sigma": [10.0, 30.0], "share": [0.0, 1.0, 2.0], "inner.bin_size": [8.0, 15.0]}
+    scores = score_grid(Wrapped(), matches, **axes)
+    assert scores.shape == (2, 3, 2, 3)
+    for row, (sigma, share, bin_size) in zip(scores.reshape(-1, 3), itertools.product(*axes.values()), strict=True):
+        scorer = Wrapped(HistogramOfShifts(sigma=sigma, bin_size=bin_size), share)
+        np.testing.assert_allclose(row, score_candidates(scorer, matches), rtol=2e-6)
 
 
 def test_a_plain_function_has_the_axis_of_distances(matches):
-    got = score_grid(plain, matches, max_distance=[0.7, 1.5])
-    for row, limit in zip(got, (0.7, 1.5), strict=True):
+    scores = score_grid(plain, matches, max_distance=[0.7, 1.5])
+    for row, limit in zip(scores, (0.7, 1.5), strict=True):
         near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
         np.testing.assert_allclose(row, score_candidates(plain, near), rtol=2e-6)
 
 
 @pytest.mark.parametrize("scorer", FOREIGN, ids=title)
 def test_foreign_scorers_are_gridded_as_they_score(matches, scorer):
-    got = score_grid(scorer, matches, max_distance=[2.0, 3.0])
-    np.testing.assert_allclose(got, [score_candidates(scorer, matches)] * 2, rtol=2e-6)
+    scores = score_grid(scorer, matches, max_distance=[2.0, 3.0])
+    np.testing.assert_allclose(scores, [score_candidates(scorer, matches)] * 2, rtol=2e-6)
 
 
 @pytest.mark.parametrize("count", [4, 20])
-def test_what_a_plain_function_closes_over_may_be_traced(count):
+def test_a_plain_function_may_close_over_traced_values(count):
     """Few candidates at once, or as many as would be shared by the cores."""
-    rng = np.random.default_rng(0)
-    pairs = jax.tree.map(lambda *leaves: np.stack(leaves), *[random_matches(rng, 30) for _ in range(count)])
-    scaled = HistogramOfShifts()
+    pairs, scaled = random_pairs([30] * count), HistogramOfShifts()
     expected = np.sum(score_grid(scaled, pairs, sigma=[10.0, 20.0]))
 
     def total(t, **axes):

@@ -23,11 +23,10 @@ def test_rank_is_stable_with_nan_and_masked_last(scores, data):
     assert list(np.asarray(got)) == oracles.rank(scores, mask)
 
 
-def test_rank_takes_batches_and_defaults_to_no_mask():
+def test_rerank_takes_batches_and_defaults_to_no_mask():
     scores = jnp.array([[1.0, 3.0, 2.0], [5.0, 5.0, 9.0]])
-    np.testing.assert_array_equal(rank(scores), [[1, 2, 0], [2, 0, 1]])
     ranking = rerank(scores)
-    np.testing.assert_array_equal(ranking.order, rank(scores))
+    np.testing.assert_array_equal(ranking.order, [[1, 2, 0], [2, 0, 1]])
     np.testing.assert_array_equal(ranking.scores, scores)
 
 
@@ -63,11 +62,10 @@ def test_balancing_c_equalizes_the_spread_of_real_candidates():
 
 
 def test_a_score_that_is_no_number_takes_no_part_in_the_balance():
-    """Its candidate is there: neither its score nor the filter's similarity to it may matter to the others."""
     filter_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
+    expected = np.std([10.0, 50.0, 30.0]) / np.std(filter_scores)  # the similarity of its candidate counts
     for broken in (np.nan, np.inf):
         c = balancing_c(filter_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
-        expected = np.std([10.0, 50.0, 30.0]) / np.std(np.array([0.5, 0.7, 0.9, 0.1]))
         np.testing.assert_allclose(c, expected, rtol=1e-6)
     assert balancing_c(filter_scores, jnp.full(4, jnp.nan), mask) == 0.0
 
@@ -88,12 +86,9 @@ def test_fusion_and_ranking_compile_once_for_all_callers(compilations):
     assert compiled == 0
 
 
-def test_whole_numbers_are_ranked_as_they_are():
-    np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint32, np.int32, np.uint64, np.int64, np.bool_])
-def test_the_ends_of_whole_numbers_are_ranked_as_they_are(dtype):
+def test_whole_numbers_are_ranked_as_they_are(dtype):
+    np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])  # not as float32
     low, high = (False, True) if dtype is np.bool_ else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     scores, mask = np.array([low, high, 1, low, high], dtype), np.array([True, True, True, True, False])
     expected = sorted(range(5), key=lambda row: (not mask[row], -int(scores[row])))
@@ -136,21 +131,17 @@ def test_no_score_is_no_fault_of_a_program():
 
 
 def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
-    scores = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32)
-    fused = np.asarray(
-        fuse_scales(scores, np.array([True, True, False]), np.array([0, 1], np.float32), normalize="none")
-    )
-    np.testing.assert_array_equal(fused, [1, 2, np.nan])
-    against = fuse_scales(scores, np.array([True, True, False]), np.array([0, -2], np.float32), normalize="none")
-    np.testing.assert_array_equal(against, [-2, -4, np.nan])
+    scores, mask = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32), np.array([True, True, False])
+    for weight in (1, -2):
+        fused = fuse_scales(scores, mask, np.array([0, weight], np.float32), normalize="none")
+        np.testing.assert_array_equal(fused, [weight, 2 * weight, np.nan])
     assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
 
 
 @pytest.mark.optimized
 def test_scales_of_equal_scores_say_nothing():
     """Whatever rounding makes of the mean of equal scores."""
-    rng = np.random.default_rng(0)
-    scores = np.stack([np.full(49, 0.1), rng.random(49)], axis=-1).astype(np.float32)
+    scores = np.stack([np.full(49, 0.1), np.random.default_rng(0).random(49)], axis=-1).astype(np.float32)
     mask = np.ones(49, bool)
     np.testing.assert_array_equal(fuse_scales(scores, mask), fuse_scales(scores[:, 1:], mask))
     np.testing.assert_array_equal(fuse_scales(scores[:, :1], mask), np.zeros(49))
@@ -173,13 +164,13 @@ def test_queries_and_settings_are_fused_one_by_one():
 
 def test_fused_scales_have_a_gradient_where_scores_are_equal_or_missing():
     mask = np.array([True, True, True, True, False])
-    equal, own = np.full(5, 2.0), np.array([1.0, np.nan, 4.0, 2.0, np.nan])
+    equal, unequal = np.full(5, 2.0), np.array([1.0, np.nan, 4.0, 2.0, np.nan])
 
     def total(scores):
         fused = fuse_scales(scores, mask)
         return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 3)  # the sum of squares is their number
 
-    for scores in (np.stack([equal, equal], 1), np.stack([equal, own], 1)):
+    for scores in (np.stack([equal, equal], 1), np.stack([equal, unequal], 1)):
         slope = jax.grad(total)(jnp.asarray(scores, jnp.float32))
         assert np.isfinite(slope).all()
     assert np.abs(slope[[0, 2, 3], 1]).min() > 0.05

@@ -1,7 +1,6 @@
 """Arrays in a file: what comes back is what was written, or an error."""
 
 import gc
-import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,7 +9,6 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.numerics import available_cpus
 
 ARRAYS = {
     "scores": np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32),
@@ -46,27 +44,20 @@ def test_equal_arrays_are_equal_files(tmp_path):
 
 
 @pytest.mark.parametrize("compress", [False, True])
-def test_every_flipped_bit_and_every_missing_byte_is_noticed(tmp_path, compress):
+def test_flipped_bits_and_missing_bytes_raise(tmp_path, compress):
     path = tmp_path / "a.npz"
     write_arrays(path, {"scores": ARRAYS["scores"]}, compress=compress)
     content = path.read_bytes()
-    with path.open("r+b") as file:
-        for position, byte in enumerate(content):
-            for written in (byte ^ 1 << position % 8, byte):
-                file.seek(position)
-                file.write(bytes([written]))
-                file.flush()
-                if written != byte:
-                    with pytest.raises(InputError, match=r"a\.npz: expected .* damaged ones; delete it$"):
-                        read_arrays(path)
-    np.testing.assert_array_equal(read_arrays(path)["scores"], ARRAYS["scores"])
-    for length in reversed(range(len(content))):
-        os.truncate(path, length)
-        with pytest.raises(InputError, match="damaged"):
+    flipped = [bytearray(content) for _ in content]
+    for position, damaged in enumerate(flipped):
+        damaged[position] ^= 1 << position % 8
+    for damaged in (*flipped, *(content[:length] for length in range(len(content)))):
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a\.npz: expected .* damaged ones; delete it$"):
             read_arrays(path)
 
 
-def test_arrays_about_something_else_are_refused(tmp_path):
+def test_arrays_with_another_label_raise(tmp_path):
     write_arrays(tmp_path / "a.npz", ARRAYS, "row 1 of \udcff")
     assert read_arrays(tmp_path / "a.npz", "row 1 of \udcff").keys() == ARRAYS.keys()
     for about in ("", "row 2 of \udcff"):
@@ -74,7 +65,7 @@ def test_arrays_about_something_else_are_refused(tmp_path):
             read_arrays(tmp_path / "a.npz", about)
 
 
-def test_what_fails_leaves_what_was_there(tmp_path):
+def test_a_failed_write_keeps_the_file_before(tmp_path):
     path = tmp_path / "a.npz"
     write_arrays(path, {"one": np.ones(2)})
     with pytest.raises(ValueError, match="Object arrays"):
@@ -83,14 +74,6 @@ def test_what_fails_leaves_what_was_there(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
     with pytest.raises(FileNotFoundError):
         read_arrays(tmp_path / "b.npz")
-
-
-def test_processors_are_those_that_this_process_may_use(monkeypatch):
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: {3, 5, 8}, raising=False)
-    assert available_cpus() == 3
-    monkeypatch.delattr("os.sched_getaffinity")
-    monkeypatch.setattr("os.cpu_count", lambda: None)
-    assert available_cpus() == 1
 
 
 def test_any_number_of_threads_read_at_the_same_time(tmp_path):
@@ -106,8 +89,7 @@ def test_any_number_of_threads_read_at_the_same_time(tmp_path):
         sys.setswitchinterval(1e-6)
         gc.set_threshold(1)
         with ThreadPoolExecutor(8) as pool:
-            files = list(pool.map(read, np.arange(300) % 20))
+            assert all(arrays.keys() == set("abcdef") for arrays in pool.map(read, np.arange(300) % 20))
     finally:
         sys.setswitchinterval(interval)
         gc.set_threshold(*threshold)
-    assert all(arrays.keys() == set("abcdef") for arrays in files)
