@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from mfvpr.matching.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.reranking.grids import score_settings
-from mfvpr.reranking.ranking import BIN_STEP, fuse_scales
+from mfvpr.reranking.ranking import BIN_STEP, Scores, fuse_scales
 from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Shortlist
@@ -27,7 +27,7 @@ PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, a
 def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
     devices: Sequence[Device] | None = None, track: Track = no_progress,
-) -> dict[str, Float[np.ndarray, "queries candidates"]]:  # fmt: skip
+) -> dict[str, Scores]:  # fmt: skip
     """Scores, float32, by name of the scorer; NaN without a candidate.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values
@@ -38,7 +38,7 @@ def score(
         match_set: matches of Q queries with C candidates; several scales are scored one by one and fused.
         candidates: shortlist of the queries.
         devices: share the batches, without effect on the bits of the scores; None = JAX's default device.
-        track: progress, over batches.
+        track: progress over batches.
     """
     if not scorers:
         return {}

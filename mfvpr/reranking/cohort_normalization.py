@@ -13,11 +13,12 @@ score high with each other and are treated as hubs.
 """
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
@@ -48,7 +49,7 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
 
 
 def hubness(
-    candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"], num_database: int, *, name: str = "a scorer"
+    candidates: Shortlist, scores: Scores, num_database: int, *, name: str = "a scorer"
 ) -> Float[np.ndarray, " database"]:
     """Hubness of each database image, float64 above 0.
 
@@ -59,10 +60,9 @@ def hubness(
         candidates: of the cohort's images.
         scores: of the candidates; scores that are not finite are ignored.
         num_database: number of database images.
-        name: name of the scorer, for the error.
 
     Raises:
-        InputError: a score is below 0.
+        InputError: a score of the scorer `name` is below 0.
     """
     known = np.asarray(candidates.mask) & np.isfinite(scores)
     rows, values = np.asarray(candidates.indices)[known], np.asarray(scores, np.float64)[known]
@@ -74,24 +74,14 @@ def hubness(
 
 
 def by_hubness(
-    candidates: Shortlist,
-    scores: Num[np.ndarray, "queries candidates"],
-    hubness: Float[np.ndarray, " database"],
-    *,
-    name: str = "a scorer",
-) -> Float[np.ndarray, "queries candidates"]:
+    candidates: Shortlist, scores: Scores, hubness: Float[np.ndarray, " database"], *, name: str = "a scorer"
+) -> Scores:
     """Scores divided by the hubness of the candidates, float32.
 
     A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
 
-    Args:
-        candidates: of a sequence.
-        scores: of the candidates.
-        hubness: see the function `hubness`.
-        name: name of the scorer, for the error.
-
     Raises:
-        InputError: a score is below 0; division would increase it.
+        InputError: a score of the scorer `name` is below 0; division would increase it.
     """
     _require_positive(scores, name)
     return (scores / np.maximum(hubness, 1)[candidates.indices]).astype(np.float32)

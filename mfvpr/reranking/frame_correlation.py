@@ -4,8 +4,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
+from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
@@ -37,9 +38,7 @@ class FrameCorrelation:
             raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
                              "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
 
-    def __call__(
-        self, candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"]
-    ) -> Float[np.ndarray, "queries candidates"]:
+    def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
         """Correlated scores of a sequence, float32.
 
         Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
@@ -54,9 +53,7 @@ class FrameCorrelation:
             before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
         return correlated.astype(np.float32)
 
-    def _gains(
-        self, rows: Float[np.ndarray, " candidates"], before: Float[np.ndarray, "previous 2"]
-    ) -> Float[np.ndarray, " candidates"]:
+    def _gains(self, rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
         """Largest relative gains of rows; `before` are places and scores."""
         places, scores = before.T
         best = scores.max()

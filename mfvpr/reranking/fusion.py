@@ -5,11 +5,19 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.reranking.cohort_normalization import by_hubness
 from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.ranking import FilterScore, Ties, filter_scores, fuse_scales, fuse_shortlist, rank_shortlist
+from mfvpr.reranking.ranking import (
+    FilterScore,
+    Scores,
+    Ties,
+    filter_scores,
+    fuse_scales,
+    fuse_shortlist,
+    rank_shortlist,
+)  # fmt: skip
 from mfvpr.reranking.results import COHORT, FILTER, FRAMES, Matched, Ranked
 from mfvpr.scoring.fields import POSITIVE
 from mfvpr.types import Shortlist
@@ -72,9 +80,7 @@ class Fusion:
                 raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
                                  f"{weight!r}")  # fmt: skip
 
-    def __call__(
-        self, main: str, candidates: Shortlist, scores: Mapping[str, Num[np.ndarray, "queries candidates"]]
-    ) -> Float[np.ndarray, "queries candidates"]:
+    def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
         """Combined scores, from scores by name of the scorer."""
         if self.c != "zscore":
             return fuse_shortlist(candidates, scores[main], self.c, filter_score=self.filter_score)
@@ -85,14 +91,10 @@ class Fusion:
 
 
 def rank_sequence(
-    matched: Matched,
-    scores: Mapping[str, Num[np.ndarray, "queries candidates"]],
-    fused: Mapping[str, Fusion],
-    correlated: Mapping[str, FrameCorrelation],
-    ties: Ties,
-    *,
+    matched: Matched, scores: Mapping[str, Scores], fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
-) -> dict[str, Ranked]:
+) -> dict[str, Ranked]:  # fmt: skip
     """Rankings of a sequence by name of the system.
 
     Args:
@@ -102,10 +104,8 @@ def rank_sequence(
         hubness: by name of the scorer; None = no score normalization with a cohort.
     """
     candidates, scores = matched.candidates, {**scores}
-    scores |= {
-        f"{name} + {COHORT}": by_hubness(candidates, scores[name], strengths, name=name)
-        for name, strengths in (hubness or {}).items()
-    }
+    for name, strengths in (hubness or {}).items():
+        scores[f"{name} + {COHORT}"] = by_hubness(candidates, scores[name], strengths, name=name)
     scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}
     scores |= {f"{name} + {FRAMES}": correlate(candidates, scores[name]) for name, correlate in correlated.items()}
     scores = {FILTER: candidates.scores} | scores
@@ -116,6 +116,6 @@ def _between(value: Any, low: float, high: float) -> bool:
     return isinstance(value, int | float | np.number) and bool(low <= value <= high)
 
 
-def _rank(candidates: Shortlist, scores: np.ndarray, ties: Ties) -> Ranked:
+def _rank(candidates: Shortlist, scores: Scores, ties: Ties) -> Ranked:
     order = rank_shortlist(candidates, scores, ties=ties)
     return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))

@@ -35,9 +35,8 @@ WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a matc
 def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Float[jax.Array, "*grid candidates"]:
     """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
 
-    The grid is one traced computation for each capacity of bins that its values need, so that fine bins do not slow
-    coarse bins down. Other values within the same capacities cost no compilation, other lengths do. If the scorer is
-    or holds a plain function, every call compiles.
+    Each capacity of bins is one traced computation, so that fine bins do not slow coarse bins down. Other values within
+    the same capacities cost no compilation, other lengths do. With a plain function, every call compiles.
 
     Args:
         scorer: its other parameters stay.
@@ -128,8 +127,8 @@ def score_settings(
         scorer: its other parameters stay; a histogram needs a capacity that suffices for every `bin_size`.
         matches: `[C, K, ...]`.
         settings: G values of the scorer's numeric parameters; none: G = 1.
-        weightings: W values that only change how much a match counts, which are cheap to vary: `max_distance`
-            (larger distances do not count) and `weight` (the index of the scorer's `ChosenWeight`); none: W = 1.
+        weightings: W values of `max_distance` (larger distances do not count) and `weight` (the index of the scorer's
+            `ChosenWeight`), which are cheap to vary; none: W = 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
     require_real("scorer", scores)

@@ -20,6 +20,8 @@ from mfvpr.utils.numerics import as_float, compiled, is_concrete, masked, masked
 Ties = Literal["filter", "index"]
 FilterScore = Literal["cosine", "negative_euclidean"]
 
+Scores = Float[np.ndarray, "queries candidates"]
+
 BIN_STEP = 8  # capacities of histograms are multiples of it
 
 
@@ -108,12 +110,8 @@ def fuse(
 
 
 def fuse_shortlist(
-    candidates: Shortlist,
-    scores: Num[np.ndarray, "queries candidates"],
-    c: float | None,
-    *,
-    filter_score: FilterScore = "cosine",
-) -> Float[np.ndarray, "queries candidates"]:
+    candidates: Shortlist, scores: Scores, c: float | None, *, filter_score: FilterScore = "cosine"
+) -> Scores:
     """Combined scores of retrieval and re-ranking; NaN without a candidate.
 
     Args:
@@ -126,7 +124,7 @@ def fuse_shortlist(
     return np.asarray(or_nan(fused, candidates.mask))
 
 
-def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> Float[np.ndarray, "queries candidates"]:
+def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> Scores:
     """Retrieval scores: cosine similarity, or minus the Euclidean distance.
 
     Raises:
@@ -202,7 +200,7 @@ def breaks_ties_by_row(ties: Ties) -> bool:
 
 
 def rank_shortlist(
-    candidates: Shortlist, scores: Num[np.ndarray, "queries candidates"], *, ties: Ties = "filter"
+    candidates: Shortlist, scores: Scores, *, ties: Ties = "filter"
 ) -> Int[np.ndarray, "queries candidates"]:
     """Positions into the shortlist, best first, missing candidates last.
 

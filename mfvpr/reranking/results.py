@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 
 FILTER = "filter"  # name of the retrieval's own ranking
@@ -37,7 +38,7 @@ class Ranked:
     """Ranking of a sequence: database rows, best first, and scores in this order."""
 
     rows: Int[np.ndarray, "queries candidates"]
-    scores: Float[np.ndarray, "queries candidates"]
+    scores: Scores
 
     @property
     def shortlist(self) -> Shortlist:

@@ -7,7 +7,7 @@ that methods call do not count. Class attributes count, private ones if they are
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import CellType, CodeType, FunctionType
 from typing import Any
 
@@ -19,12 +19,7 @@ _CONSTANTS = (*_PLAIN, np.ndarray, np.generic, jax.Array, tuple, list, dict, set
 
 
 def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
-    """The code of a class without its bases.
-
-    Args:
-        kind: the class.
-        recipe_of: array -> JSON values.
-    """
+    """The code of a class without its bases; `recipe_of` returns the JSON values of an array."""
     parts = [[name, _part(part, recipe_of, ())] for name, part in sorted(vars(kind).items()) if _counts(name, part)]
     return [kind.__qualname__, _text(kind), parts]
 
@@ -56,22 +51,23 @@ def _functions(part: Any) -> list[Any]:
 def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> Any:
     if id(part) in seen:  # a function that closes over itself
         return "itself"
-    seen = (*seen, id(part))
+
+    def parts(values: Iterable[Any]) -> list[Any]:
+        return [_part(value, recipe_of, (*seen, id(part))) for value in values]
+
     if isinstance(part, FunctionType):
         closure = [cell.cell_contents for cell in part.__closure__ or () if cell != CellType()]  # an empty cell
-        values = [part.__code__, part.__defaults__ or (), part.__kwdefaults__ or {}, *closure]
-        return [_part(value, recipe_of, seen) for value in values]
+        return parts([part.__code__, part.__defaults__ or (), part.__kwdefaults__ or {}, *closure])
     if isinstance(part, CodeType):
-        constants = [_part(value, recipe_of, seen) for value in part.co_consts]
-        return [part.co_code.hex(), list(part.co_names), list(part.co_varnames), constants]
+        return [part.co_code.hex(), list(part.co_names), list(part.co_varnames), parts(part.co_consts)]
     if isinstance(part, functools.partial):
-        return [_part(value, recipe_of, seen) for value in (part.func, part.args, part.keywords)]
+        return parts([part.func, part.args, part.keywords])
     if functions := _functions(part):
-        return [_part(function, recipe_of, seen) for function in functions]
+        return parts(functions)
     if isinstance(part, tuple | list):
-        return [_part(value, recipe_of, seen) for value in part]
+        return parts(part)
     if isinstance(part, dict):
-        return [[str(name), _part(value, recipe_of, seen)] for name, value in part.items()]
+        return [[str(name), *parts([value])] for name, value in part.items()]
     if isinstance(part, set | frozenset):
         return sorted(map(repr, part)) if all(isinstance(value, _PLAIN) for value in part) else type(part).__qualname__
     if part is None or isinstance(part, _PLAIN):

@@ -135,8 +135,8 @@ def compiled(function: Function, **options: Any) -> Function:
     The classes of all nodes of the arguments choose the program as well, even if two classes were registered alike.
 
     With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
-    the values of the function's closure from the first call (as it does for a function in a static field). For many
-    calls in a row, `with_static_functions` allows compilation.
+    the values of the function's closure from the first call. For many calls in a row, `with_static_functions` allows
+    compilation.
     """
     programs: dict[tuple[type, ...], Any] = {}
 
