@@ -21,21 +21,19 @@ from mfvpr.utils.fingerprints import fingerprint
 
 def test_other_numbers_make_another_recipe():
     """Batch sizes do not."""
-    keys = [recipe_of(Sift(max_keypoints=60, batch_size=size)) for size in (1, 8)]
-    assert keys[0] == keys[1]
-    recipes = [recipe_of(Sift(max_keypoints=61)), recipe_of(Sift(max_keypoints=60, image_size=(320, 336)))]
-    recipes += [recipe_of(VladFitting(seed=1)), recipe_of(Vlad(np.ones((2, 3), np.float32)))]
-    recipes += [recipe_of(Vlad(np.ones((3, 2), np.float32))), recipe_of(Vlad(np.zeros((2, 3), np.float32)))]
-    assert len({json.dumps(recipe, sort_keys=True) for recipe in (*keys, *recipes)}) == 7
+    assert recipe_of(Sift(batch_size=1)) == recipe_of(Sift(batch_size=8))
+    vocabularies = [np.ones((2, 3), np.float32), np.ones((3, 2), np.float32), np.zeros((2, 3), np.float32)]
+    extractors = [Sift(), Sift(max_keypoints=61), Sift(image_size=(320, 336)), VladFitting(seed=1)]
+    recipes = [recipe_of(part) for part in (*extractors, *map(Vlad, vocabularies))]
+    assert len({json.dumps(recipe, sort_keys=True) for recipe in recipes}) == len(recipes) == 7
     with pytest.raises(TypeError, match=r"dataclass, arrays, .*`recipe`"):
         recipe_of(lambda images: images)
 
 
 def test_classes_of_one_name_are_told_apart():
-    classes = [
-        dataclass(type("Sift", (), {"__module__": name})) for name in ("theirs", "theirs.newer", "mfvpr.features")
-    ]
-    assert [recipe_of(kind())["class"] for kind in classes] == ["theirs.Sift", "theirs.newer.Sift", "Sift"]
+    modules = {"theirs": "theirs.Sift", "theirs.newer": "theirs.newer.Sift", "mfvpr.features": "Sift"}
+    for module, name in modules.items():
+        assert recipe_of(dataclass(type("Sift", (), {"__module__": module}))())["class"] == name
     assert recipe_of(Sift())["class"] == "Sift"
 
 
@@ -63,13 +61,12 @@ class Inner(made_by(1)):
 
 
 def test_code_of_ones_own_is_part_of_the_recipe():
-    same = [recipe_of(made_by(1)()), recipe_of(made_by(1)())]
-    assert same[0] == same[1]
-    used = made_by(1)()
+    recipe, used = recipe_of(made_by(1)()), made_by(1)()
     assert used.table
-    assert recipe_of(used) == same[0]
+    used.detector, type(used)._cache = object(), {1: 2}  # what a class keeps while it works is no part
+    assert recipe_of(used) == recipe
     scorers = [made_by(2)(), made_by(1, gain=7)(), made_by(1, default=4)(), made_by(1)(size=3), Inner()]
-    assert len({fingerprint(recipe) for recipe in (same[0], *map(recipe_of, scorers))}) == 1 + len(scorers)
+    assert len({fingerprint(other) for other in (recipe, *map(recipe_of, scorers))}) == 1 + len(scorers)
     assert recipe_of(Inner()) == recipe_of(Inner())
 
 
@@ -87,7 +84,7 @@ def test_text_counts_where_code_does_not_say_all(tmp_path, monkeypatch):
     assert recipes[0] != recipes[1]
 
 
-def privately(value):
+def with_private_gain(value):
     """A class of the same text whatever its private attribute holds."""
 
     class Mine(Sift):
@@ -101,16 +98,9 @@ def privately(value):
 
 def test_private_constants_are_part_of_the_recipe():
     values = [1, 3, 1.0, "1", (1, 2), {"a": 1}, [1], np.ones(2), np.zeros(2), np.float32]
-    recipes = [fingerprint(recipe_of(privately(value)())) for value in values]
+    recipes = [fingerprint(recipe_of(with_private_gain(value)())) for value in values]
     assert len({*recipes}) == len(values)
-    assert recipes[0] == fingerprint(recipe_of(privately(1)()))
-
-
-def test_what_a_class_keeps_while_it_works_is_no_part_of_the_recipe():
-    used = made_by(1)()
-    before = recipe_of(used)
-    used.detector, type(used)._cache = object(), {1: 2}
-    assert recipe_of(used) == before
+    assert recipes[0] == fingerprint(recipe_of(with_private_gain(1)()))
 
 
 def test_what_runs_counts_and_not_the_text_of_a_file_alone(tmp_path, monkeypatch):
@@ -142,15 +132,13 @@ def test_a_recipe_of_ones_own_belongs_to_its_class():
 
 
 def test_a_network_is_known_by_its_weights():
-    entry = entry_of("aliked-t16")
-    plan = blueprint(entry)
-    filled = [
-        plan.filled({name: np.full(shape, value, np.float32) for name, shape in plan.shapes.items()})
-        for value in (0, 1)
-    ]
-    recipes = [recipe_of(AlikedFeatures(model)) for model in (*filled, filled[0])]
-    assert recipes[0] == recipes[2]
-    assert recipes[0] != recipes[1]
+    plan = blueprint(entry_of("aliked-t16"))
+
+    def recipe(value):
+        weights = {name: np.full(shape, value, np.float32) for name, shape in plan.shapes.items()}
+        return recipe_of(AlikedFeatures(plan.filled(weights)))
+
+    assert recipe(0) == recipe(0) != recipe(1)
 
 
 def test_a_network_is_known_wherever_its_functions_are_in_memory():

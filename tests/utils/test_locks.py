@@ -64,7 +64,7 @@ def test_a_conflict_without_an_error_waits(tmp_path):
     assert order == ["waits", "first", "second"]
 
 
-def test_whoever_asks_for_a_lock_does_not_take_it(tmp_path):
+def test_is_locked_does_not_take_the_lock(tmp_path):
     path = tmp_path / "lock"
     assert not is_locked(path)
     with lock(path, os.O_RDWR | os.O_CREAT, refuse):
