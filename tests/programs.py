@@ -1,5 +1,6 @@
 """The programs, and a small data set for them: called, as command lines of this process, or in one of their own."""
 
+import csv
 import json
 import logging
 import os
@@ -99,6 +100,12 @@ def results(place):
     found = json.loads((place / "results.json").read_text())
     del found["seconds"]
     return found
+
+
+def csv_rows(path):
+    """The lines of a table, as dictionaries by column."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def snapshot(place):

@@ -1,6 +1,5 @@
 """Confidence of predictions in the run folder: curves, refused queries, re-ranking of uncertain queries."""
 
-import csv
 import json
 import shutil
 from pathlib import Path
@@ -11,12 +10,12 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.evaluation import precision_recall, read_confidences, reliability
-from tests.programs import QUERIES, small
+from tests.programs import QUERIES, csv_rows, small
 
 pytestmark = pytest.mark.thorough
 
 SYSTEMS = ("filter", "histogram", "histogram + filter")
-LINES = ("scorer=histogram", "figures=1")
+LINES = ("scorer=histogram", "figures=0")
 LEARNED = Path(mfvpr.__file__).parent / "scoring" / "learned" / "learned_aliked.json"
 
 
@@ -44,34 +43,33 @@ def refused(root, tmp_path, call):
 
 
 @pytest.fixture
-def content(evaluate):
-    """The content of the confidence file of a first run."""
-    first, *_ = evaluate("first", "figures=0")
-    return json.loads((first / "confidence.json").read_text())
+def confidence(evaluate):
+    """The confidence file of a first run."""
+    return evaluate("first")[0] / "confidence.json"
 
 
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+@pytest.fixture
+def content(confidence):
+    return json.loads(confidence.read_text())
 
 
 def test_a_run_says_how_sure_its_answers_are(evaluate):
-    out, _, stdout = evaluate("first")
+    out, _, stdout = evaluate("first", "figures=1")
     assert "ECE" not in stdout  # said in files, until it is asked for
-    gains, answers = rows(out / "gains.csv"), rows(out / "answers.csv")
+    gains, answers = csv_rows(out / "gains.csv"), csv_rows(out / "answers.csv")
     hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
-    predictions = [line for line in rows(out / "predictions.csv") if line["rank"] == "1"]
+    predictions = [line for line in csv_rows(out / "predictions.csv") if line["rank"] == "1"]
     assert [(line["query"], line["answer"], line["score"], line["right"]) for line in answers] == [
         (line["query"], line["database"], line["score"], line["right"]) for line in predictions
     ]
     probability = np.array([float(line["p"]) for line in answers])
     assert len(np.unique(probability)) > QUERIES / 2
-    table = {line["system"]: line for line in rows(out / "confidence.csv")}
+    table = {line["system"]: line for line in csv_rows(out / "confidence.csv")}
     assert tuple(table) == SYSTEMS
-    curves = rows(out / "precision_recall.csv")
+    curves = csv_rows(out / "precision_recall.csv")
     for system in SYSTEMS:
         file = out / "predictions" / f"{system.replace(' + ', '_')}.csv"
-        scores = np.array([float(line["score"]) for line in rows(file) if line["rank"] == "1"])
+        scores = np.array([float(line["score"]) for line in csv_rows(file) if line["rank"] == "1"])
         curve = precision_recall(scores, hits[system])
         written = [line for line in curves if (line["system"], line["by"]) == (system, "score")]
         points = [[float(line[name]) for line in written] for name in ("threshold", "precision", "recall")]
@@ -80,11 +78,9 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
         assert table[system]["R@100P by score"] == f"{100 * curve.recall_at(1):.1f}"
     error = reliability(probability, hits["histogram"]).calibration_error
     assert table["histogram"]["ECE of p"] == f"{100 * error:.1f}"
-    assert (
-        table["histogram"]["AP by p"]
-        == f"{100 * precision_recall(probability, hits['histogram']).average_precision:.1f}"
-    )
-    shares = rows(out / "rerank_share.csv")
+    average_precision = precision_recall(probability, hits["histogram"]).average_precision
+    assert table["histogram"]["AP by p"] == f"{100 * average_precision:.1f}"
+    shares = csv_rows(out / "rerank_share.csv")
     for line, system in ((shares[0], "filter"), (shares[-1], "histogram")):
         assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
     for name in ("precision_recall", "reliability", "rerank_share"):
@@ -93,19 +89,18 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
         assert picture.std() > 10
 
 
-def test_below_the_threshold_the_answer_is_no_place(evaluate):
-    first, *_ = evaluate("first")
-    systems, origin = read_confidences(first / "confidence.json")
+def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
+    systems, origin = read_confidences(confidence)
     assert tuple(systems) == SYSTEMS
     assert (origin["queries"], origin["right_within"]) == (QUERIES, [1, "frames"])
     assert origin["ground_truth"]["thresholds"] == [0, 1]
-    confidence = (f"confidence={first}/confidence.json", "threshold=0.4")
-    out, stderr, stdout = evaluate("second", *confidence)
+    threshold = (f"confidence={confidence}", "threshold=0.4")
+    out, stderr, stdout = evaluate("second", *threshold)
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
     assert header.endswith("right  wrong  refused  of these right")
-    answers = rows(out / "answers.csv")
+    answers = csv_rows(out / "answers.csv")
     probability, score = (np.array([float(line[name]) for line in answers]) for name in ("p", "score"))
     refused = probability < 0.4
     assert 0 < refused.sum() < QUERIES
@@ -113,48 +108,44 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate):
     assert [line["answer"] == "no place" for line in answers] == refused.tolist()
     assert [line["reason"] for line in answers] == np.where(refused, "low confidence", "").tolist()
     assert {line["in_database"] for line in answers} == {"1"}
-    right = np.array([line["histogram"] == "1" for line in rows(out / "gains.csv")])
+    right = np.array([line["histogram"] == "1" for line in csv_rows(out / "gains.csv")])
     assert [line["right"] for line in answers] == right.astype(int).astype(str).tolist()
-    line = next(line for line in rows(out / "confidence.csv") if line["system"] == "histogram")
+    line = next(line for line in csv_rows(out / "confidence.csv") if line["system"] == "histogram")
     counts = [int(line[name]) for name in ("right", "wrong", "refused", "of these right")]
     assert counts == [(right & ~refused).sum(), (~right & ~refused).sum(), refused.sum(), (right & refused).sum()]
     assert line["ECE of p"] == f"{100 * reliability(probability, right).calibration_error:.1f}"
-    predictions = rows(out / "predictions.csv")
+    predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
     assert [line["query"] for line in none] == [line["query"] for line in answers if line["answer"] == "no place"]
     assert [(line["rank"], line["score"], line["right"]) for line in none] == [
         ("1", line["score"], line["right"]) for line in answers if line["answer"] == "no place"
     ]
-    every = rows(out / "predictions" / "histogram.csv")
+    every = csv_rows(out / "predictions" / "histogram.csv")
     refusing = {line["query"] for line in none}
     assert [line for line in predictions if line not in none] == [
         line for line in every if line["query"] not in refusing
     ]
-    unknown, stderr, _ = evaluate(
-        "third", *confidence, "dataset.ground_truth=none", "dataset.index_file=null", "figures=0"
-    )
-    assert [{**line, "right": "", "in_database": ""} for line in answers] == rows(unknown / "answers.csv")
+    unknown, *_ = evaluate("third", *threshold, "dataset.ground_truth=none", "dataset.index_file=null")
+    assert [{**line, "right": "", "in_database": ""} for line in answers] == csv_rows(unknown / "answers.csv")
     assert not (unknown / "confidence.csv").exists()
 
 
-def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, root, tmp_path):
+def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confidence, root, tmp_path):
     """Ground truth without the first query's place: it is a negative, and its refusal is right."""
-    first, *_ = evaluate("first", "figures=0")
     index = next(setting for setting in small(root) if setting.startswith("dataset.index_file=")).partition("=")[2]
     header, line, *lines = Path(index).read_text().splitlines()
     (tmp_path / "index.csv").write_text("\n".join([header, f"{line.partition(',')[0]},", *lines]))
-    threshold = (f"confidence={first}/confidence.json", "threshold=1", "figures=0")
-    out, *_ = evaluate("second", *threshold, f"dataset.index_file={tmp_path}/index.csv")
-    answers = rows(out / "answers.csv")
+    index = f"dataset.index_file={tmp_path}/index.csv"
+    out, *_ = evaluate("second", f"confidence={confidence}", "threshold=1", index)
+    answers = csv_rows(out / "answers.csv")
     assert {line["answer"] for line in answers} == {"no place"}
     assert [line["in_database"] for line in answers] == ["0"] + ["1"] * (QUERIES - 1)
-    hits = [str(int(line["histogram"] == "1")) for line in rows(out / "gains.csv")]
+    hits = [str(int(line["histogram"] == "1")) for line in csv_rows(out / "gains.csv")]
     assert [line["right"] for line in answers] == hits
     assert hits[0] == "0"
-    last = [line for line in rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
-    right = sum(line["histogram"] == "1" for line in rows(out / "gains.csv"))
-    assert float(last["recall"]) == pytest.approx(right / (QUERIES - 1))
-    assert float(last["precision"]) == pytest.approx(right / QUERIES)
+    last = [line for line in csv_rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
+    assert float(last["recall"]) == pytest.approx(hits.count("1") / (QUERIES - 1))
+    assert float(last["precision"]) == pytest.approx(hits.count("1") / QUERIES)
 
 
 @pytest.mark.parametrize(
@@ -176,30 +167,28 @@ def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
 
 
 @pytest.mark.slow
-def test_confidence_of_other_settings_is_said(evaluate):
-    first, *_ = evaluate("first", "figures=0")
-    confidence = (f"confidence={first}/confidence.json", "figures=0")
-    _, stderr, _ = evaluate("second", *confidence, "scorer.weight=ratio", "fusion.c=2")
+def test_confidence_of_other_settings_is_said(evaluate, confidence):
+    _, stderr, _ = evaluate("second", f"confidence={confidence}", "scorer.weight=ratio", "fusion.c=2")
     assert "other settings of scorer, fusion:" in stderr
-    fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined", "figures=0")
+    fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined")
     other, *_ = evaluate("fused", *fused)
     for changed, warns in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
         _, stderr, _ = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
         assert ("other settings of scorer:" in stderr) == warns
-    _, stderr, _ = evaluate("third", *confidence, "scorer=paper")
+    _, stderr, _ = evaluate("third", f"confidence={confidence}", "scorer=paper")
     assert "other settings" not in stderr  # the histogram is the same beside others
 
 
 def test_confidence_of_what_counted_otherwise_is_said(evaluate):
-    first, *_ = evaluate("first", "figures=0", "scorer=paper")
-    confidence = (f"confidence={first}/confidence.json", "figures=0", "scorer=paper")
+    first, *_ = evaluate("first", "scorer=paper")
+    same = (f"confidence={first}/confidence.json", "scorer=paper")
     for changed, words in (("recall.tolerances=[0]", "recall"), ("candidates=5", "candidates")):
-        _, stderr, _ = evaluate(changed, *confidence, changed)
+        _, stderr, _ = evaluate(changed, *same, changed)
         assert f"other settings of {words}" in stderr
-    out, stderr, _ = evaluate("sum", *confidence, "scorer.sum.weight=fs")
+    out, stderr, _ = evaluate("sum", *same, "scorer.sum.weight=fs")
     assert "nothing is said of sum" in stderr
     assert "other settings of" not in stderr
-    assert "sum" not in {line["system"] for line in rows(out / "confidence.csv")}
+    assert "sum" not in {line["system"] for line in csv_rows(out / "confidence.csv")}
 
 
 def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, content, tmp_path):
@@ -210,16 +199,16 @@ def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, content, tmp_pa
         sides = {"database": "other", side: queries} if warns else {"database": seen["database"], "query": "other"}
         changed = content | {"made": content["made"] | {"data_fingerprint": sides}}
         (tmp_path / f"{name}.json").write_text(json.dumps(changed))
-        _, stderr, _ = evaluate(name, f"confidence={tmp_path}/{name}.json", "figures=0")
+        _, stderr, _ = evaluate(name, f"confidence={tmp_path}/{name}.json")
         assert ("was fitted on these very images" in stderr) == warns
 
 
 def test_a_single_candidate_leaves_nothing_to_say(evaluate, refused):
-    first, *_ = evaluate("first", "figures=0", "candidates=1")
-    line = rows(first / "confidence.csv")[0]
+    first, *_ = evaluate("first", "candidates=1")
+    line = csv_rows(first / "confidence.csv")[0]
     assert line["AP by score"]
     assert {line[name] for name in line if " by p" in name or "ECE" in name or name == "by chance"} == {""}
-    error = refused("figures=0", "candidates=1", f"confidence={first}/confidence.json")
+    error = refused("candidates=1", f"confidence={first}/confidence.json")
     assert "expected p of systems, got none" in error
 
 
@@ -229,23 +218,23 @@ def test_a_single_candidate_leaves_nothing_to_say(evaluate, refused):
 ])  # fmt: skip
 def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, content, tmp_path, origin):
     (tmp_path / "other.json").write_text(json.dumps(content | {"made": origin}))
-    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/other.json", "figures=0")
+    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/other.json")
     assert "other settings of features" in stderr
 
 
 def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
     for name in ("one", "other"):
         shutil.copy(LEARNED, tmp_path / f"{name}.json")
-    first, *_ = evaluate("first", "figures=0", f"scorer.weight={tmp_path}/one.json")
+    first, *_ = evaluate("first", f"scorer.weight={tmp_path}/one.json")
     confidence = f"confidence={first}/confidence.json"
-    _, stderr, _ = evaluate("second", "figures=0", confidence, f"scorer.weight={tmp_path}/other.json")
+    _, stderr, _ = evaluate("second", confidence, f"scorer.weight={tmp_path}/other.json")
     assert "other settings" not in stderr
-    _, stderr, _ = evaluate("third", "figures=0", confidence, "scorer.weight=ratio")
+    _, stderr, _ = evaluate("third", confidence, "scorer.weight=ratio")
     assert "other settings of scorer" in stderr
 
 
 def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_path):
     content["systems"]["histogram"]["weights"] = [0.0, 0.0]
     (tmp_path / "flat.json").write_text(json.dumps(content))
-    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json", "figures=0")
+    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json")
     assert "flat.json cannot tell right answers from wrong ones" in stderr

@@ -17,9 +17,10 @@ from experiments import build, maps, query_images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.datasets.videos import frames
-from mfvpr.evaluation import Confidence, write_confidences
+from mfvpr.evaluation import write_confidences
 from mfvpr.storage.maps import lock_map
 from mfvpr.utils import InputError
+from tests.localization.test_map import SURE
 from tests.programs import ROOT, composed, typed
 
 pytestmark = pytest.mark.thorough
@@ -341,15 +342,6 @@ def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_
     assert name == f"{video}:0"
 
 
-def test_a_drive_is_not_added_again_under_another_spelling_of_its_path(folder, small_street, monkeypatch, localized):
-    monkeypatch.chdir(small_street)
-    for root, is_new in ((small_street, True), (".", False)):
-        code, lines, _ = localized(f"[{root}/queries/0000.png,{root}/queries/0001.png]", "add=true", "recent=2")
-        assert code == 0
-        assert values_of("added", lines) == [is_new] * 2
-        assert not any(line["place"] == line["image"] for line in lines)
-
-
 def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
     (tmp_path / "a.png").symlink_to("gone")
     (tmp_path / "b.png").write_bytes(b"image")
@@ -371,11 +363,10 @@ def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localized):
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localized):
     """An evaluation with the map's settings gives no warning."""
     settings = json.loads((folder / "settings.json").read_text())
-    sure = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
     for candidates in (settings["candidates"], settings["candidates"] + 1):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {"settings": same | {"scorer": build.describe_settings(settings["scorer"])}, "candidates": candidates}
-        write_confidences(tmp_path / "c.json", {"histogram": sure}, origin)
+        write_confidences(tmp_path / "c.json", {"histogram": SURE}, origin)
         code, [line], stderr = localized(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert code == 0
         assert 0 <= line["p_right"] <= 1

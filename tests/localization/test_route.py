@@ -119,15 +119,6 @@ def test_what_image_and_motion_exclude_is_left_to_the_motion():
     assert drive_route(sharp(20), there) == (4, 1)
 
 
-def test_nothing_is_known_of_images_that_come():
-    rng, there = np.random.default_rng(0), np.ones(50, bool)
-    answers = [answer(dict(zip(rng.choice(50, 5).tolist(), rng.exponential(size=5).tolist(), strict=True)))
-               for _ in range(12)]  # fmt: skip
-    long, short = Route(Drive()), Route(Drive())
-    located = [long(each, there) for each in answers]
-    assert [short(each, there) for each in answers[:5]] == located[:5]
-
-
 def test_the_map_may_grow_and_costs_few_programs(compilations):
     drive_route = Route(Drive())
     assert drive_route(sharp(0), np.zeros(0, bool)) is None
@@ -139,14 +130,6 @@ def test_the_map_may_grow_and_costs_few_programs(compilations):
     assert compilations.count == 0
     assert drive_route(sharp(1500), np.ones(1600, bool)).row == 1500
     assert len(drive_route.belief) == 2 * route.FIRST_ROWS
-
-
-def test_rows_that_are_not_there_are_no_place():
-    there, drive_route = np.ones(20, bool), Route(Drive(1, 0.5, 0.01))
-    there[11] = False
-    drive_route(sharp(10), there)
-    assert drive_route(None, there).row != 11
-    assert drive_route.belief[11] == 0
 
 
 @pytest.mark.parametrize(("scores", "expected"), [
