@@ -48,7 +48,7 @@ settings.load_profile("mfvpr")
 
 
 class Compilations:
-    """How many programs XLA compiled since the last `reset`."""
+    """The number of programs that XLA compiled since the last `reset`."""
 
     def __init__(self) -> None:
         self.count = 0

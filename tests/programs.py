@@ -67,7 +67,7 @@ def small(root, *more):
 
 
 def matches_path(settings):
-    """Where a program keeps the matches of its data set, and their recipe."""
+    """The folder in which a program keeps the matches of its data set, and their recipe."""
     tools, images = stages.begun(settings, stages.Stopwatch())
     recipe = stages.recipe(tools, images, settings["candidates"])
     return store_path(tools.cache.root, "matches", recipe, MATCHES), recipe
@@ -97,9 +97,9 @@ def typed(monkeypatch, capsys, program, *arguments):
 
 def results(place):
     """results.json of a run folder, but for its seconds."""
-    found = json.loads((place / "results.json").read_text())
-    del found["seconds"]
-    return found
+    content = json.loads((place / "results.json").read_text())
+    del content["seconds"]
+    return content
 
 
 def csv_rows(path):

@@ -58,8 +58,8 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     write_json(folder / "results.json", rows)
     write_json(folder / "run.json", {"command": HOSTILE[3], "commit": None, "settings": {"out": HOSTILE[5], "a": {}}})
     for number, name in enumerate(sequences):
-        own = sequence_folder(folder, sequences, number)
-        _write_answers(own, ranks, truth, [""] * len(HOSTILE) if not several else [*range(len(HOSTILE))])
+        places = [*range(len(HOSTILE))] if several else [""] * len(HOSTILE)
+        _write_answers(sequence_folder(folder, sequences, number), ranks, truth, places)
         _write_figure(folder / "figures" / f"{name if several else ''}" / f"right_{number:04d}.png", name, 0)
         _write_figure(folder / "figures" / f"{name if several else ''}" / f"wrong_{number:04d}.png", name, 6)
     if truth:
@@ -70,7 +70,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
 def _write_answers(folder, ranks, truth, places):
     files = file_names([*ranks])
     for system, first in ranks.items():
-        right = np.array([[rank == one for one in range(1, CANDIDATES + 1)] for rank in first])
+        right = np.array(first)[:, None] == np.arange(1, CANDIDATES + 1)
         rows = (np.arange(len(HOSTILE))[:, None] + np.arange(CANDIDATES)) % len(HOSTILE)
         scores = np.arange(len(HOSTILE))[:, None] + 10.0 - np.arange(CANDIDATES)
         rankings = Rankings(HOSTILE, HOSTILE[::-1], rows, scores, right if truth else None)
@@ -78,14 +78,10 @@ def _write_answers(folder, ranks, truth, places):
         write_failures(folder / "failures" / f"{files[system]}.csv", rankings)
     if truth:
         header = ["query", "place", *(column for name in ranks for column in (name, f"{name} rank"))]
-        lines = [
-            [
-                name,
-                places[query],
-                *(cell for one in ranks.values() for cell in (int(one[query] == 1), one[query] or "")),
-            ]
-            for query, name in enumerate(HOSTILE)
-        ]
+        lines = []
+        for query, name in enumerate(HOSTILE):
+            first = [column[query] for column in ranks.values()]
+            lines.append([name, places[query], *(cell for rank in first for cell in (int(rank == 1), rank or ""))])
         write_csv(folder / "gains.csv", header, lines)
 
 
@@ -100,8 +96,8 @@ def _write_figure(path, sequence, query):
 
 def _write_tables(folder, ranks, sequences):
     names = [*sequences, "mean", "pooled"] if len(sequences) > 1 else []
-    recall = [[name, *([part] if part else []), f"{100 * np.mean(np.array(one) == 1):.1f}"]
-              for name, one in ranks.items() for part in names or [None]]  # fmt: skip
+    recall = [[name, *([part] if part else []), f"{100 * np.mean(np.array(first) == 1):.1f}"]
+              for name, first in ranks.items() for part in names or [None]]  # fmt: skip
     header = ["system", *(["sequence"] if names else []), "R@1 ±2"]
     (folder / "table.csv").write_text(Table(header, recall).csv(), encoding="utf-8")
     pairs = [[*SYSTEMS[:2], 0, 5, 0.06, 2, 3, 0.25], [*SYSTEMS[1:], 2, 0, "1e-09", 2, 3, 0.25]]

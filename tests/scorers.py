@@ -96,7 +96,6 @@ FOREIGN = [plain, *FOREIGN_VALUES, HistogramOfShifts(weight=closest)]
 
 
 def title(scorer):
-    """For the names of tests."""
     return getattr(scorer, "__name__", type(scorer).__name__)
 
 

@@ -4,7 +4,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from mfvpr.io import write_features
 from mfvpr.storage import FeatureCache
 from tests import random_checkpoints
 from tests.builders import make_matches
-from tests.programs import QUICK, ROOT, composed, typed
+from tests.programs import QUICK, ROOT, composed, run, typed
 
 pytestmark = pytest.mark.thorough
 
@@ -94,10 +93,7 @@ def test_commands_of_sweeps_and_learning_are_settings(program):
 @pytest.mark.slow
 def test_benchmark_runs(tmp_path):
     out = tmp_path / "benchmark.json"
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.benchmark", "--rounds", "1", "--out", out],
-        cwd=ROOT, capture_output=True, text=True, timeout=280,
-    )  # fmt: skip
+    done = run("--rounds", "1", "--out", out, program="benchmark")
     assert done.returncode == 0, done.stderr
     for step in ("matching", "matching + histogram", "histogram", "anchor", "sum"):
         assert re.search(rf"^{re.escape(step)} +mfvpr", done.stdout, flags=re.MULTILINE)
@@ -134,7 +130,6 @@ def test_the_whole_way_in_one_call(small_street, tmp_path, monkeypatch, capsys):
 
 
 def test_a_scorer_of_your_own_keeps_the_contract():
-    """The example checks itself; what it scores is the number of matches that agree."""
     code, names = EXAMPLES[2], {}
     assert len(lines(code)) <= 15
     exec(compile(code, "README.md", "exec"), names)

@@ -60,6 +60,32 @@ def numpy_only(matches):
     return np.float32(np.sum(np.asarray(matches.mask)))
 
 
+@jax.custom_batching.custom_vmap
+def count(mask):
+    return jnp.sum(mask.astype(jnp.float32))
+
+
+@count.def_vmap
+def _(axis_size, in_batched, mask):
+    return jnp.full(axis_size, jnp.mean(mask.astype(jnp.float32))), True
+
+
+class Static:
+    """Its number is part of the structure, and changes with the leaf beside it."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __call__(self, matches):
+        return self.number * real(matches)
+
+
+def flatten(scorer):
+    return (scorer.number,), None if isinstance(scorer.number, jax.core.Tracer) else float(scorer.number)
+
+
+jax.tree_util.register_pytree_node(Static, flatten, lambda _, leaves: Static(*leaves))
+
 BROKEN = {
     "is no pytree.*@mfvpr.value": Unregistered(),
     r"Worded\.word = 'mean' is no number.*static": Worded(),
@@ -73,6 +99,9 @@ BROKEN = {
     "more slots of padding change the score": lambda m: real(m) / len(m.mask),
     "the order of the matches": lambda m: jnp.sum(jnp.where(m.mask, jnp.arange(len(m.mask), dtype=jnp.float32), 0.0)),
     "the gradient for points. is not finite": lambda m: jnp.sum(mfvpr.masked(lengths(m.points1 - m.points0), m.mask)),
+    "jit scores otherwise": lambda m: (2.0 if isinstance(m.mask, jax.core.Tracer) else 1.0) * real(m),
+    "vmap over a batch of pairs": lambda m: count(m.mask),
+    r"3 traces .*expected one": Static(2.0),
 }
 
 
@@ -90,45 +119,3 @@ def asks(matches):
 def test_the_error_of_code_that_jit_cannot_trace_says_what_to_do(scorer):
     with pytest.raises(AssertionError, match=r"number .*jit .*jnp.where"):
         check_scorer(scorer)
-
-
-def test_jit_that_scores_otherwise_is_named():
-    def score(matches):
-        return (2.0 if isinstance(matches.mask, jax.core.Tracer) else 1.0) * real(matches)
-
-    with pytest.raises(AssertionError, match="jit scores otherwise"):
-        check_scorer(score)
-
-
-def test_a_batch_that_scores_otherwise_is_named():
-    @jax.custom_batching.custom_vmap
-    def count(mask):
-        return jnp.sum(mask.astype(jnp.float32))
-
-    @count.def_vmap
-    def _(axis_size, in_batched, mask):
-        return jnp.full(axis_size, jnp.mean(mask.astype(jnp.float32))), True
-
-    with pytest.raises(AssertionError, match="vmap over a batch of pairs"):
-        check_scorer(lambda matches: count(matches.mask))
-
-
-def test_a_trace_for_every_number_is_named():
-    class Static:
-        """Its number is part of the structure, and changes with the leaf beside it."""
-
-        def __init__(self, number):
-            self.number = number
-
-        def __call__(self, matches):
-            return self.number * real(matches)
-
-    def unflatten(_, leaves):
-        return Static(*leaves)
-
-    def flatten(scorer):
-        return (scorer.number,), None if isinstance(scorer.number, jax.core.Tracer) else float(scorer.number)
-
-    jax.tree_util.register_pytree_node(Static, flatten, unflatten)
-    with pytest.raises(AssertionError, match=r"3 traces .*expected one"):
-        check_scorer(Static(2.0))

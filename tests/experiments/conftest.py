@@ -1,5 +1,6 @@
 """Command lines of the programs in this process, and the data set that their tests share."""
 
+import signal
 from functools import partial
 
 import pytest
@@ -44,6 +45,21 @@ def refuse(call):
         return error
 
     return run
+
+
+@pytest.fixture
+def interrupt(tmp_path):
+    """Sends Ctrl-C to a process, which must end with exit code 130, say so in its last line, and leave no file."""
+
+    def send(process):
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+        assert process.returncode == 130, stderr[-2000:]
+        assert stderr.splitlines()[-1].startswith("interrupted")
+        assert "Traceback" not in stderr
+        assert list(tmp_path.iterdir()) == []
+
+    return send
 
 
 @pytest.fixture

@@ -1,14 +1,12 @@
 """Command lines as they are typed: help, groups, mistakes, and Ctrl-C before anything has begun."""
 
 import re
-import signal
 import subprocess
 import sys
 
 import pytest
 
 from experiments import groups
-from experiments.benchmark.__main__ import main as benchmark
 from experiments.launch import version
 from experiments.quoting import as_typed
 from experiments.settings import CONF
@@ -83,96 +81,90 @@ def test_version(succeed, program):
     assert re.fullmatch(r"mfvpr \d+\.\d+\.\d+ \(jax .*, Python .*\)\n", stdout)
 
 
-@pytest.mark.parametrize(
-    ("program", "arguments", "words"),
-    [
-        ("evaluate", ["experiment=histogram"], "type python -m experiments.sweep experiment=histogram"),
-        ("learn", ["experiment=anchor"], "experiments.learn has no group experiment"),
-        ("sweep", ["system=mix_hist_5"], "the nearest is mix_hist_50"),
-        ("sweep", ["system=null"], "leave it out for none"),
-        ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
-        ("sweep", ["system=mix_hist_comb_10", "experiment=anchor", "grid.sigma=[3]"], "grid.sigma: scorer=anchor has"),
-        ("learn", ["system=mix_hist_50", "learning_rate=0"], "learning_rate=0: expected"),
-        ("sweep", ["system=mfvpr", "grid.sigma=[3]"], "fusion.c=zscore: expected a number or auto"),
-        ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
-        ("learn", ["fusion.c=zscore"], "fusion.c=auto fusion.weights=null"),
-        ("evaluate", ["fusion.c=zscores"], "(at most 1e12), or auto, zscore"),
-        ("evaluate", ["fusion.weights={filter: 2}"], "{'filter': 2}: expected fusion.c=zscore"),
-        ("evaluate", ["system=mfvpr", "fusion.c=auto"], "1}: expected fusion.c=zscore"),
-        *(
-            ("evaluate", ["system=mfvpr", f"fusion.weights.filter={wrong}"], f".filter={wrong}: expected a number")
-            for wrong in (0, -1, "nan", "inf", "x")
-        ),
-        ("evaluate", ["fusion.weights.filter=2"], "the nearest is fusion.weights"),
-        ("evaluate", ["fusion.weights=[2]"], "fusion.weights=[2]: expected weights"),
-        ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected filter"),
-        ("evaluate", ["system=mfvpr", "scorer=histogram"],
-         "(histogram), got anchor; choose scorer=all"),
-        ("evaluate", ["=5"], "=5: expected name=value"),
-        ("evaluate", [".=5"], ".=5: expected name=value"),
-        ("evaluate", ["candidates =5"], "candidates =5: expected name=value"),
-        ("evaluate", ["ü=5"], "ü=5: expected name=value"),
-        ("evaluate", ["candidates:5"], "expected name=value"),
-        ("evaluate", ["--cfg", "job"], "--cfg: unknown option"),
-        ("evaluate", [f"candidates={'9' * 5000}"], "candidates=99999999999999999999...: expected"),
-        ("evaluate", [f"scorer.histogram.sigma={'9' * 299}"], "...: expected a number above 0"),
-        ("evaluate", ["scorer.histogram.sigma=1e400"], "scorer.histogram.sigma=inf: expected a number above 0"),
-        ("evaluate", [f"candidates={'[' * 500}"], "[...: expected a whole number"),
-        ("evaluate", ["candidates=1,2"], "candidates=1,2: expected one value"),
-        ("evaluate", ["candidates=range(1,3)"], "requires --multirun"),
-        ("evaluate", ["candidates=${nope}"], "candidates: Interpolation key 'nope' not found"),
-        ("evaluate", ["store=${oc.env:NOPE}"], "store=${oc.env:NOPE}: expected a path"),
-        ("evaluate", ["store='${x}'"], "store: Interpolation key 'x' not found"),
-        ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
-        ("evaluate", ["scorer.histogram.max_bins=100000"], "a whole number from 1 to 1024"),
-        ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least retrieval.num_words=64"),
-        ("evaluate", ["matching.max_distance=3"], "matching.max_distance=3: expected a number above 0"),
-        ("evaluate", ["matching=mutual"], "matching=mutual: expected one of lightglue, neighbors"),
-        ("evaluate", ["matching=lightglue", "matching.filter_threshold=2"], "filter_threshold=2: expected a number"),
-        ("evaluate", ["matching=lightglue", "matching.cross_check=none"], "matching=neighbors has"),
-        ("evaluate", ["matching=lightglue", "matching.weights=d2_tf"], "weights=d2_tf: expected weights of lightglue"),
-        ("sweep", ["grid.max_distance=[1,3]"], "grid.max_distance=[1, 3]: expected a list"),
-        ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),
-        ("sweep", ["grid=[1]"], "grid=[1]: this is a group of settings"),
-        ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
-        ("evaluate", ["features=aliked", "features.weights=d2_tf"], "weights=d2_tf: expected weights of aliked"),
-        ("evaluate", ["scorer.sgma=3"], "the nearest is scorer.histogram.sigma"),
-        ("evaluate", ["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
-        ("evaluate", ["candidats=3"], "the nearest is candidates"),
-        ("evaluate", ["dataset.database=a"], "dataset=folder and dataset=sequences have dataset."),
-        ("evaluate", ["scorer=sum", "scorer.sigma=15"], "scorer=histogram has scorer.sigma"),
-        ("evaluate", ["scorer=sum", "scorer.histogram.sigma=15"], "scorer=histogram has scorer.sigma"),
-        ("evaluate", ["scorer.sigma=15"], "the nearest is scorer.histogram.sigma"),
-        ("evaluate", ["retrieval=pairs", "retrieval.file=a"], "the nearest is retrieval.queries"),
-        ("evaluate", ["features.num_words=9"], "the nearest is retrieval.num_words"),
-        ("evaluate", ["scorer=histogram", "scorer.sigma=nan"], "scorer.sigma=nan: expected a number above 0"),
-        ("evaluate", ["candidates=0"], "candidates=0: expected a whole number above 0"),
-        ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
-        ("evaluate", ["dataset=folder"], "dataset.database: this setting has no default"),
-        ("evaluate", ["dataset=grief_season"], "dataset.root: this setting has no default"),
-        ("evaluate", ["scorer=histgram"], "sum; the nearest is histogram"),
-        ("evaluate", [*OWN], "dataset.ground_truth: "),
-        ("evaluate", [*OWN, "dataset.bits=7"], "whole number from 8 to 16, or"),
-        ("evaluate", [*OWN, "dataset.ground_truth=none"], "a: expected a folder of images"),
-        ("evaluate", ["+new=1"], "+new=1: settings can be set, not added"),
-        ("evaluate", ["word"], "word: expected name=value"),
-        ("evaluate", ["scorer=[count,sum]"], "expected one of all"),
-        ("evaluate", ["features=null"], "aliked, d2net, import, patch_netvlad, selavpr, sift, ssm"),
-        ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
-        ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
-        ("evaluate", ["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
-        ("evaluate", ["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
-        ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),
-        ("evaluate", ["scorer=histogram", "scorer.method=sum"], "scorer=sum has no setting"),
-        ("evaluate", ["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),
-        ("evaluate", ["scorer.histogram.sigma=1e-46"], "(1e-6 to 1e12)"),
-        ("evaluate", [f"out={ROOT}/README.md/x"], "cannot be written to"),
-        ("evaluate", [f"out={ROOT}/README.md"], "README.md: expected a new or empty run folder"),
-        ("evaluate", ["out=/"], "/: expected a new or empty run folder"),
-        ("evaluate", ["out=/dev/null"], "/dev/null: expected a new or empty run folder"),
-        ("evaluate", ["out=/dev/null/x"], "/x: cannot be written to (Not a directory)"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("program", "arguments", "words"), [
+    ("evaluate", ["experiment=histogram"], "type python -m experiments.sweep experiment=histogram"),
+    ("learn", ["experiment=anchor"], "experiments.learn has no group experiment"),
+    ("sweep", ["system=mix_hist_5"], "the nearest is mix_hist_50"),
+    ("sweep", ["system=null"], "leave it out for none"),
+    ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
+    ("sweep", ["system=mix_hist_comb_10", "experiment=anchor", "grid.sigma=[3]"], "grid.sigma: scorer=anchor has"),
+    ("learn", ["system=mix_hist_50", "learning_rate=0"], "learning_rate=0: expected"),
+    ("sweep", ["system=mfvpr", "grid.sigma=[3]"], "fusion.c=zscore: expected a number or auto"),
+    ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
+    ("learn", ["fusion.c=zscore"], "fusion.c=auto fusion.weights=null"),
+    ("evaluate", ["fusion.c=zscores"], "(at most 1e12), or auto, zscore"),
+    ("evaluate", ["fusion.weights={filter: 2}"], "{'filter': 2}: expected fusion.c=zscore"),
+    ("evaluate", ["system=mfvpr", "fusion.c=auto"], "1}: expected fusion.c=zscore"),
+    *(
+        ("evaluate", ["system=mfvpr", f"fusion.weights.filter={wrong}"], f".filter={wrong}: expected a number")
+        for wrong in (0, -1, "nan", "inf", "x")
+    ),
+    ("evaluate", ["fusion.weights.filter=2"], "the nearest is fusion.weights"),
+    ("evaluate", ["fusion.weights=[2]"], "fusion.weights=[2]: expected weights"),
+    ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected filter"),
+    ("evaluate", ["system=mfvpr", "scorer=histogram"], "(histogram), got anchor; choose scorer=all"),
+    ("evaluate", ["=5"], "=5: expected name=value"),
+    ("evaluate", [".=5"], ".=5: expected name=value"),
+    ("evaluate", ["candidates =5"], "candidates =5: expected name=value"),
+    ("evaluate", ["ü=5"], "ü=5: expected name=value"),
+    ("evaluate", ["candidates:5"], "expected name=value"),
+    ("evaluate", ["--cfg", "job"], "--cfg: unknown option"),
+    ("evaluate", [f"candidates={'9' * 5000}"], "candidates=99999999999999999999...: expected"),
+    ("evaluate", [f"scorer.histogram.sigma={'9' * 299}"], "...: expected a number above 0"),
+    ("evaluate", ["scorer.histogram.sigma=1e400"], "scorer.histogram.sigma=inf: expected a number above 0"),
+    ("evaluate", [f"candidates={'[' * 500}"], "[...: expected a whole number"),
+    ("evaluate", ["candidates=1,2"], "candidates=1,2: expected one value"),
+    ("evaluate", ["candidates=range(1,3)"], "requires --multirun"),
+    ("evaluate", ["candidates=${nope}"], "candidates: Interpolation key 'nope' not found"),
+    ("evaluate", ["store=${oc.env:NOPE}"], "store=${oc.env:NOPE}: expected a path"),
+    ("evaluate", ["store='${x}'"], "store: Interpolation key 'x' not found"),
+    ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
+    ("evaluate", ["scorer.histogram.max_bins=100000"], "a whole number from 1 to 1024"),
+    ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least retrieval.num_words=64"),
+    ("evaluate", ["matching.max_distance=3"], "matching.max_distance=3: expected a number above 0"),
+    ("evaluate", ["matching=mutual"], "matching=mutual: expected one of lightglue, neighbors"),
+    ("evaluate", ["matching=lightglue", "matching.filter_threshold=2"], "filter_threshold=2: expected a number"),
+    ("evaluate", ["matching=lightglue", "matching.cross_check=none"], "matching=neighbors has"),
+    ("evaluate", ["matching=lightglue", "matching.weights=d2_tf"], "weights=d2_tf: expected weights of lightglue"),
+    ("sweep", ["grid.max_distance=[1,3]"], "grid.max_distance=[1, 3]: expected a list"),
+    ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),
+    ("sweep", ["grid=[1]"], "grid=[1]: this is a group of settings"),
+    ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
+    ("evaluate", ["features=aliked", "features.weights=d2_tf"], "weights=d2_tf: expected weights of aliked"),
+    ("evaluate", ["scorer.sgma=3"], "the nearest is scorer.histogram.sigma"),
+    ("evaluate", ["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
+    ("evaluate", ["candidats=3"], "the nearest is candidates"),
+    ("evaluate", ["dataset.database=a"], "dataset=folder and dataset=sequences have dataset."),
+    ("evaluate", ["scorer=sum", "scorer.sigma=15"], "scorer=histogram has scorer.sigma"),
+    ("evaluate", ["scorer=sum", "scorer.histogram.sigma=15"], "scorer=histogram has scorer.sigma"),
+    ("evaluate", ["scorer.sigma=15"], "the nearest is scorer.histogram.sigma"),
+    ("evaluate", ["retrieval=pairs", "retrieval.file=a"], "the nearest is retrieval.queries"),
+    ("evaluate", ["features.num_words=9"], "the nearest is retrieval.num_words"),
+    ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
+    ("evaluate", ["dataset=folder"], "dataset.database: this setting has no default"),
+    ("evaluate", ["dataset=grief_season"], "dataset.root: this setting has no default"),
+    ("evaluate", ["scorer=histgram"], "sum; the nearest is histogram"),
+    ("evaluate", [*OWN], "dataset.ground_truth: "),
+    ("evaluate", [*OWN, "dataset.bits=7"], "whole number from 8 to 16, or"),
+    ("evaluate", [*OWN, "dataset.ground_truth=none"], "a: expected a folder of images"),
+    ("evaluate", ["+new=1"], "+new=1: settings can be set, not added"),
+    ("evaluate", ["word"], "word: expected name=value"),
+    ("evaluate", ["scorer=[count,sum]"], "expected one of all"),
+    ("evaluate", ["features=null"], "aliked, d2net, import, patch_netvlad, selavpr, sift, ssm"),
+    ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
+    ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
+    ("evaluate", ["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
+    ("evaluate", ["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
+    ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),
+    ("evaluate", ["scorer=histogram", "scorer.method=sum"], "scorer=sum has no setting"),
+    ("evaluate", ["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),
+    ("evaluate", ["scorer.histogram.sigma=1e-46"], "(1e-6 to 1e12)"),
+    ("evaluate", [f"out={ROOT}/README.md/x"], "cannot be written to"),
+    ("evaluate", [f"out={ROOT}/README.md"], "README.md: expected a new or empty run folder"),
+    ("evaluate", ["out=/"], "/: expected a new or empty run folder"),
+    ("evaluate", ["out=/dev/null"], "/dev/null: expected a new or empty run folder"),
+    ("evaluate", ["out=/dev/null/x"], "/x: cannot be written to (Not a directory)"),
+])  # fmt: skip
 def test_mistakes_are_one_line_and_leave_nothing(refuse_at_once, program, arguments, words):
     error = refuse_at_once(program, *arguments)
     assert words in error
@@ -189,18 +181,13 @@ def test_a_device_that_is_not_there_is_one_line():
 
 
 @pytest.mark.parametrize("module", ["yaml", "omegaconf", "jaxlib", "jax"])
-def test_ctrl_c_during_imports_is_one_line(tmp_path, module):
+def test_ctrl_c_during_imports_is_one_line(tmp_path, interrupt, module):
     command = [sys.executable, "-X", "importtime", "-m", "experiments.evaluate", f"out={tmp_path}/out"]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     for line in process.stderr:
         if line.rpartition("|")[2].strip() == module:
             break
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130, stderr[-2000:]
-    assert stderr.splitlines()[-1].startswith("interrupted")
-    assert "Traceback" not in stderr
-    assert list(tmp_path.iterdir()) == []
+    interrupt(process)
 
 
 @pytest.mark.parametrize("program", ["benchmark", "weights"])
@@ -214,14 +201,8 @@ def test_version_of_programs_without_settings(program):
     [(["foo"], "invalid choice: 'foo'"), (["--rounds", "0"], "expected a whole number above 0"),
      (["--stores", "a"], "--stores ")],
 )  # fmt: skip
-def test_mistakes_of_the_benchmark_are_one_line(monkeypatch, capsys, arguments, words):
-    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # which it sets
-    monkeypatch.setattr(sys, "argv", ["benchmark", *arguments])
-    with pytest.raises(SystemExit) as left:
-        benchmark()
-    stdout, stderr = capsys.readouterr()
-    assert (left.value.code, stdout) == (2, "")
-    assert stderr.startswith("error: ")
-    assert words in stderr
-    assert stderr.endswith("; see python -m experiments.benchmark --help\n")
-    assert stderr.count("\n") == 1
+def test_mistakes_of_the_benchmark_are_one_line(refuse_at_once, arguments, words):
+    error = refuse_at_once("benchmark.__main__", *arguments)
+    assert error.startswith("error: ")
+    assert words in error
+    assert error.endswith("; see python -m experiments.benchmark --help\n")

@@ -32,8 +32,6 @@ def evaluate(root, tmp_path, succeed):
 
 @pytest.fixture
 def refused(root, tmp_path, call):
-    """The error of an evaluation that is refused."""
-
     def run(*more):
         code, _, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out", *more)
         assert (code, (tmp_path / "out").exists()) == (2, False)
@@ -44,7 +42,6 @@ def refused(root, tmp_path, call):
 
 @pytest.fixture
 def confidence(evaluate):
-    """The confidence file of a first run."""
     return evaluate("first")[0] / "confidence.json"
 
 
@@ -148,14 +145,11 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confide
     assert float(last["precision"]) == pytest.approx(hits.count("1") / QUERIES)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
-        (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
-        (["confidence=/none.json"], "/none.json: expected the confidence.json"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "words"), [
+    (["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
+    (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
+    (["confidence=/none.json"], "/none.json: expected the confidence.json"),
+])  # fmt: skip
 def test_what_cannot_say_how_sure_answers_are_is_refused(refused, settings, words):
     assert words in refused(*settings)
 

@@ -1,7 +1,5 @@
 """Data sets as a program: listed, and checked beside what is published."""
 
-from functools import partial
-
 import pytest
 from PIL import Image
 
@@ -11,12 +9,18 @@ from tests.datasets.test_published import put
 
 @pytest.fixture
 def program(call):
-    return partial(call, "data")
+    """Runs a command: output and errors."""
+
+    def run(*arguments, code=0):
+        exit_code, stdout, stderr = call("data", *arguments)
+        assert exit_code == code, stderr
+        return stdout, stderr
+
+    return run
 
 
 def test_all_are_listed_with_their_numbers(program):
-    code, stdout, _ = program("list")
-    assert code == 0
+    stdout, _ = program("list")
     names = [line.split()[0].removesuffix(":") for line in stdout.splitlines()[2:]]
     assert names == [*PUBLISHED, "grief_season", "corridor", "streets_seasons"]
     assert "1,411" in next(line for line in stdout.splitlines() if line.startswith("robotcar"))
@@ -26,8 +30,7 @@ def test_images_that_cannot_be_read_are_counted(program, tmp_path):
     put(tmp_path, *(f"{side}/{i}.png" for side in ("database", "queries") for i in range(3)))
     (tmp_path / "queries/1.png").write_bytes((tmp_path / "queries/1.png").read_bytes()[:30])
     (tmp_path / "queries/2.png").write_text("text")
-    code, stdout, stderr = program("check", "grief_season", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
-    assert code == 2
+    stdout, stderr = program("check", "grief_season", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png", code=2)
     assert ["queries", "3", "-", "2"] in [line.split() for line in stdout.splitlines()]
     assert stdout.count("unreadable: ") == 2
     assert "2 images cannot be read" in stderr
@@ -35,25 +38,23 @@ def test_images_that_cannot_be_read_are_counted(program, tmp_path):
 
 def test_other_sequences_under_a_published_name(program, tmp_path):
     put(tmp_path, "db/1.png", "q1/1.png", "q2/1.png")
-    typed = [f"database={tmp_path}/db", f"queries=[{tmp_path}/q1,{tmp_path}/q2]", "ground_truth=none"]
-    code, _, stderr = program("check", "sequences", "name=robotcar_seasons", *typed, "--sheet", tmp_path / "sheet.png")
-    assert code == 2
+    folders = [f"database={tmp_path}/db", f"queries=[{tmp_path}/q1,{tmp_path}/q2]", "ground_truth=none"]
+    sheet = ("--sheet", tmp_path / "sheet.png")
+    _, stderr = program("check", "sequences", "name=robotcar_seasons", *folders, *sheet, code=2)
     assert "queries in q2, which is none of its sequences" in stderr
 
 
 def test_a_layout_is_told(program):
-    code, stdout, _ = program("list", "gardens_point", "msls_val")
-    assert code == 0
+    stdout, _ = program("list", "gardens_point", "msls_val")
     assert "GroundTruth.csv" in stdout
     assert "train_val/cph/database/images" in stdout
-    assert program("list", "x")[0] == 2
+    program("list", "x", code=2)
 
 
 def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(4)), *(f"Live/image{i:04d}.png" for i in range(2)))
     (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n3,1\n")
-    code, stdout, stderr = program("check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
-    assert code == 2
+    stdout, stderr = program("check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png", code=2)
     assert ["database", "4", "85", "0"] in [line.split() for line in stdout.splitlines()]
     assert "berlin_a100: right images of a query (±5): 4 to 4, median 4; 0 queries have none" in stdout
     assert "2 queries are images of the database" in stdout
@@ -70,7 +71,6 @@ def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     ([], "the following arguments are required: COMMAND"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(program, arguments, words):
-    code, _, stderr = program(*arguments)
-    assert code == 2
+    _, stderr = program(*arguments, code=2)
     assert words in stderr
     assert stderr.count("\n") == 1

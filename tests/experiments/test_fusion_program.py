@@ -1,13 +1,12 @@
 """Fusions as a user of the programs meets them: the systems of a run folder, and what can be swept of them."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
 
 from experiments import axes, build, evaluation, settings
-from tests.programs import CANDIDATES, QUERIES, composed, small
+from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={filter: 0.5, anchor: 1}")
 SYSTEM = "histogram + anchor + filter"
@@ -15,8 +14,8 @@ SYSTEM = "histogram + anchor + filter"
 
 def ranked(out, name):
     """Database images of every query and the scores, best first."""
-    with (out / "predictions" / f"{name}.csv").open(newline="") as file:
-        return [(line["query"], line["database"], float(line["score"])) for line in csv.DictReader(file)]
+    lines = csv_rows(out / "predictions" / f"{name}.csv")
+    return [(line["query"], line["database"], float(line["score"])) for line in lines]
 
 
 @pytest.mark.slow
@@ -59,7 +58,6 @@ def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
 
 
 def test_our_system_fuses_two_scores_and_the_filter():
-    """With other features and weights as well; a score of it can be swept by itself."""
     for arguments, features, side, weight in (
         ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 336, 1),
     ):  # fmt: skip
@@ -83,13 +81,12 @@ def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_p
     name = "histogram + cohort + filter"
     assert [*rows][-2:] == ["histogram + filter", name]
     assert rows[name]["parameters"]["cohort"] == 1
-    with (tmp_path / "out" / "predictions" / "histogram_cohort_filter.csv").open(newline="") as file:
-        fused = {(line["query"], line["database"]): float(line["score"]) for line in csv.DictReader(file)}
-    parts = {part: {line[:2]: line[2] for line in ranked(tmp_path / "out", part)}
-             for part in ("filter", "histogram_cohort")}  # fmt: skip
-    queries = {query for query, _ in fused}
-    for query in queries:
+    filter_scores, cohort_scores, fused = (
+        {line[:2]: line[2] for line in ranked(tmp_path / "out", system)}
+        for system in ("filter", "histogram_cohort", "histogram_cohort_filter")
+    )
+    for query in {query for query, _ in fused}:
         pairs = [pair for pair in fused if pair[0] == query]
-        scores = [np.array([parts[part][pair] for pair in pairs]) for part in parts]
+        scores = [np.array([part[pair] for pair in pairs]) for part in (filter_scores, cohort_scores)]
         filtered, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
         np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * normalized, atol=1e-2)

@@ -84,22 +84,6 @@ def test_several_sets_as_they_are_typed(streets):
     assert (drawn["name"], data_sets.label(drawn)) == ("streets", "streets 4")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["also=streets"], "also=streets: expected report="),
-        (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
-        (["report=street"], "report=street: expected data sets"),
-        (["report=corridor"], "report=corridor: corridor has no default of root"),
-        (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
-        (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
-        (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
-    ],
-)
-def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
-    assert words in refuse_at_once("learn", *small(root), *arguments)
-
-
 def test_images_that_were_learned_on_are_not_reported_on_and_queries_count_once(root, streets, tmp_path, refuse):
     again = streets[1].replace("name=street1", "name=again")
     for report, name, other, same in (

@@ -59,6 +59,10 @@ def untrained(monkeypatch):
     return calls
 
 
+def rows_of(results):
+    return {row["score"]: row for row in results["rows"]}
+
+
 def test_all_rows_in_every_file(learned):
     out, content = learned
     assert [row["score"] for row in content["rows"]] == ROWS
@@ -97,7 +101,7 @@ def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path
     grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
     search.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
     swept = results(tmp_path / "out")
-    rows = {row["score"]: row for row in learned[1]["rows"]}
+    rows = rows_of(learned[1])
     assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]
     for line in swept["report"]:
         for row, name in (("paper", "own"), ("grid search", "chosen")):
@@ -135,7 +139,7 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
 @pytest.mark.parametrize("changes", [(), ("matching.max_distance=0.3", "ties=index")])
 def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, changes):
     changes = ("scorer=sum", "fusion.c=1e6", *changes)
-    rows = {row["score"]: row for row in learn(tmp_path / "out", *SUM, *changes, "steps=1")["rows"]}
+    rows = rows_of(learn(tmp_path / "out", *SUM, *changes, "steps=1"))
     evaluation.evaluate(composed(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
     expected = json.loads((tmp_path / "evaluated" / "results.json").read_text())
     names = {"sum": "paper", "sum + filter": "paper + filter"}
@@ -143,10 +147,6 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
         if row["system"] in names:
             recall = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
             assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
-
-
-def rows_of(results):
-    return {row["score"]: row for row in results["rows"]}
 
 
 def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
@@ -176,7 +176,6 @@ def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
 
 
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
-    """Interrupted in the middle of the second training."""
     saved, save = [], checkpoints.save
 
     def interrupted(folder, step, *rest):
@@ -248,23 +247,27 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step, 
     assert sorted(path.name for path in place.glob("*/*")) == (["3", "4"] if step == 4 else [])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["split=null"], "split=null: "),
-        (["scorer=count"], "scorer=count: expected one to learn"),
-        (["scorer=lost"], "scorer=lost: expected one to learn"),
-        (["scorer=all"], "scorer: expected one to learn"),
-        (["scorer=anchor", "grid.sigma=[10]"], "it has num_bins, window, tolerance, "),
-        (["loss=hinge"], "loss=hinge: expected one of cross_entropy"),
-        (["steps=0"], "steps=0: expected a whole number above 0"),
-        (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
-        (["learning_rat=1"], "the nearest is learning_rate"),
-        (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
-        (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-        (["recall.tolerances=[30]"], "smaller tolerances or radius"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["split=null"], "split=null: "),
+    (["scorer=count"], "scorer=count: expected one to learn"),
+    (["scorer=lost"], "scorer=lost: expected one to learn"),
+    (["scorer=all"], "scorer: expected one to learn"),
+    (["scorer=anchor", "grid.sigma=[10]"], "it has num_bins, window, tolerance, "),
+    (["loss=hinge"], "loss=hinge: expected one of cross_entropy"),
+    (["steps=0"], "steps=0: expected a whole number above 0"),
+    (["learning_rate=nan"], "learning_rate=nan: expected a number above 0"),
+    (["learning_rat=1"], "the nearest is learning_rate"),
+    (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
+    (["dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
+    (["recall.tolerances=[30]"], "smaller tolerances or radius"),
+    (["also=streets"], "also=streets: expected report="),
+    (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
+    (["report=street"], "report=street: expected data sets"),
+    (["report=corridor"], "report=corridor: corridor has no default of root"),
+    (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
+    (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
+    (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number not below 0"),
+])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
     assert words in refuse_at_once("learn", *small(root), *arguments)
 

@@ -1,8 +1,6 @@
 """Hydra's multirun: many jobs, one after the other or at the same time."""
 
 import os
-import subprocess
-import sys
 import threading
 import time
 
@@ -10,7 +8,7 @@ import pytest
 
 from experiments import console
 from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small
+from tests.programs import CANDIDATES, QUERIES, composed, matches_path, results, run, small
 
 pytestmark = pytest.mark.thorough
 
@@ -18,7 +16,6 @@ SIGMA = "grid.sigma=[10]"
 
 
 def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call):
-    """A job that fails stops no other, and comes up again at the end."""
     monkeypatch.chdir(tmp_path)
     jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
     code, stdout, stderr = call("sweep", *small(root), "-m", *jobs)
@@ -81,10 +78,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
 @pytest.mark.slow
 def test_jobs_in_several_processes(root, tmp_path):
     jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.sweep", "-m", *small(root), *jobs],
-        cwd=tmp_path, capture_output=True, text=True, timeout=200, env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
+    done = run("-m", *small(root), *jobs, program="sweep", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("results: runs/folder/") == 2
     assert {results(path)["candidates"] for path in (tmp_path / "runs" / "folder").iterdir()} == {4, 8}
@@ -92,16 +86,14 @@ def test_jobs_in_several_processes(root, tmp_path):
 
 
 def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
-    messages, got = [], []
+    messages, got, sizes = [], [], {"num_queries": 1, "num_candidates": 2}
 
     def another():
-        with match_store.open_match_store(
-            tmp_path / "s", {}, num_queries=1, num_candidates=2, waiting=messages.append
-        ) as store:
+        with match_store.open_match_store(tmp_path / "s", {}, **sizes, waiting=messages.append) as store:
             got.append(store.done.tolist())
 
     other = threading.Thread(target=another)
-    with match_store.open_match_store(tmp_path / "s", {}, num_queries=1, num_candidates=2):
+    with match_store.open_match_store(tmp_path / "s", {}, **sizes):
         other.start()
         while not messages and other.is_alive():
             time.sleep(0.01)

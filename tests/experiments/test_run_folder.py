@@ -1,6 +1,5 @@
 """Run folders: their files, also after errors, on full disks, and with names that are not UTF-8."""
 
-import csv
 import itertools
 import json
 import os
@@ -10,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -28,7 +28,7 @@ from mfvpr.report import runs
 from mfvpr.report.evaluations import SequenceFigures
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.utils import InputError
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, small
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
 
 pytestmark = pytest.mark.thorough
 
@@ -48,18 +48,13 @@ def outcome(root):
     return evaluation.evaluation_of(composed(*small(root), *LINES, "candidates=3"))
 
 
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 # --- contents ----------------------------------------------------------------------------------------------------
 
 
 def test_predictions_are_long_and_agree_with_the_recall(evaluated):
     entries = json.loads((evaluated / "results.json").read_text())
-    for system in ("filter", "histogram", "histogram + filter"):
-        lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+    for system in SYSTEMS:
+        lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         assert list(lines[0]) == ["query", "rank", "database", "score", "right"]
         assert [int(line["rank"]) for line in lines] == QUERIES * [*range(1, CANDIDATES + 1)]
         scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
@@ -74,10 +69,10 @@ def test_predictions_are_long_and_agree_with_the_recall(evaluated):
 @pytest.mark.parametrize("system", ["filter", "histogram", "histogram_filter"])
 def test_failures_are_the_wrong_first_answers(evaluated, system):
     ranked = {}
-    for line in rows(evaluated / "predictions" / f"{system}.csv"):
+    for line in csv_rows(evaluated / "predictions" / f"{system}.csv"):
         ranked.setdefault(line["query"], []).append(line)
     wrong = {query: lines for query, lines in ranked.items() if lines[0]["right"] == "0"}
-    failures = rows(evaluated / "failures" / f"{system}.csv")
+    failures = csv_rows(evaluated / "failures" / f"{system}.csv")
     assert [line["query"] for line in failures] == list(wrong)
     assert 0 < len(failures) < QUERIES
     assert {bool(line["rank"]) for line in failures} == {True, False} or system != "filter"
@@ -95,17 +90,17 @@ def test_failures_are_the_wrong_first_answers(evaluated, system):
 
 
 def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
-    gains, hits = rows(evaluated / "gains.csv"), {}
+    gains, hits = csv_rows(evaluated / "gains.csv"), {}
     assert len(gains) == QUERIES
     for system in SYSTEMS:
-        lines = rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         for line in gains:
             right = [entry["rank"] for entry in lines if entry["query"] == line["query"] and entry["right"] == "1"]
             assert line[f"{system} rank"] == (right[0] if right else "")
             assert line[system] == str(int(right[:1] == ["1"]))
         hits[system] = np.array([line[system] == "1" for line in gains])
     assert {line["histogram rank"] for line in gains} > {"", "1"}
-    for line, pair in zip(rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
+    for line, pair in zip(csv_rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
         assert (line["system"], line["other"]) == pair
         first, second = (hits[name] for name in pair)
         assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
@@ -116,13 +111,15 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
     assert line.startswith(f"| histogram | {(hits['histogram'] > hits['filter']).sum()} (p ")
 
 
-def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path):
+def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys):
     none = ("dataset.ground_truth=none", "dataset.index_file=null", "figures=2", f"out={tmp_path}/out")
     evaluation.evaluate(composed(*small(root), *LINES, *none))
-    assert {line["right"] for line in rows(tmp_path / "out" / "predictions.csv")} == {""}
-    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert "no ground truth: rankings only" in capsys.readouterr().out
+    entries = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [(row["system"], row["recall_at"]) for row in entries] == [(system, {}) for system in SYSTEMS]
+    assert {line["right"] for line in csv_rows(tmp_path / "out" / "predictions.csv")} == {""}
     files = {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures", "report.html"}
-    assert names == files
+    assert {path.name for path in (tmp_path / "out").iterdir()} == files
     assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
     assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
 
@@ -135,7 +132,7 @@ def test_heading_and_tables_say_the_same(evaluated, capsys):
     assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth: {truth['files'][0]}")
     latex = (evaluated / "table.tex").read_text()
     assert latex.startswith(f"% {heading}\n")
-    for line in rows(evaluated / "table.csv"):
+    for line in csv_rows(evaluated / "table.csv"):
         assert f"| {' | '.join(line.values())} |" in table
         assert f"{' & '.join(line.values())} \\\\\n" in latex
 
@@ -184,7 +181,6 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
 
 
 def page_of(outcome, **changes):
-    """The figures' page of the only sequence, with another ground truth."""
     result = outcome.judged.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
     judged = replace(outcome.judged, result=replace(result, dataset=dataset))
@@ -281,21 +277,17 @@ def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
 
 def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
-    claimed, together = [], threading.Barrier(8)
+    together = threading.Barrier(8, timeout=30)
 
-    def claim():
+    def claim(_):
         together.wait()
         with runs.claim_run_folder(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
-            claimed.append(folder.name)
             together.wait()
+            return folder.name
 
-    threads = [threading.Thread(target=claim) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=30)
-    names = [f"2030-01-02_03-04-05{suffix}" for suffix in ("", *(f"-{number}" for number in range(2, 9)))]
-    assert sorted(claimed) == names
+    with ThreadPoolExecutor(8) as threads:
+        names = sorted(threads.map(claim, range(8)))
+    assert names == ["2030-01-02_03-04-05", *(f"2030-01-02_03-04-05-{number}" for number in range(2, 9))]
     assert list(tmp_path.rglob("*-*")) == []
 
 

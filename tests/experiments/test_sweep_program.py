@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -169,10 +168,8 @@ def test_no_features_are_read_where_the_matches_are_stored(sweep, swept, tmp_pat
     assert "features" not in stderr
 
 
-@pytest.mark.parametrize("chunk", [(1, 24), (3, 5)])
-def test_chunks_change_nothing(sweep, swept, tmp_path, chunk):
-    content = sweep(tmp_path / "out", *GRID, f"chunk.settings={chunk[0]}", f"chunk.queries={chunk[1]}")
-    assert content == swept[1]
+def test_chunks_change_nothing(sweep, swept, tmp_path):
+    assert sweep(tmp_path / "out", *GRID, "chunk.settings=3", "chunk.queries=5") == swept[1]
 
 
 def test_without_a_store(root, sweep, tmp_path):
@@ -201,14 +198,11 @@ def test_other_scores_and_their_axes(sweep, swept, tmp_path):
     assert "none" in (tmp_path / "soft" / "table.csv").read_text()
 
 
-@pytest.mark.parametrize(
-    ("experiment", "changes", "count"),
-    [
-        ("histogram", ("grid.sigma=[10,15]", "grid.bin_size=[15]"), 3),
-        ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
-        ("combined", ("grid.c=[0,1,auto]",), 3),
-    ],
-)
+@pytest.mark.parametrize(("experiment", "changes", "count"), [
+    ("histogram", ("grid.sigma=[10,15]", "grid.bin_size=[15]"), 3),
+    ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
+    ("combined", ("grid.c=[0,1,auto]",), 3),
+])  # fmt: skip
 def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
     content = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
     assert len(content["settings"]) == count
@@ -235,45 +229,37 @@ def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
 SIGMA = "grid.sigma=[10]"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "grid: expected at least one axis"),
-        (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
-        (["grid.sgma=[1]"], "the nearest is grid.sigma"),
-        (["grid.window=[3]"], "it has bin_size, sigma"),
-        (["grid.sigma=[10,nan]"], "grid.sigma=[10, nan]: expected a list"),
-        (["grid.sigma=[-1]"], "grid.sigma=[-1]: expected"),
-        (["grid.sigma=3"], "grid.sigma=3: expected a list"),
-        (["grid.align=[middle]"], "each one of min_edge, zero_center, zero_edge"),
-        (["grid.c=[automatic]"], "grid.c=['automatic']: expected"),
-        (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
-        (["grid.sigma=[10,10]"], "grid.sigma=[10, 10]: expected different values"),
-        (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
-        (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
-        (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
-        (["scorer=count", SIGMA], "it has single, max_distance, c"),
-        ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-        ([SIGMA, "search=random"], "search=random: expected one of grid, optuna"),
-        ([SIGMA, "split=half"], "split=half: expected one of null"),
-        ([SIGMA, "chunk.settings=0"], "chunk.settings=0: expected a whole number above 0"),
-        ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
-        ([SIGMA, "experiment=histogam"], "the nearest is histogram"),
-        ([SIGMA, "features=sift,aliked"], "add --multirun"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
+    (["grid.sgma=[1]"], "the nearest is grid.sigma"),
+    (["grid.window=[3]"], "it has bin_size, sigma"),
+    (["grid.sigma=[10,nan]"], "grid.sigma=[10, nan]: expected a list"),
+    (["grid.sigma=[-1]"], "grid.sigma=[-1]: expected"),
+    (["grid.sigma=3"], "grid.sigma=3: expected a list"),
+    (["grid.align=[middle]"], "each one of min_edge, zero_center, zero_edge"),
+    (["grid.c=[automatic]"], "grid.c=['automatic']: expected"),
+    (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
+    (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
+    (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
+    (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
+    (["scorer=count", SIGMA], "it has single, max_distance, c"),
+    ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
+    ([SIGMA, "search=random"], "search=random: expected one of grid, optuna"),
+    ([SIGMA, "split=half"], "split=half: expected one of null"),
+    ([SIGMA, "chunk.settings=0"], "chunk.settings=0: expected a whole number above 0"),
+    ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
+    ([SIGMA, "experiment=histogam"], "the nearest is histogram"),
+    ([SIGMA, "features=sift,aliked"], "add --multirun"),
+])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
     assert words in refuse_at_once("sweep", *small(root), *arguments)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins"),
-        ([SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
-        (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins"),
+    ([SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
+    (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
+])  # fmt: skip
 def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, arguments, words):
     assert refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
     assert list(tmp_path.iterdir()) == []
@@ -315,14 +301,10 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, call, chan
     assert snapshot(tmp_path) == before
 
 
-def test_results_are_not_overwritten(root, swept, refuse_at_once):
-    before = snapshot(swept[0])
-    assert "expected a new or empty run folder" in refuse_at_once("sweep", *small(root), SIGMA, f"out={swept[0]}")
-    assert snapshot(swept[0]) == before
-
-
 @pytest.mark.slow
-def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, sweep, swept, tmp_path, monkeypatch):
+def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
+    root, sweep, swept, tmp_path, monkeypatch, interrupt
+):
     """Finished blocks are store, and go when the whole sweep is done."""
     grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
     arguments = [*small(root), *grid, f"out={tmp_path}/out"]
@@ -332,13 +314,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(root, swee
     while len(done := list(store.glob("folder_sweep-*/[!.]*.npz"))) < 5:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130, stderr
-    assert "\ninterrupted; " in stderr
-    assert "Traceback" not in stderr
-    assert list(tmp_path.iterdir()) == []
-
+    interrupt(process)
     done, computed = list(store.glob("folder_sweep-*/[!.]*.npz")), []
     assert 5 <= len(done) < 6 * QUERIES
     sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away

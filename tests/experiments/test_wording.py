@@ -46,24 +46,21 @@ def files(group, file):
 ORDER = "dataset.ground_truth=order"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["dataset.ground_truth=index"], "dataset.index_file=FILE"),
-        (["dataset.ground_truth=label"], "dataset.database_labels=FILE"),
-        ([ORDER, "dataset.index_file=a.csv"], "dataset.index_file, but dataset.ground_truth=order"),
-        ([ORDER, "dataset.exclude_neighbors=1"], "error: dataset.exclude_neighbors=1: expected"),
-        ([ORDER, "retrieval.num_words=99"], "or lower retrieval.num_words"),
-        ([ORDER, "dataset.queries=ROOT/broken"], "or set on_bad_image=skip"),
-        ([ORDER, "dataset=sequences", "dataset.queries=[ROOT/queries,ROOT/mean]"], "error: dataset.queries: expected"),
-        ([ORDER, *files("features", "both.h5")], "features.database_prefix=... and features.query_prefix=..."),
-        ([ORDER, *files("retrieval", "both_vectors.h5")], "retrieval.database_prefix=... and retrieval.qu"),
-        ([ORDER, *files("features", "some.npz")], "features.database_prefix and features.query_prefix"),
-        ([ORDER, *files("features", "sizeless.npz")], "features.image_size=[W,H]"),
-        ([ORDER, *files("features", "long_features.npz")], "features.lengths=normalize"),
-        ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["dataset.ground_truth=index"], "dataset.index_file=FILE"),
+    (["dataset.ground_truth=label"], "dataset.database_labels=FILE"),
+    ([ORDER, "dataset.index_file=a.csv"], "dataset.index_file, but dataset.ground_truth=order"),
+    ([ORDER, "dataset.exclude_neighbors=1"], "error: dataset.exclude_neighbors=1: expected"),
+    ([ORDER, "retrieval.num_words=99"], "or lower retrieval.num_words"),
+    ([ORDER, "dataset.queries=ROOT/broken"], "or set on_bad_image=skip"),
+    ([ORDER, "dataset=sequences", "dataset.queries=[ROOT/queries,ROOT/mean]"], "error: dataset.queries: expected"),
+    ([ORDER, *files("features", "both.h5")], "features.database_prefix=... and features.query_prefix=..."),
+    ([ORDER, *files("retrieval", "both_vectors.h5")], "retrieval.database_prefix=... and retrieval.qu"),
+    ([ORDER, *files("features", "some.npz")], "features.database_prefix and features.query_prefix"),
+    ([ORDER, *files("features", "sizeless.npz")], "features.image_size=[W,H]"),
+    ([ORDER, *files("features", "long_features.npz")], "features.lengths=normalize"),
+    ([ORDER, *files("retrieval", "long.npz")], "retrieval.lengths=normalize"),
+])  # fmt: skip
 def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, refuse, arguments, words):
     monkeypatch.chdir(tmp_path)
     sides = [f"dataset.{side}={images}/{side}" for side in ("database", "queries")]

@@ -186,11 +186,9 @@ def test_a_file_has_one_name_under_every_spelling(dataset, tmp_path, monkeypatch
 
 
 def test_a_map_goes_on_where_it_was(dataset, tmp_path):
-    first = opened(tmp_path / "map")
-    first.build(replace(dataset.database, names=dataset.database.names[:4]))
+    opened(tmp_path / "map").build(replace(dataset.database, names=dataset.database.names[:4]))
     again = opened(tmp_path / "map")
-    assert again.build(dataset.database) == len(dataset.database) - 4
-    assert again.build(dataset.database) == 0
+    assert [again.build(dataset.database) for _ in range(2)] == [len(dataset.database) - 4, 0]
     assert again.names == list(dataset.database.names)
     assert again.localize(dataset.database.paths[6]).place == dataset.database.names[6]
     with pytest.raises(InputError, match="a place of each of"):
@@ -414,7 +412,6 @@ def test_strong_features_with_few_matches_have_no_place(folder):
 
 
 def test_the_strength_of_a_map_is_of_a_few_of_its_rows():
-    """Rows of one keypoint each, whose score is the row."""
     rows, read = Unsteady(), []
     mean = MapStrength(rows)
     rows.features = lambda wanted: (read.extend(wanted), Unsteady().features(wanted))[1]
@@ -461,7 +458,6 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
 
 @pytest.mark.slow
 def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
-    """Rows appear one by one; whatever is there can be read, and the next goes on behind it."""
     program = (
         "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
         "from mfvpr.localization import Map; from tests.localization.test_map import SIFT, VLAD\n"

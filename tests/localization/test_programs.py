@@ -31,50 +31,49 @@ WAIT = "10 images in the map; the first answer takes seconds more: programs comp
 
 
 @pytest.fixture
-def called(monkeypatch, capsys):
-    """Exit code, output and errors of a program, without the line that says why the first answer takes long."""
+def call_program(monkeypatch, capsys):
+    """Runs a program: output and errors, without the line that says why the first answer takes long."""
 
-    def call(program, *arguments):
-        code, stdout, stderr = typed(monkeypatch, capsys, program, *map(str, arguments))
-        return code, stdout, "".join(line for line in stderr.splitlines(True) if not line.endswith(WAIT[10:]))
+    def call(program, *arguments, code=0):
+        exit_code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
+        assert exit_code == code, stderr
+        return stdout, "".join(line for line in stderr.splitlines(True) if not line.endswith(WAIT[10:]))
 
     return call
 
 
 @pytest.fixture
-def built(called):
-    """Exit code, output and errors of the program that builds a map of a street."""
+def build_map(call_program):
+    """Builds a map of a street: output and errors."""
 
-    def call(folder, street, *more):
+    def call(folder, street, *more, code=0):
         data = ["dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
                 "dataset.ground_truth=none"]  # fmt: skip
-        return called("map", "build", f"map={folder}", *data, *QUICK, *more)
+        return call_program("map", "build", f"map={folder}", *data, *QUICK, *more, code=code)
 
     return call
 
 
 @pytest.fixture
-def folder(small_street, tmp_path, built):
-    code, stdout, stderr = built(tmp_path / "map", small_street)
-    assert code == 0, stderr
+def folder(small_street, tmp_path, build_map):
+    stdout, _ = build_map(tmp_path / "map", small_street)
     assert stdout == f"{tmp_path}/map: 10 images, 10 of them new\n"
     return tmp_path / "map"
 
 
 @pytest.fixture
-def localized(called, tmp_path):
-    """Exit code, lines and errors of the program that localizes images."""
+def localize(call_program, tmp_path):
+    """Localizes images: lines and errors."""
 
-    def call(images, *more, folder=tmp_path / "map"):
-        code, stdout, stderr = called("localize", f"map={folder}", f"images={images}", *more)
-        return code, [json.loads(line) for line in stdout.splitlines()], stderr
+    def call(images, *more, folder=tmp_path / "map", code=0):
+        stdout, stderr = call_program("localize", f"map={folder}", f"images={images}", *more, code=code)
+        return [json.loads(line) for line in stdout.splitlines()], stderr
 
     return call
 
 
 @pytest.fixture
 def queries(tmp_path):
-    """An empty folder."""
     (tmp_path / "queries").mkdir()
     return tmp_path / "queries"
 
@@ -98,26 +97,24 @@ def test_images_of_a_folder_are_localized(folder, small_street, monkeypatch, cap
     assert all(line["p_right"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in lines)
 
 
-def test_images_of_the_map_are_not_added_again(folder, small_street, called, built):
-    code, stdout, _ = built(folder, small_street)
-    assert (code, stdout) == (0, f"{folder}: 10 images, 0 of them new\n")
-    code, stdout, _ = called("map", "info", folder)
-    assert code == 0
+def test_images_of_the_map_are_not_added_again(folder, small_street, call_program, build_map):
+    stdout, _ = build_map(folder, small_street)
+    assert stdout == f"{folder}: 10 images, 0 of them new\n"
+    stdout, _ = call_program("map", "info", folder)
     assert stdout.startswith(f"{folder}: 10 images, 0.")
     assert json.loads(stdout.partition("\n")[2])["candidates"] == 5
 
 
-def test_images_are_added(folder, small_street, called, localized):
+def test_images_are_added(folder, small_street, call_program, localize):
     image = small_street / "queries" / "0009.png"
     new = shutil.copy(image, folder.parent / "new.png")
-    code, stdout, _ = called("map", "add", folder, new, "--place", "the last")
-    assert (code, stdout) == (0, f"{new}: added, 11 images\n")
-    assert localized(image)[1][0]["place"] == "the last"
-    assert localized(image, "recent=1")[1][0]["place"] != "the last"
-    code, _, stderr = called("map", "add", folder, new)
-    assert code == 2
+    stdout, _ = call_program("map", "add", folder, new, "--place", "the last")
+    assert stdout == f"{new}: added, 11 images\n"
+    assert localize(image)[0][0]["place"] == "the last"
+    assert localize(image, "recent=1")[0][0]["place"] != "the last"
+    _, stderr = call_program("map", "add", folder, new, code=2)
     assert "new.png: the map has an image" in stderr
-    assert called("map", "add", folder, image)[0] == 0  # another image of the name 0009.png
+    call_program("map", "add", folder, image)  # another image of the name 0009.png
 
 
 @pytest.fixture
@@ -131,9 +128,8 @@ def video(small_street, tmp_path):
     return path
 
 
-def test_frames_of_a_video_are_localized(folder, video, small_street, localized):
-    code, lines, _ = localized(video, "every=3")
-    assert code == 0
+def test_frames_of_a_video_are_localized(folder, video, small_street, localize):
+    lines, _ = localize(video, "every=3")
     assert [(line["image"], line["place"]) for line in lines] == [
         (f"{video}:{row}", f"{row:04d}.png") for row in (0, 3, 6, 9)
     ]
@@ -150,11 +146,10 @@ def test_files_that_are_no_video(tmp_path):
             list(frames(path))
 
 
-def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queries, localized):
+def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queries, localize):
     (queries / "0.png").write_text("no image")
     shutil.copy(small_street / "database/0004.png", queries / "1.png")
-    code, (first, second), stderr = localized(queries)
-    assert code == 2
+    (first, second), stderr = localize(queries, code=2)
     assert "0.png: " in first["error"]
     assert second["place"] == "0004.png"
     assert "1 of the images could not be answered" in stderr
@@ -175,9 +170,9 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queri
     (["map=MAP", "images=MAP", "route=fast"], "route=fast: expected a number from -1000 to 1000"),
     (["map=MAP", "images=MAP", "add=1"], "add=1: expected one of true, false"),
 ])  # fmt: skip
-def test_mistakes_are_one_line(folder, called, arguments, words):
-    code, stdout, stderr = called("localize", *(argument.replace("MAP", str(folder)) for argument in arguments))
-    assert (code, stdout) == (2, "")
+def test_mistakes_are_one_line(folder, call_program, arguments, words):
+    stdout, stderr = call_program("localize", *(argument.replace("MAP", str(folder)) for argument in arguments), code=2)
+    assert stdout == ""
     assert words in stderr
     assert stderr.count("\n") == 1
 
@@ -190,9 +185,9 @@ def test_mistakes_are_one_line(folder, called, arguments, words):
     (["scorer=paper"], "scorer=histogram, got several"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
 ])  # fmt: skip
-def test_other_settings_are_refused(folder, small_street, built, more, words):
-    code, _, stderr = built(folder, small_street, *(setting.replace("STREET", str(small_street)) for setting in more))
-    assert code == 2
+def test_other_settings_are_refused(folder, small_street, build_map, more, words):
+    changes = [setting.replace("STREET", str(small_street)) for setting in more]
+    _, stderr = build_map(folder, small_street, *changes, code=2)
     assert words in stderr
 
 
@@ -212,11 +207,11 @@ def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch)
 
 
 @pytest.mark.slow
-def test_answers_are_drawn(folder, small_street, tmp_path, localized):
+def test_answers_are_drawn(folder, small_street, tmp_path, localize):
     queries, pictures = small_street / "queries", {}
     for name, root in (("gray", "null"), ("shown", f"{small_street}/database"), ("elsewhere", str(tmp_path))):
-        code, lines, stderr = localized(queries, "figures=[0003.png,5]", f"out={tmp_path}/{name}", f"root={root}")
-        assert (code, stderr) == (0, "")
+        lines, stderr = localize(queries, "figures=[0003.png,5]", f"out={tmp_path}/{name}", f"root={root}")
+        assert stderr == ""
         paths = [tmp_path / name / "0003_0003.png", tmp_path / name / "0005_0005.png"]
         assert [line["figure"] for line in lines if "figure" in line] == [*map(str, paths)]
         assert sorted((tmp_path / name).iterdir()) == paths
@@ -229,21 +224,20 @@ def test_answers_are_drawn(folder, small_street, tmp_path, localized):
     assert gray["shown"] < 0.01 < 0.1 < gray["gray"]
 
 
-def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_path, queries, localized):
+def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_path, queries, localize):
     for name in ("a b.png", "c.png", "d.png"):
         write_gray(queries / name)
-    code, lines, stderr = localized(queries, "figures=2", f"out={tmp_path}/out")
-    assert (code, stderr) == (0, "")
+    lines, stderr = localize(queries, "figures=2", f"out={tmp_path}/out")
+    assert stderr == ""
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0000_a b.png", "0001_c.png"]
     assert [(line["place"], line["reason"]) for line in lines] == [(None, "too few features")] * 3
 
 
-def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_path, localized):
+def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_path, localize):
     """Its names are data: of a map that somebody gave away they may say anything."""
     query = small_street / "queries/0004.png"
     maps.open_map(folder).add(query, "there", name=f"..{query}")
-    code, [line], stderr = localized(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database")
-    assert code == 2
+    [line], stderr = localize(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database", code=2)
     assert (line["place"], line["figure"]) == ("there", None)
     warning, error = stderr.splitlines()
     assert warning.startswith(f"warning: {tmp_path}/out/0000_0004.png: not drawn ('..")
@@ -252,34 +246,31 @@ def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_figures_of_images_that_were_not_localized(folder, small_street, tmp_path, localized):
+def test_figures_of_images_that_were_not_localized(folder, small_street, tmp_path, localize):
     figures = ("figures=[no.png,0003.png,10]", f"out={tmp_path}/out")
-    code, lines, stderr = localized(small_street / "database", *figures)
-    assert code == 2
+    lines, stderr = localize(small_street / "database", *figures, code=2)
     assert len(lines) == 10
     assert stderr.startswith("error: figures=[10,no.png]: expected rows")
     assert len([*(tmp_path / "out").iterdir()]) == 1
 
 
-def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, localized):
+def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, localize):
     drive = shutil.copytree(small_street / "database", tmp_path / "drive")
     shutil.copy(drive / "0000.png", drive / "0006.png")
-    code, lines, _ = localized(drive, "route=1")
-    assert code == 0
+    lines, _ = localize(drive, "route=1")
     assert values_of("place", lines) == [*NAMES[:6], NAMES[0], *NAMES[7:]]
     assert [line["route"]["place"] for line in lines] == NAMES
     assert all(0 < line["route"]["p"] <= 1 for line in lines)
-    _, plain, _ = localized(drive)
+    plain, _ = localize(drive)
     assert values_of("place", plain) == values_of("place", lines)
     assert all("route" not in line and "added" not in line for line in plain)
 
 
-def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, localized):
+def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, localize):
     drive = shutil.copytree(small_street / "database", tmp_path / "drive")
     (drive / "0004.png").write_text("no image")
     write_gray(drive / "0006.png")
-    code, lines, _ = localized(drive, "route=1")
-    assert code == 2
+    lines, _ = localize(drive, "route=1", code=2)
     assert "error" in lines[4]
     assert [line["route"]["place"] for line in lines] == NAMES
 
@@ -297,17 +288,17 @@ def without_seconds(lines):
     return [{name: value for name, value in line.items() if name not in ("seconds", "added")} for line in lines]
 
 
-def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, built, localized):
+def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, build_map, localize):
     start = tmp_path / "start"
     (start / "database").mkdir(parents=True)
     shutil.copytree(twice, start / "queries")
     for number in (8, 9):  # which the drive does not pass
         shutil.copy(small_street / f"database/{number:04d}.png", start / "database")
-    assert built(tmp_path / "map", start)[0] == 0
+    build_map(tmp_path / "map", start)
     write_gray(twice / "16.png", (240, 320))
     settings = ("add=true", "recent=3", "route=1")
-    code, first, stderr = localized(twice, *settings)
-    assert (code, stderr) == (0, "")
+    first, stderr = localize(twice, *settings)
+    assert stderr == ""
     names = [f"{twice}/{number:02d}.png" for number in range(17)]
     assert values_of("image", first) == names
     assert all(values_of("added", first))
@@ -315,17 +306,17 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, built,
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
         assert all(alternative["row"] < 2 + number - 3 for alternative in line["alternatives"])
     assert maps.open_map(tmp_path / "map").names[2:] == names
-    _, again, _ = localized(twice, *settings)
+    again, _ = localize(twice, *settings)
     assert without_seconds(again) == without_seconds(first)
     assert not any(values_of("added", again))
     assert len(maps.open_map(tmp_path / "map")) == 19
 
 
-def test_a_drive_that_was_interrupted_goes_on(twice, folder, localized):
+def test_a_drive_that_was_interrupted_goes_on(twice, folder, localize):
     other, settings = shutil.copytree(folder, folder.parent / "other"), ("add=true", "recent=2")
-    _, uninterrupted, _ = localized(twice, *settings)
-    localized(f"[{twice}/00.png,{twice}/01.png]", *settings, folder=other)
-    _, resumed, _ = localized(twice, *settings, folder=other)
+    uninterrupted, _ = localize(twice, *settings)
+    localize(f"[{twice}/00.png,{twice}/01.png]", *settings, folder=other)
+    resumed, _ = localize(twice, *settings, folder=other)
     assert without_seconds(resumed) == without_seconds(uninterrupted)
     assert values_of("added", resumed) == [False, False, *[True] * 14]
 
@@ -352,23 +343,21 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
     assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
 
 
-def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localized):
+def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
     with lock_map(folder):
-        code, lines, stderr = localized(twice, "add=true")
-    assert (code, lines) == (2, [])
+        lines, stderr = localize(twice, "add=true", code=2)
+    assert lines == []
     assert "in use by process" in stderr
     assert stderr.count("\n") == 1
 
 
-def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localized):
-    """An evaluation with the map's settings gives no warning."""
+def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):
     settings = json.loads((folder / "settings.json").read_text())
     for candidates in (settings["candidates"], settings["candidates"] + 1):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {"settings": same | {"scorer": build.describe_settings(settings["scorer"])}, "candidates": candidates}
         write_confidences(tmp_path / "c.json", {"histogram": SURE}, origin)
-        code, [line], stderr = localized(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
-        assert code == 0
+        [line], stderr = localize(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert 0 <= line["p_right"] <= 1
         assert ("other settings of candidates" in stderr) == (candidates != settings["candidates"])
 

@@ -78,7 +78,6 @@ def test_a_sure_robot_moves_as_its_drive_says(advance):
 
 
 def test_half_a_row_is_half_a_row():
-    """The mean of the belief moves by the mean of the motion."""
     there, drive_route = np.ones(100, bool), Route(Drive(0.5, 1.0, 0.0))
     drive_route(sharp(20), there)
     for _ in range(20):

@@ -182,7 +182,6 @@ def test_nothing_is_written_of_rows_that_cannot_be_stored(images, folder):
 
 @pytest.mark.parametrize("segment", [3, 4096])
 def test_a_map_that_replaced_the_one_that_is_open_is_refused(images, tmp_path, monkeypatch, segment):
-    """Also one of the same size, or of full segments."""
     monkeypatch.setattr(map_store, "SEGMENT", segment)
     folder = tmp_path / "map"
     opened(folder).build(first(images, 6))
