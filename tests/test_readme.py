@@ -61,9 +61,9 @@ def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, cap
             images = image_folder(root / side)
             [features] = FeatureCache().local(images, Sift(max_keypoints=60))
             write_features(tmp_path / f"{side}.npz", images.names, features.read(range(len(images))))
-    known = "vlad" if "mixvpr" not in command and "system" not in command else "mixvpr"
-    quick = [setting for setting in QUICK if known == "vlad" or not setting.startswith("retrieval.")]
-    quick = [setting for setting in quick if "features=import" not in arguments or not setting.startswith("features.")]
+    fixed = ("retrieval.",) if "mixvpr" in command or "system" in command else ()
+    fixed += ("features.",) if "features=import" in arguments else ()
+    quick = [setting for setting in QUICK if not setting.startswith(fixed)]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, *quick)

@@ -17,7 +17,7 @@ from tests.programs import composed, csv_rows, folder, matches_path
 pytestmark = pytest.mark.thorough
 
 QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
-         "scorer=sum", "candidates=4")  # fmt: skip
+         "scorer=sum", "candidates=4", "store=null")  # fmt: skip
 
 
 @pytest.fixture
@@ -27,8 +27,7 @@ def run(tmp_path, monkeypatch, capsys):
 
     def run(*settings, name="out"):
         place = tmp_path / name
-        extra = "scorer=sum" if any("store=" in setting for setting in settings) else "store=null"
-        evaluate(composed(*QUICK, extra, f"out={place}", *settings) | {"multirun": False})
+        evaluate(composed(*QUICK, f"out={place}", *settings) | {"multirun": False})
         return json.loads((place / "results.json").read_text()), capsys.readouterr(), place
 
     return run

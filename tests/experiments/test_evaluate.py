@@ -125,15 +125,6 @@ def test_ctrl_c_leaves_nothing(small_street, tmp_path, interrupt, stage):
     interrupt(process)
 
 
-@pytest.mark.parametrize(("setting", "words"), [
-    ("scorer.max_bins=3", "at least 45"), ("scorer.bin_size=0.01", "at most 1024 bins per axis"),
-])  # fmt: skip
-def test_bins_that_do_not_fit_are_refused(small_street, tmp_path, refuse, setting, words):
-    assert words in refuse(
-        "evaluate", *folder(small_street, "scorer=histogram", *QUICK, setting, f"out={tmp_path}/out")
-    )
-
-
 @pytest.mark.slow
 def test_one_evaluation_compiles_few_programs_and_the_next_none(
     small_street, tmp_path, monkeypatch, compilations, capsys
@@ -183,16 +174,12 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     for bar in ("drawing streets", "database features", "matching", "scores", "figures"):
         assert bar in done.stderr
 
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    tables = {"table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
-    assert {"results.json", "run.json"} | tables <= files
-    figures = [path for path in files if path.startswith("figures/")]
-    queries = {name for name in figures if name[-8:-4].isdigit()}
-    assert {name.split("/")[1].split("_")[0] for name in queries} == {"right", "wrong"}
-    curves = {f"figures/{name}.png" for name in ("precision_recall", "reliability", "rerank_share")}
-    assert set(figures) == queries | curves
-    for name in figures:
-        image = np.asarray(Image.open(folder / name).convert("L"))
+    files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
+    assert files <= {path.name for path in folder.iterdir()}
+    figures = [*(folder / "figures").iterdir()]
+    assert {path.stem.split("_")[0] for path in figures} == {"right", "wrong", "precision", "reliability", "rerank"}
+    for path in figures:
+        image = np.asarray(Image.open(path).convert("L"))
         assert image.shape[0] > 300
         assert image.std() > 20
     assert [row["system"] for row in csv_rows(folder / "table.csv")] == systems

@@ -255,13 +255,15 @@ def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, 
     assert words in refuse_at_once("sweep", *small(root), *arguments)
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins"),
-    ([SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
-    (["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
+@pytest.mark.parametrize(("program", "arguments", "words"), [
+    ("sweep", ["grid.bin_size=[15,0.01]"], "bin_size=0.01: expected at most 1024 bins"),
+    ("sweep", [SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
+    ("sweep", ["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
+    ("evaluate", ["scorer=histogram", "scorer.bin_size=0.01"], "bin_size=0.01: expected at most 1024 bins"),
+    ("evaluate", ["scorer=histogram", "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
 ])  # fmt: skip
-def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, arguments, words):
-    assert refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
+def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, program, arguments, words):
+    assert refuse(program, *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -457,7 +457,7 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
+def test_killed_while_adding_it_has_whole_rows(dataset, small_street, tmp_path):
     program = (
         "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
         "from mfvpr.localization import Map; from tests.localization.test_map import SIFT, VLAD\n"
@@ -481,5 +481,4 @@ def test_killed_while_adding_it_has_whole_rows(small_street, tmp_path):
         assert len(known) > seen
         seen = start = len(known)
         assert opened(tmp_path / "map").names == known.names
-    data = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
-    assert known.localize(data.database.paths[4]).place % 10 == 4
+    assert known.localize(dataset.database.paths[4]).place % 10 == 4
