@@ -17,7 +17,7 @@ _WORDS = {
     r"(expected one query sequence, got \d+); choose one of ": r"\1; give one folder as dataset.queries=[DIR], of ",
     r"give names with their folders as the file has them": "say what stands before the names in the file with "
     "GROUP.database_prefix=... and GROUP.query_prefix=...",
-    r"called by their paths below their folder\)": "called by their paths below their folder, behind "
+    r"names are paths below the folder\)": "names are paths below the folder, behind "
     "GROUP.database_prefix and GROUP.query_prefix)",
     r"give one of this folder as well$": "choose another retrieval, or no cohort",  # not for one of several folders
     r"or lower num_words$": "or lower retrieval.num_words",

@@ -50,7 +50,7 @@ def add_arguments(parser: Parser) -> None:
         module = import_module(f"experiments.benchmark.{benchmark}")
         module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **paths)
 
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=lambda: run)
 
 
 def positive_int(text: str) -> int:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int, Num
+from jaxtyping import Bool, Int, Integer, Num
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
@@ -183,7 +183,7 @@ def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) ->
 
 
 def frame_positives(
-    query_index: Int[np.ndarray, " queries"], database_index: Int[np.ndarray, " database"], *, tolerance: int
+    query_index: Integer[np.ndarray, " queries"], database_index: Integer[np.ndarray, " database"], *, tolerance: int
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by frame: |database_index - query_index| <= tolerance.
 
