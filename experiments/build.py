@@ -183,10 +183,8 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["store"] is None else expand_user(settings["store"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
-    if shard is not None and settings["coordinator"]:
-        shard = replace(shard, meets=True)
     return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
-                   wait=settings.get("multirun", False), shard=shard, patience=settings.get("wait", 0))  # fmt: skip
+                        wait=settings.get("multirun", False), shard=shard)  # fmt: skip
 
 
 def where(settings: dict[str, Any]) -> dict[str, Any]:

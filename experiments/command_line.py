@@ -17,7 +17,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments import distributed_launch
 from experiments.console import tell
 from experiments.data_sets import compose_program, first_of
 from experiments.errors import on_interrupt, one_line
@@ -54,11 +53,10 @@ def run(program: Program, config: str) -> None:
             if is_multirun:
                 arguments = [override for override in job.overrides.task if not override.startswith("launcher=")]
             command = f"python -m experiments.{PROGRAMS[config]} {shlex.join(arguments)}"
-            with distributed_launch.connection(settings, PROGRAMS[config], arguments):
-                work = program()
-                _require_device()
-                with on_interrupt(signal.default_int_handler), in_settings(settings):
-                    work(settings | {"multirun": is_multirun, "command": command})
+            work = program()
+            _require_device()
+            with on_interrupt(signal.default_int_handler), in_settings(settings):
+                work(settings | {"multirun": is_multirun, "command": command})
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _hydra_errors(config):

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments import build, confidences, distributed_launch, run_folder, sharding, stages, truth
+from experiments import build, confidences, run_folder, stages, truth
 from experiments.settings import SettingsError
 from experiments.stages import Images, Tools
 from mfvpr.datasets import Dataset
@@ -51,29 +51,23 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Run all stages, print the table, fill the run folder; a shard does what it can do by now."""
-    if settings["shard"] is None:
-        with run_folder.claimed(settings) as folder:
-            _leave(folder, evaluation_of(settings))
+    """Run all stages, print the table, fill the run folder; a shard fills the store only."""
+    if settings["shard"] is not None:
+        _fill_store(settings)
         return
-    with sharding.join_run(settings):
-        try:
-            outcome = evaluation_of(settings)
-        except NotYet as needs:
-            sharding.mark_waiting(settings, needs)
-            if needs.is_complete:
-                print(f"shard {settings['shard']} has done its part: {needs}; the last shard leaves the results")
-            else:
-                print(f"shard {settings['shard']} has done what it can: {needs}; start it again when they are there")
-            return
-        distributed_launch.disconnect()
-        with sharding.claim_results(settings) as is_last:
-            if is_last:
-                with run_folder.claimed(settings, own=True, beside=[sharding.SHARDS]) as folder:
-                    _leave(folder, outcome)
-            else:
-                print(f"shard {settings['shard']} is complete; results: {settings['out']}")
-        sharding.mark_complete(settings)
+    with run_folder.claimed(settings) as folder:
+        _leave(folder, evaluation_of(settings))
+
+
+def _fill_store(settings: dict[str, Any]) -> None:
+    """Do the part of a shard, and print what is done or missing."""
+    try:
+        evaluation_of(settings)
+    except NotYet as end:
+        advice = "when all shards are done, run without shard= for the results"
+        if not end.is_complete:
+            advice = "start it again when they are there"
+        print(f"shard {settings['shard']}: {end}; {advice}")
 
 
 def _leave(folder: Path, outcome: Outcome) -> None:
@@ -91,7 +85,6 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
     tools, images = stages.begun(settings, watch)
-    sharding.check_data(settings, images)
     figure_queries = query_rows(settings["figures"], images.dataset)
     headline, frames = fusion.system(main) if settings["final"] == "combined" else main, build.frames(settings)
     cohort, fused_systems = settings["cohort"], [main]

@@ -68,7 +68,6 @@ RULES: dict[str, Rule] = {
         "also report": either(_TEXT, None),
         ".datasets .systems": either(list_of(_TEXT), None),
         "shard": either(pattern(r"[0-9]+/[0-9]+", "i/n with i from 0 to n - 1, such as 0/8"), None),
-        "coordinator": either(pattern(r"[^\s:]+:[0-9]{1,5}", "HOST:PORT of the first task, such as node1:7654"), None),
         "figures": _FIGURES,
         # whole numbers
         "seed alternatives recent": _INDEX,
@@ -102,21 +101,16 @@ RULES: dict[str, Rule] = {
         "fusion.c": either(_NOT_NEGATIVE, "auto", "zscore"),
         "fusion.weights": any_of("weights by name, such as {filter: 0.5, anchor: 1}, or null", one_of(None)),
         "route": either(number(-1000, 1000), None),
-        "wait": number(0, 1e9),
     }.items()
     for name in names.split()
 }
 # Settings that take effect with another one only, and the words of the error.
 _NEEDS = (
     ("also", "report", "report=DATASET,... as well, to learn on several data sets and report on others"),
-    ("coordinator", "shard", "shard=i/n as well, this task's part"),
-    ("wait", "shard", "shard=i/n as well, this task's part"),
-    ("shard", "out", "out=DIR as well, the same of all shards"),
     ("shard", "store", "store=DIR as well, the same of all shards"),
     ("threshold", "confidence", "confidence=FILE as well, the confidence.json of a run on other images with ground "
      "truth"),
 )  # fmt: skip
-_NOT_SET = {"wait": 0}  # null of all others
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -147,7 +141,7 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
     for name, needed, expected in _NEEDS:
-        if name in settings and settings[name] != _NOT_SET.get(name) and settings[needed] is None:
+        if settings.get(name) is not None and settings[needed] is None:
             raise SettingsError(f"{name}={settings[name]}: expected {expected}")
 
 

@@ -18,7 +18,7 @@ from mfvpr.evaluation import match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.matching import Matcher, MatchSet, Scales
-from mfvpr.retrieval import ExactSearch, Filter, Retrieval
+from mfvpr.retrieval import Filter
 from mfvpr.scoring.weight_registry import provenance
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
@@ -73,18 +73,7 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.filter(settings["retrieval"], extractor, dataset)
-    if settings.get("coordinator"):
-        retrieval = _distribute(retrieval)
     return Tools(extractor, retrieval, build.matching(settings["matching"]), cache, build.where(settings))
-
-
-def _distribute(retrieval: Filter) -> Filter:
-    """The same retrieval on the devices of all tasks, if its search is exact."""
-    from mfvpr.evaluation.distributed import retrieve_everywhere  # here, since few runs need it
-
-    if not isinstance(retrieval, Retrieval) or not isinstance(retrieval.search, ExactSearch):
-        return retrieval
-    return replace(retrieval, search=replace(retrieval.search, spread=retrieve_everywhere))
 
 
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:

@@ -14,7 +14,6 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
-from mfvpr.evaluation.distributed import all_devices, score_program
 from mfvpr.matching import MatchSet
 from mfvpr.tuning.sweeps.settings import groups
 from mfvpr.tuning.sweeps.sweep import group_program
@@ -76,7 +75,6 @@ def register_scorer(number, log):
 ENTRIES = {
     "score_candidates": lambda scorer, matches: mfvpr.score_candidates(scorer, matches),
     "score_grid": lambda scorer, matches: mfvpr.score_grid(scorer, matches, factor=[1.0, 2.0]),
-    "score_spread": lambda scorer, pair: score_program(all_devices())(scorer, jax.tree.map(lambda x: x[None], pair)),
 }
 
 
@@ -122,7 +120,6 @@ PROGRAMS_OF_THEIR_OWN = {
     "utils/numerics.py",
     "tuning/sweeps/sweep.py",  # of a new function
     "testing.py",  # of new functions, each of which has one scorer
-    "evaluation/distributed.py",  # of arrays alone
 }
 
 

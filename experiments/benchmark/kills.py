@@ -1,14 +1,15 @@
 """Kill the tasks of small sharded evaluations at random moments, and compare the results with undisturbed ones.
 
-Two tasks of an evaluation run side by side and receive SIGKILL at any moment. Missing tasks are started again until the
-results are complete. Then the rows in the stores and the tables must equal those of undisturbed tasks byte by byte, and
-no row may have been written twice.
+Two shards of an evaluation run side by side and receive SIGKILL at any moment. They are started again until both are
+done. Then a run without a shard, which is killed as well, writes the results. The rows in the stores and the tables
+must equal those of undisturbed tasks byte by byte, and no row may have been written twice.
 """
 
 import hashlib
 import math
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -16,14 +17,15 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from experiments import sharding
 from experiments.benchmark.harness import duration, write_report
 from experiments.console import bar
 from experiments.settings import SettingsError
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.report import Table
+from mfvpr.report.runs import LAST
 
-KILLS, SHARDS = 200, 2
+KILLS = 200
+SHARDS, NO_SHARD = ("0/2", "1/2"), "null"  # values of the setting `shard`
 FRAMES, IMAGE_SIZE = 40, (160, 120)
 POLL = 0.02  # seconds
 
@@ -40,7 +42,7 @@ def run(rounds: int | None, out: Path) -> None:
         _evaluate(root / "first", street)  # fills the compilation cache
         _evaluate(root / "undisturbed", street)
         expected = file_hashes(root / "undisturbed")
-        seconds = duration(lambda: _start_task(root / "undisturbed", street, 0).wait())  # a task with nothing to do
+        seconds = duration(lambda: _start_task(root / "undisturbed", street, SHARDS[0]).wait())  # with nothing to do
         with bar("kills", total) as progress:
             while kills.total() < total:
                 folder = root / f"{evaluations}"
@@ -53,7 +55,7 @@ def run(rounds: int | None, out: Path) -> None:
                 evaluations += 1
                 progress.update(new_kills.total())
     lines = [[stage, str(count)] for stage, count in [*kills.items(), ("in all", kills.total())]]
-    title = f"{evaluations} evaluations in {SHARDS} shards: rows and tables equal undisturbed ones, rows written once"
+    title = f"{evaluations} evaluations in shards: rows and tables equal undisturbed ones, rows written once"
     content = {"evaluations": evaluations, "kills": dict(kills)}
     write_report(out, title, [Table(["killed during", "times"], lines)], content)
 
@@ -63,25 +65,33 @@ def _evaluate(
 ) -> Counter[str]:
     """Run an evaluation, kill its tasks after about `seconds`, and count the kills by stage."""
     kills, states = Counter[str](), {}
-    while missing := _missing_tasks(folder):
-        ends = [time.monotonic() + (_delay(rng, seconds) if rng else math.inf) for _ in missing]
-        tasks = {index: (_start_task(folder, street, index), end) for index, end in zip(missing, ends, strict=True)}
-        while tasks:
-            time.sleep(POLL)
-            _check_rows(states, folder)
-            for index, (task, end) in list(tasks.items()):
-                if task.poll() is not None:
-                    if task.returncode:
-                        log = (folder / f"{index}.log").read_text("utf-8").strip()
-                        error = f"failed with {task.returncode}: {log.splitlines()[-1:]}"
-                        raise SettingsError(f"kills: the task {index}/{SHARDS} {error}")
-                    del tasks[index]
-                elif time.monotonic() > end and kills.total() < max_kills:
-                    kills[_stage(folder)] += 1
-                    task.kill()
-                    task.wait()
-                    del tasks[index]
-    _check_rows(states, folder)
+    for shards in (SHARDS, [NO_SHARD]):
+        while pending := [shard for shard in shards if not _is_complete(folder, shard)]:
+            delays = {shard: _delay(rng, seconds) if rng else math.inf for shard in pending}
+            kills += _run_tasks(folder, street, delays, states, max_kills - kills.total())
+    return kills
+
+
+def _run_tasks(
+    folder: Path, street: Path, delays: dict[str, float], states: FileStates, max_kills: int
+) -> Counter[str]:
+    """Run tasks side by side until each has ended or was killed after its delay; count the kills by stage."""
+    kills, start = Counter[str](), time.monotonic()
+    tasks = {shard: _start_task(folder, street, shard) for shard in delays}
+    while tasks:
+        time.sleep(POLL)
+        for shard, task in list(tasks.items()):
+            if task.poll() is not None:
+                if task.returncode:
+                    error = f"failed with {task.returncode}: {_log(folder, shard).read_text('utf-8')[-200:]}"
+                    raise SettingsError(f"kills: the task shard={shard} {error}")
+                del tasks[shard]
+            elif time.monotonic() - start > delays[shard] and kills.total() < max_kills:
+                kills[_stage(folder, shard)] += 1
+                task.kill()
+                task.wait()
+                del tasks[shard]
+        _check_rows(states, folder)
     return kills
 
 
@@ -90,27 +100,33 @@ def _delay(rng: random.Random, seconds: float) -> float:
     return math.inf if rng.random() < 0.25 else rng.uniform(0.6, 1.8) * seconds
 
 
-def _start_task(folder: Path, street: Path, index: int) -> subprocess.Popen[bytes]:
+def _start_task(folder: Path, street: Path, shard: str) -> subprocess.Popen[bytes]:
     settings = [
         "dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
         "dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true",
         "features.max_keypoints=200", f"features.image_size=[{IMAGE_SIZE[0]},{IMAGE_SIZE[1]}]", "retrieval.num_words=8",
-        "candidates=20", "figures=2", f"store={folder}/store", f"out={folder}/out", f"shard={index}/{SHARDS}",
+        "candidates=20", "figures=2", f"store={folder}/store", f"out={folder}/out", f"shard={shard}",
     ]  # fmt: skip
     folder.mkdir(exist_ok=True)
-    with (folder / f"{index}.log").open("w", encoding="utf-8") as log:
+    shutil.rmtree(folder / "out", ignore_errors=True)  # of a run that was killed
+    with _log(folder, shard).open("w", encoding="utf-8") as log:
         command = [sys.executable, "-m", "experiments.evaluate", *settings]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
+        return subprocess.Popen(command, stdout=log, stderr=log)
 
 
-def _missing_tasks(folder: Path) -> list[int]:
-    if not (folder / "out" / sharding.SHARDS / "run.json").exists():
-        return list(range(SHARDS))
-    return sharding.missing(folder / "out")
+def _log(folder: Path, shard: str) -> Path:
+    return folder / f"{shard.replace('/', '-of-')}.log"
+
+
+def _is_complete(folder: Path, shard: str) -> bool:
+    if shard == NO_SHARD:
+        return (folder / "out" / LAST).exists()
+    log = _log(folder, shard)
+    return log.exists() and "are done" in log.read_text("utf-8")
 
 
 def _row_files(folder: Path) -> dict[str, Path]:
-    return {str(path.relative_to(folder)): path for path in (folder / "store").glob("*/shards/*/[0-9]*-*.npz")}
+    return {str(path.relative_to(folder)): path for path in (folder / "store").rglob("[0-9]*-*.npz")}
 
 
 def _check_rows(states: FileStates, folder: Path) -> None:
@@ -121,13 +137,12 @@ def _check_rows(states: FileStates, folder: Path) -> None:
             raise SettingsError(f"kills: {name} was written twice")
 
 
-def _stage(folder: Path) -> str:
+def _stage(folder: Path, shard: str) -> str:
     """Stage under way, judged by the files in the stores."""
-    kinds = {path.relative_to(folder / "store").parts[0].partition("-")[0] for path in _row_files(folder).values()}
-    queries = {path.name.partition("-")[0] for path in (folder / "store").glob("scores-*/shards/*/[0-9]*-*.npz")}
-    if len(queries) == FRAMES:
+    if shard == NO_SHARD:
         return "results and report"
-    return "matching and scoring" if "matches" in kinds else "extraction" if kinds else "before the first row"
+    kinds = {path.relative_to(folder / "store").parts[0].partition("-")[0] for path in _row_files(folder).values()}
+    return "matching" if "matches" in kinds else "extraction" if kinds else "before the first row"
 
 
 def file_hashes(folder: Path) -> dict[str, str]:

@@ -8,7 +8,7 @@
 Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -18,7 +18,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.results import Result
-from mfvpr.evaluation.sequence_matching import match_sequence, matches_recipe
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.validation import check_request, score_warnings
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
@@ -30,10 +30,7 @@ from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.retrieval.retriever import Filter
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.manifest import SCORES, store_path
-from mfvpr.storage.scores import QueryScores, ScoreStore, open_score_store
-from mfvpr.storage.shards import Shard, together
-from mfvpr.utils.errors import InputError
+from mfvpr.storage.shards import together
 from mfvpr.utils.numerics import Device
 from mfvpr.utils.progress import Stopwatch
 
@@ -72,7 +69,7 @@ def evaluate(
     Raises:
         InputError: arguments, images, stores or features that cannot be used, or an invalid result of an extractor, the
             retrieval or a scorer; one line says which, and how to fix it.
-        NotYet: this shard has done its part, but other shards have not; see `mfvpr.storage.shards`.
+        NotYet: the cache has a shard, which has done what it can; see `mfvpr.storage.shards`.
     """
     fused, correlated, watch = fused or {}, correlated or {}, watch or Stopwatch()
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
@@ -103,22 +100,13 @@ class _Scoring:
     where: Mapping[str, Any]  # `memory` and `devices`
 
     def score(self, sequence: QuerySequence, watch: Stopwatch, label: str = "") -> Scored:
-        """Match and score a sequence; a shard computes scores of its own queries and reads those of other shards."""
-
-        def match(rows: Sequence[int] | None = None) -> Matched:
-            track = {"track": self.cache.track(f"{label}matching")} if label else {}
-            options = {"matching": self.matching, "cache": self.cache, "watch": watch, **self.where, **track}
-            return match_sequence(self.dataset, sequence, *self.tools, rows=rows, **options)
-
-        def score(matched: Matched) -> dict[str, np.ndarray]:
-            options = {"devices": self.where["devices"], "track": self.cache.track(f"{label}scores")}
-            with watch("scores"):
-                return stages.score(self.scorers, matched.by_scale, matched.candidates, **options)
-
-        if self.cache.shard is not None and self.cache.root is not None:
-            return self._share_scores(sequence, self.cache.shard, match, score)
-        matched = match()
-        return matched, score(matched)
+        """Match and score a sequence."""
+        track = {"track": self.cache.track(f"{label}matching")} if label else {}
+        options = {"matching": self.matching, "cache": self.cache, "watch": watch, **self.where, **track}
+        matched = match_sequence(self.dataset, sequence, *self.tools, **options)
+        options = {"devices": self.where["devices"], "track": self.cache.track(f"{label}scores")}
+        with watch("scores"):
+            return matched, stages.score(self.scorers, matched.by_scale, matched.candidates, **options)
 
     def score_cohort(self, cohort: int, watch: Stopwatch) -> Scored:
         """Match and score the database with itself, as a stage of its own."""
@@ -130,60 +118,3 @@ class _Scoring:
         """Hubness `[N]` of the database images by name of the scorer, from the matches and scores of the cohort."""
         size = len(self.dataset.database)
         return {name: hubness(matched.candidates, values, size, name=name) for name, values in scores.items()}
-
-    def _share_scores(
-        self, sequence: QuerySequence, shard: Shard,
-        match: Callable[..., Matched], score: Callable[[Matched], dict[str, np.ndarray]],
-    ) -> Scored:  # fmt: skip
-        names, scorer_names = sequence.images.names, sorted(self.scorers)
-        with self._open_store(sequence) as store:
-            _write_scores(store, shard, names, scorer_names, match, score)
-
-            def missing_rows() -> Sequence[int]:
-                store.look()
-                return np.flatnonzero(~store.done).tolist()
-
-            label, patience = f"{sequence.name} scores", self.cache.patience
-            shard.wait(missing_rows, names, label, patience=patience, is_complete=True)
-            stored = [query for _, query in store.read()]
-        matched = match()
-        if (np.stack([query.indices for query in stored]) != matched.candidates.indices).any():
-            raise InputError(f"{store.folder}: expected scores of these candidates, got those of another shortlist; "
-                             "delete this folder, and run again")  # fmt: skip
-        by_scorer = np.stack([query.scores for query in stored], axis=1)
-        return matched, {name: by_scorer[scorer_names.index(name)] for name in self.scorers}
-
-    def _open_store(self, sequence: QuerySequence) -> ScoreStore:
-        """Open a shard's store of scores. Its recipe has the code of the scorers, but not of functions they call."""
-        if self.cache.root is None or not self.scorers:
-            raise InputError("scorers: expected at least one, got none; a shard keeps their scores")
-        recipes = {}
-        for name, scorer in self.scorers.items():
-            try:
-                recipes[name] = self.cache.recipe_of(scorer)
-            except TypeError as error:
-                raise InputError(f"{name}: a shard keeps scores, and must know what makes them: {error}") from None
-        recipe = {
-            "matches": matches_recipe(self.dataset, sequence, *self.tools, self.matching, self.cache),
-            "scorers": recipes,
-            "scale weights": [scale.weight for scale in self.tools[0].scales],
-        }
-        path = store_path(self.cache.root, "scores", recipe, SCORES)
-        return open_score_store(path, recipe, num_queries=len(sequence.images), **self.cache.store_options)
-
-
-def _write_scores(
-    store: ScoreStore, shard: Shard, names: Sequence[str], scorer_names: Sequence[str],
-    match: Callable[..., Matched], score: Callable[[Matched], dict[str, np.ndarray]],
-) -> None:  # fmt: skip
-    """Match and score the queries of a shard, and write the missing scores."""
-    rows = shard.rows(names)
-    missing = [row for row in rows if not store.done[row]]
-    # A shard without queries still extracts features of images; and all shards must join collective computations.
-    if missing or not rows or (shard.meets and not store.done.all()):
-        matched = match(rows)
-        if missing:  # all rows are scored, so that a continued run has the bits of a single one
-            scores = score(matched)
-            by_query = np.stack([scores[name] for name in scorer_names], axis=1)
-            queries = dict(zip(rows, map(QueryScores, by_query, np.asarray(matched.candidates.indices)), strict=True))
-            store.write({row: queries[row] for row in missing})

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-import jax
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
@@ -22,43 +21,39 @@ from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import Filter, Filtered
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.matches import MatchStore
-from mfvpr.storage.shards import together
+from mfvpr.storage.shards import NotYet, together
 from mfvpr.types import Shortlist
 from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import placing, write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
 _SHORTLIST = "shortlist.npz"  # beside the matches of shards
+_COMPLETE = "its images and queries are done"
 
 
 def match_sequence(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
     candidates: int | Literal["all"] = 50, *, matching: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
-    watch: Stopwatch | None = None, rows: Sequence[int] | None = None, **where: Any,
+    watch: Stopwatch | None = None, **where: Any,
 ) -> Matched:  # fmt: skip
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    If the cache has a root, matches are kept below it. If they are all there, nothing else is read.
-    Arguments not listed here are those of `evaluate`.
+    If the cache has a root, matches are kept below it. If they are all there, nothing else is read. If the cache has a
+    shard, only queries of the shard are matched. Arguments not listed here are those of `evaluate`.
 
     Args:
         dataset: of the sequence.
         sequence: Q queries.
         watch: gets the seconds of the stages.
-        rows: of the queries that are matched and returned; None = all. Candidates are found for all queries, since they
-            decide which features are extracted.
         **where: `memory`, `devices` and `track` of `stages.match`.
 
     Raises:
         InputError: as `evaluate`.
-        NotYet: other shards have not extracted their features.
+        NotYet: the cache has a shard: its queries are matched, or features of other shards are missing.
     """
     check_matching(candidates, extractor, matching)
-    if rows is not None and not all(0 <= row < len(sequence.images) for row in rows):
-        raise InputError(f"rows: expected rows of {len(sequence.images)} queries, got {[*rows][:9]}")
     cache, watch, database = cache or FeatureCache(), watch or Stopwatch(), dataset.database
     cache = cache if cache.watch else replace(cache, watch=watch)
     with watch("features"):
@@ -70,15 +65,15 @@ def match_sequence(
         if cache.root is not None:
             recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, cache)
             stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, cache)]
-        is_joint = rows is not None and cache.shard is not None and cache.shard.meets
-        matched = None if is_joint else _read_matches(sequence, stores, rows, cache, watch, where.get("memory"))
+        if cache.shard is not None and all(store.done.all() for store in stores):
+            raise NotYet(_COMPLETE)
+        matched = _read_matches(sequence, stores, cache, watch, where.get("memory"))
         if matched is None:
             with watch("filter"):
                 filtered = _find_candidates(sequence, database, filter, candidates, cache, stores)
-            options = {"matcher": matching, "rows": rows, "track": cache.track("matching"), **where}
+            options = {"matcher": matching, "track": cache.track("matching"), **where}
             matched = _match(dataset, sequence, extractor, filtered, stores, cache, watch, **options)
-    if rows is None:
-        _warn_of_queries_without_candidates(matched, cache)
+    _warn_of_queries_without_candidates(matched, cache)
     return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
 
 
@@ -86,17 +81,18 @@ def _find_candidates(
     sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"],
     cache: FeatureCache, stores: Sequence[MatchStore],
 ) -> Filtered:  # fmt: skip
-    """The shortlist; all shards use that of the first, since near ties may come out differently on other machines."""
+    """The shortlist; all runs use that of the first shard, since near ties may come out differently elsewhere."""
 
     def retrieve() -> Filtered:
         number = _number(candidates, database)
         filtered = filter.shortlist(sequence, database, number, cache)
         return validate_candidates(filtered, type(filter).__name__, len(sequence.images), len(database), number)
 
-    if cache.shard is None:
+    path = stores[0].folder / _SHORTLIST if stores else None
+    if path is None or (cache.shard is None and not path.exists()):
         return retrieve()
-    path, key = stores[0].folder / _SHORTLIST, stores[0].folder.name
-    if cache.shard.meets or not path.exists():
+    key = path.parent.name
+    if not path.exists():
         shortlist, *bad = retrieve()
         arrays = {"indices": shortlist.indices, "scores": shortlist.scores, "bad": np.array(json.dumps(bad))}
         with placing(path) as temporary:
@@ -109,23 +105,24 @@ def _find_candidates(
 
 def _match(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered,
-    stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, *, rows: Sequence[int] | None, **options: Any,
+    stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, **options: Any,
 ) -> Matched:  # fmt: skip
-    """Extract features and match all scales."""
+    """Extract features and match all scales; a shard matches its queries, and ends with `NotYet`."""
     with watch("features"):
         sides, remarks = _extract(dataset, sequence, extractor, filtered, cache)
     for store in stores[:1]:  # for later runs, which read the matches and nothing else
         write_text(store.folder / _REMARKS, json.dumps(remarks))
     for line in remarks["warnings"]:
         cache.warn(line)
-    shortlist = filtered.candidates
+    shortlist, shard = filtered.candidates, cache.shard
+    rows = None if shard is None else shard.rows(sequence.images.names)
     with watch("matching"):
         matches = tuple(
             stages.match(*scale, shortlist, store=store, rows=rows, **options)
             for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
         )
-    if rows is not None:
-        shortlist = jax.tree.map(lambda values: values[rows], shortlist)
+    if shard is not None:
+        raise NotYet(_COMPLETE)
     return Matched(sequence, shortlist, matches, remarks["queries"], remarks["database"])
 
 
@@ -184,12 +181,10 @@ def _by_row(*reasons: Mapping[Any, str]) -> dict[int, str]:
 
 
 def _read_matches(
-    sequence: QuerySequence, stores: Sequence[MatchStore], rows: Sequence[int] | None, cache: FeatureCache,
-    watch: Stopwatch, memory: float | None,
+    sequence: QuerySequence, stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, memory: float | None
 ) -> Matched | None:  # fmt: skip
     """Matches of all scales from the stores; None if some are missing."""
-    requested = slice(None) if rows is None else [*rows]
-    if not stores or not requested or not all(store.done[requested].all() for store in stores):
+    if not stores or not all(store.done.all() for store in stores):
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
@@ -197,7 +192,7 @@ def _read_matches(
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None  # so images are read again, but not matched
     with watch("matches read"):
-        scales = [stages.stored_matches(store, rows, memory=memory) for store in stores]
+        scales = [stages.stored_matches(store, memory=memory) for store in stores]
     match_sets, shortlists = zip(*scales, strict=True)
     if any((shortlist.indices != shortlists[0].indices).any() for shortlist in shortlists):
         return None  # scales with different shortlists: matching will raise

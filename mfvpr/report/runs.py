@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -29,9 +29,7 @@ def new_run_folder(root: Path, name: str) -> Path:
 
 
 @contextmanager
-def claim_run_folder(
-    folder: Path, *, numbered: bool = False, own: bool = False, beside: Collection[str] = ()
-) -> Iterator[Path]:
+def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
     """Make and lock a new or empty folder, until the block or the process ends.
 
     An empty folder is removed at the end, with the parents that were made for it.
@@ -40,7 +38,6 @@ def claim_run_folder(
         folder: of the run.
         numbered: take `folder-2`, `folder-3`, ... if the folder exists.
         own: only runs write into the folder; files of a killed run are removed.
-        beside: names of files that may be there, and stay.
 
     Raises:
         InputError: the folder cannot be made or written to, is not empty, or another run uses it.
@@ -52,7 +49,7 @@ def claim_run_folder(
             in_use = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
             with suppress(OSError):  # a file system without locks of folders, such as NFS
                 stack.enter_context(lock_folder(folder, in_use))
-            _clear(folder, own, {*beside})  # a folder that is refused must stay
+            _clear(folder, own)  # a folder that is refused must stay
         except OSError as error:
             raise InputError(f"{folder}: cannot be written to ({error.strerror}); name another run folder") from None
         try:
@@ -76,9 +73,9 @@ def _make(folder: Path, numbered: bool) -> Path:
             free = folder.with_name(f"{folder.name}-{number}")
 
 
-def _clear(folder: Path, only_runs: bool, beside: set[str]) -> None:
+def _clear(folder: Path, only_runs: bool) -> None:
     """Remove files of a killed run, and check that the folder is empty and writable."""
-    paths = [path for path in folder.iterdir() if path.name not in beside]
+    paths = [*folder.iterdir()]
     names = {path.name for path in paths}
     if only_runs and LAST not in names:
         for path in paths:

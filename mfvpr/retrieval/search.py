@@ -1,7 +1,7 @@
 """Search by global descriptors -> Shortlist: exact, in chunks, optionally after whitening."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -49,12 +49,9 @@ class ExactSearch:
     Attributes:
         memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
             None = a sixteenth of the free memory. The result does not depend on it, in any bit.
-        spread: function with the same result, such as `mfvpr.evaluation.distributed.retrieve_everywhere`; None = search
-            on one device.
     """
 
     memory: float | None = None
-    spread: Callable[..., Shortlist] | None = field(default=None, metadata={"recipe": False})
 
     def fit(self, database: Database) -> "ExactSearch":
         """Return itself: there is nothing to learn."""
@@ -77,8 +74,6 @@ class ExactSearch:
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
             raise InputError(f"excluded: expected rows for {len(queries)} queries and {len(database)} database images, "
                              f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
-        if self.spread is not None:
-            return self.spread(queries, database, num_candidates=num_candidates, excluded=excluded)
         chunk_size = self._chunk_size(len(queries), min(len(database), ROWS))
         shortlists = []
         for part in _parts(len(queries), chunk_size):

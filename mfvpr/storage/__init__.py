@@ -1,7 +1,7 @@
 """The cache of features and matches on disk, its file formats, and shards.
 
 Read first: feature_cache (what is cached for a folder of images), rows (a store: one file per image), features,
-vectors, matches, scores, map_entries and maps (formats of rows), manifest (what a store belongs to), shards.
+vectors, matches, map_entries and maps (formats of rows), manifest (what a store belongs to), shards.
 
 Imports datasets, features, matching, types, utils.
 """

@@ -64,9 +64,8 @@ class FeatureCache:
         track: label -> progress bar of the next loop.
         tell: called with one line: the work to be done and the disk space it takes, or a warning about images.
         wait: wait for another process that writes the same store, instead of raising.
-        shard: extracts its own images alone, and reads the rest from the stores of other shards. It waits `patience`
-            seconds for them before it raises `mfvpr.storage.shards.NotYet`. It needs a root.
-        patience: seconds, see `shard`.
+        shard: extracts its own images alone, and reads the rest from the stores of other shards; see
+            `mfvpr.storage.shards`. It needs a root.
         watch: counts the extraction of local features as the stage `features`.
     """
 
@@ -76,7 +75,6 @@ class FeatureCache:
     tell: Callable[[str], None] = lambda line: None
     wait: bool = False
     shard: Shard | None = None
-    patience: float = 0.0
     watch: Stopwatch | None = None
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
@@ -230,7 +228,8 @@ class FeatureCache:
                 for sink in state.sinks:
                     if sink.store is not None:
                         stack.enter_context(sink.store)
-            state.read_bad()
+            if self.skip_bad:
+                state.read_bad()
             missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
             self._announce(extractor, state, missing, len(rows), len(folder), label)
             options = {"skip_bad": self.skip_bad, "track": self.track(label)}
@@ -242,7 +241,7 @@ class FeatureCache:
                 for line in size_lines(state.of_scales, extractor.scales):
                     self.tell(f"{label}: {line}")
         if self.shard is not None:
-            self.shard.wait(lambda: state.look(rows), folder.names, label, patience=self.patience)
+            self.shard.require_rows(state.look(rows), folder.names, label)
         if len(state.bad) == len(folder):
             raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
                              f"{state.bad[min(state.bad)]}")  # fmt: skip

@@ -77,13 +77,12 @@ class ExtractionState:
         for sink in self.sinks if self.missing(rows) else ():
             if sink.store is not None:
                 sink.store.look()
-        self.read_bad()
         return self.missing(rows)
 
     def read_bad(self) -> None:
-        """Add the bad images of all shards, which stay bad: all shards evaluate the same images."""
+        """Add the bad images of all shards, which stay bad: all runs evaluate the same images."""
         store = self.sinks[0].store
-        if store is None or store.shard is None:
+        if store is None:
             return
         with disk_errors_as_input_errors(store.folder, store.kind.content):
             for path in sorted((store.folder / SHARDS).glob(f"*-of-*/{_BAD}")):

@@ -53,7 +53,6 @@ class Kind:
 
 
 FEATURES = Kind("feature store", 3, "features", "images", "extracts", compress=False)
-SCORES = Kind("score store", 1, "scores", "queries", "scores", compress=False)
 VECTORS = Kind("descriptor store", 1, "global descriptors", "images", "describes", compress=False)
 MATCHES = Kind("match store", 3, "matches", "queries", "matches", compress=True)
 

@@ -1,18 +1,19 @@
 """Shards of one evaluation on many machines: a hash of its name assigns every image and query to a shard.
 
-    cache = FeatureCache(root, shard=Shard(2, 8))
-    mfvpr.evaluate(dataset, extractor, filter, scorers, cache=cache)  # NotYet, until all eight are done
+    try:
+        cache = FeatureCache(root, shard=Shard(2, 8))
+        mfvpr.evaluate(dataset, extractor, filter, scorers, cache=cache)
+    except NotYet as progress:
+        print(progress, progress.is_complete)
 
-Each shard extracts its own images, then matches and scores its own queries. It raises `NotYet` when it needs rows that
-other shards have not written; started again, it goes on from there. The last shard finds all rows and returns the
-result. All shards use the candidates of the first shard, even if their machines would round otherwise. Stores are named
-by the recipes of scorers and extractors, not by the functions that they call: after a change there, use another root.
+A shard extracts its own images, then matches its own queries, and always ends with `NotYet`. If features of other
+shards are missing, start it again when they are there. When all shards are complete, `evaluate` with
+`FeatureCache(root)` reads features and matches, and returns the result. All runs use the candidates of the first shard,
+even if their machines would round otherwise.
 """
 
 import hashlib
-import math
 import re
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,21 +21,24 @@ from typing import Any
 from mfvpr.utils.errors import InputError
 
 MOST = 9999  # shards
-POLL = 1.0  # seconds between two looks at the rows of other shards
 
 
 class NotYet(Exception):
-    """Rows of other shards are missing; its text is one line that names the rows and the shards.
+    """The end of a shard's work; its text is one line: what is done, or which rows of which shards are missing.
 
     Attributes:
         shards: with missing rows.
-        is_complete: whether this shard has nothing left to do.
     """
 
-    def __init__(self, message: str, shards: Iterable[int] = (), *, is_complete: bool = False) -> None:
-        """Take the message and the attributes."""
+    def __init__(self, message: str, shards: Iterable[int] = ()) -> None:
+        """Take the message and the shards."""
         super().__init__(message)
-        self.shards, self.is_complete = frozenset(shards), is_complete
+        self.shards = frozenset(shards)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether this shard has nothing left to do."""
+        return not self.shards
 
 
 @dataclass(frozen=True)
@@ -44,13 +48,10 @@ class Shard:
     Attributes:
         index: of this shard, from 0.
         count: number of shards.
-        meets: all shards run at the same time: each waits for the others as long as they take, and takes part in
-            common steps (`mfvpr.evaluation.distributed`) even if it does not need their result.
     """
 
     index: int
     count: int
-    meets: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -81,34 +82,11 @@ class Shard:
         return [row for row in (range(len(names)) if among is None else among)
                 if shard_of(names[row], self.count) == self.index]  # fmt: skip
 
-    def wait(
-        self,
-        missing: Callable[[], Sequence[int]],
-        names: Sequence[str],
-        what: str,
-        *,
-        patience: float = 0.0,
-        is_complete: bool = False,
-    ) -> None:
-        """Wait until other shards have written their rows.
-
-        Args:
-            missing: gives the rows that are missing now.
-            names: of all rows.
-            what: name of the rows in messages.
-            patience: seconds.
-            is_complete: see `NotYet`.
-
-        Raises:
-            NotYet: rows are still missing.
-        """
-        end = time.monotonic() + (math.inf if self.meets else patience)
-        while rows := missing():
-            if (seconds := end - time.monotonic()) <= 0:
-                shards = {shard_of(names[row], self.count) for row in rows}
-                line = f"{what}: {len(rows)} of {len(names)} are missing, of shards {indices(shards)}"
-                raise NotYet(line, shards, is_complete=is_complete)
-            time.sleep(min(POLL, seconds))
+    def require_rows(self, missing: Sequence[int], names: Sequence[str], what: str) -> None:
+        """Raise `NotYet` if rows of other shards are missing; `what` names the rows in its message."""
+        if missing:
+            shards = {shard_of(names[row], self.count) for row in missing}
+            raise NotYet(f"{what}: {len(missing)} of {len(names)} are missing, of shards {indices(shards)}", shards)
 
 
 def shard_of(name: str, count: int) -> int:
@@ -128,19 +106,18 @@ def indices(numbers: Iterable[int]) -> str:
 
 
 def together(*calls: Callable[[], Any]) -> list[Any]:
-    """The results of all calls; if one waits for other shards, the rest are called all the same.
+    """The results of all calls; if one ends with `NotYet`, the rest are called all the same.
 
     Raises:
-        NotYet: for all calls that wait.
+        NotYet: for all calls that lack rows, or else for all that are complete.
     """
-    results, waits = [], []
+    results, ends = [], []
     for call in calls:
         try:
             results.append(call())
-        except NotYet as error:
-            waits.append(error)
-    if waits:
-        lines = dict.fromkeys(map(str, waits))
-        shards = frozenset[int]().union(*(wait.shards for wait in waits))
-        raise NotYet("; ".join(lines), shards, is_complete=all(wait.is_complete for wait in waits))
+        except NotYet as end:
+            ends.append(end)
+    if ends:
+        lines = dict.fromkeys(str(end) for end in [end for end in ends if not end.is_complete] or ends)
+        raise NotYet("; ".join(lines), frozenset[int]().union(*(end.shards for end in ends)))
     return results

@@ -3,7 +3,6 @@
 They are `flock` locks of a handle: two blocks of one process exclude each other as two processes do.
 """
 
-import fcntl
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -38,19 +37,3 @@ def lock_folder(folder: Path, error: Exception) -> AbstractContextManager[int]:
         raise error
 
     return lock(folder, os.O_RDONLY | os.O_DIRECTORY, refuse)
-
-
-def is_locked(path: Path) -> bool:
-    """Whether a lock file exists and is held."""
-    try:
-        handle = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        # A shared lock, which `filelock` does not have: two processes that ask must not take each other for the holder.
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(handle)
-    return False

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from mfvpr.utils.locks import is_locked, lock, lock_folder
+from mfvpr.utils.locks import lock, lock_folder
 
 HOLD = ("import fcntl, os, sys\n"
         "handle = os.open(sys.argv[1], os.O_RDONLY)\n"
@@ -62,13 +62,3 @@ def test_a_conflict_without_an_error_waits(tmp_path):
         order.append("first")
     other.join(timeout=30)
     assert order == ["waits", "first", "second"]
-
-
-def test_is_locked_does_not_take_the_lock(tmp_path):
-    path = tmp_path / "lock"
-    assert not is_locked(path)
-    with lock(path, os.O_RDWR | os.O_CREAT, refuse):
-        assert is_locked(path)
-    with path.open() as asking:
-        fcntl.flock(asking, fcntl.LOCK_SH)
-        assert not is_locked(path)
