@@ -1,4 +1,4 @@
-"""Shards: many machines that share an evaluation without a word between them, whatever order they come in."""
+"""Shards: many machines fill one store, in any order, and a run without shards gives the results."""
 
 import hashlib
 import json
@@ -9,19 +9,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import mfvpr
 from mfvpr.datasets import folder_dataset, sequences_dataset
-from mfvpr.evaluation import match_sequence
 from mfvpr.features import Aggregated, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Filtered, Retrieval
 from mfvpr.storage import FeatureCache, NotYet, Shard
-from mfvpr.storage.shards import shard_of
+from mfvpr.storage.shards import indices, shard_of, together
 from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
-from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.utils.arrays import read_arrays
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales
 
 pytestmark = pytest.mark.thorough
@@ -43,17 +44,17 @@ def plain(dataset, tmp_path_factory):
 
 
 def shared(root, count, run, seed=0):
-    """Shards in a random order, again and again, as schedulers start them; the result of whichever comes last."""
+    """Start shards in a random order until all are complete; the result of a run without shards, and the lines."""
     random.seed(seed)
-    waits, results = [], []
-    while not results:
+    incomplete, lines = {*range(count)}, []
+    while incomplete:
         for index in random.sample(range(count), count):
-            try:
-                results.append(run(FeatureCache(root, shard=Shard(index, count))))
-            except NotYet as wait:
-                waits.append(str(wait))
-        assert len(waits) < 8 * count
-    return results, waits
+            with pytest.raises(NotYet) as end:
+                run(FeatureCache(root, shard=Shard(index, count)))
+            incomplete -= {index} if end.value.is_complete else set()
+            lines.append(str(end.value))
+        assert len(lines) < 8 * count
+    return run(FeatureCache(root)), lines
 
 
 def assert_same(report, expected):
@@ -75,25 +76,24 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
     def run(cache):
         return mfvpr.evaluate(dataset, extractor, filter, SCORERS, cache=cache, **HOW)
 
-    results, waits = shared(tmp_path, count, run)
-    for result in results:
-        assert_same(result, plain)
-    assert extractor.seen == len(dataset.database) + len(dataset.queries)  # each image once, by whomever
-    assert bool(waits) == (count > 1)
-    assert all(re.search(r"of \d+ are missing, of shards \d", wait) for wait in waits)
-    again = mfvpr.evaluate(dataset, extractor, filter, SCORERS, cache=FeatureCache(tmp_path), **HOW)
-    assert_same(again, plain)  # of anybody who is no shard: nothing is done again
-    assert extractor.seen == len(dataset.database) + len(dataset.queries)
+    result, lines = shared(tmp_path, count, run)
+    assert_same(result, plain)
+    assert extractor.seen == len(dataset.database) + len(dataset.queries)  # each image once
+    assert lines[-1] == "its images and queries are done"
+    missing = [line for line in lines if line != lines[-1]]
+    assert bool(missing) == (count > 1)
+    assert all(re.search(r"of \d+ are missing, of shards \d", line) for line in missing)
+    assert {path.parent.parent.name for path in tmp_path.rglob("[0-9]*-*.npz")} == {"shards"}
 
 
 def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     """With a filter of its own descriptors, as for a single machine."""
     filter, plain_root = Retrieval(Mean()), tmp_path / "plain"
     expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=FeatureCache(plain_root))
-    results, _ = shared(
+    result, _ = shared(
         tmp_path / "s", 3, lambda cache: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=cache)
     )
-    assert_same(results[0], expected)
+    assert_same(result, expected)
 
     def files(root):
         return sorted(path.name for path in root.rglob("*-*.npz") if path.name[0].isdigit() and "Sift" in str(path))
@@ -113,21 +113,21 @@ def test_several_sequences_and_scales_and_more_shards_than_images(small_street, 
         several, extractor, Retrieval(extractor), SCORERS, cache=FeatureCache(tmp_path / "s"), **how
     )
     for count in (3, 17):
-        results, _ = shared(
+        result, _ = shared(
             tmp_path / f"s{count}", count,
             lambda cache: mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, cache=cache, **how),
         )  # fmt: skip
-        assert_same(results[0], expected)
+        assert_same(result, expected)
 
 
-@pytest.mark.parametrize("store", ["Sift", "matches", "scores"])
+@pytest.mark.parametrize("store", ["Sift", "matches"])
 def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
     def run(cache):
         try:
             return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
-        except InputError as error:  # the row is removed, and its shard makes it again
+        except InputError as error:  # the row is removed, and made again
             messages.append(str(error))
-            raise NotYet(str(error)) from None
+            return run(cache)
 
     messages = []
     expected = run(FeatureCache(tmp_path / "plain"))
@@ -135,35 +135,12 @@ def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
     rows = [path for path in (tmp_path / "s").glob(f"{store}-*/shards/*/[0-9]*-*.npz") if "-0.npz" not in path.name]
     rows[0].write_bytes(b"damaged")
     if store == "Sift":  # which nobody reads again, unless what is made of it is gone
-        for path in (tmp_path / "s").glob("[ms]*-*"):
-            shutil.rmtree(path)
-    elif store == "matches":
-        [row] = (tmp_path / "s").glob(f"scores-*/shards/*/{rows[0].name.partition('-')[0]}-*.npz")
-        row.unlink()
-    results, _ = shared(tmp_path / "s", 2, run)
-    assert_same(results[0], expected)
+        [matches] = (tmp_path / "s").glob("matches-*")
+        shutil.rmtree(matches)
+    result, _ = shared(tmp_path / "s", 2, run)
+    assert_same(result, expected)
     assert len(messages) == 1
     assert "are damaged on disk, the first in row" in messages[0]
-
-
-def test_scores_are_known_by_their_scorers_and_candidates(dataset, split, small_street, tmp_path):
-    """Whatever the order of the scorers, and the weights of the scales, which no feature depends on."""
-    cache = FeatureCache(tmp_path, shard=Shard(0, 1))
-    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
-    turned = mfvpr.evaluate(dataset, SIFT, VLAD, dict(reversed(SCORERS.items())), candidates=3, cache=cache)
-    assert [*turned.systems] == ["filter", "count", "histogram"]
-    assert_same(turned, first)
-    for weight in (1.0, 5.0):
-        extractor = TwoScales(weight)
-        how = (dataset, extractor, Retrieval(extractor), SCORERS)
-        assert_same(mfvpr.evaluate(*how, cache=cache), mfvpr.evaluate(*how, cache=FeatureCache(tmp_path / "plain")))
-    for path in tmp_path.glob("matches-*/shortlist.npz"):
-        arrays = read_arrays(path, path.parent.name)
-        write_arrays(path, arrays | {"indices": np.roll(arrays["indices"], 1, axis=0)}, path.parent.name)
-    for path in tmp_path.glob("matches-*/shards/*/*.npz"):
-        path.unlink()
-    with pytest.raises(InputError, match=r"scores .*candidates.*shortlist"):
-        mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
 
 
 class Drawn:
@@ -178,27 +155,16 @@ class Drawn:
 
 
 def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
-    results, _ = shared(
-        tmp_path, 3, lambda cache: mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, cache=cache)
-    )
-    paths = [path for path in tmp_path.glob("matches-*/shortlist.npz")]
-    indices = read_arrays(paths[0], paths[0].parent.name)["indices"]
-    np.testing.assert_array_equal(results[0].matched[0].candidates.indices, indices)
+    def run(cache):
+        return mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, cache=cache)
 
-
-def test_rows_are_those_of_queries(dataset):
-    for wrong in ([-1], [99]):
-        with pytest.raises(InputError, match=r"rows: expected rows of 10 queries, got \["):
-            match_sequence(dataset, dataset.only, SIFT, VLAD, 3, rows=wrong)
-
-
-UNKNOWN = {"own": lambda matches: matches.mask.sum() * 1.0}
-
-
-@pytest.mark.parametrize("scorers, words", [({}, "scorers: expected at least one"), (UNKNOWN, "own: a shard keeps")])
-def test_scorers_that_no_store_can_know(dataset, tmp_path, scorers, words):
-    with pytest.raises(InputError, match=words):
-        mfvpr.evaluate(dataset, SIFT, VLAD, scorers, candidates=3, cache=FeatureCache(tmp_path, shard=Shard(0, 1)))
+    result, _ = shared(tmp_path, 3, run)
+    [path] = tmp_path.glob("matches-*/shortlist.npz")
+    expected = read_arrays(path, path.parent.name)["indices"]
+    np.testing.assert_array_equal(result.matched[0].candidates.indices, expected)
+    for row in path.parent.glob("shards/1-of-3/[0-9]*-*.npz"):  # a run without shards matches what is missing
+        row.unlink()
+    np.testing.assert_array_equal(run(FeatureCache(tmp_path)).matched[0].candidates.indices, expected)
 
 
 def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
@@ -219,10 +185,12 @@ def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
             cache = replace(cache, skip_bad=True)
             return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=cache)
         finally:
-            broken[0] = False if cache.shard.index == shard_of("0003.png", 2) else broken[0]
+            broken[0] &= cache.shard is None or cache.shard.index != shard_of("0003.png", 2)
 
-    results, _ = shared(tmp_path, 2, run)
-    for result in results:
+    first, _ = shared(tmp_path, 2, run)
+    [matches] = tmp_path.glob("matches-*")
+    shutil.rmtree(matches)
+    for result in (first, run(FeatureCache(tmp_path))):
         assert result.matched[0].bad_database.keys() == {3}
         assert not (result.matched[0].candidates.indices == 3).any()
 
@@ -237,8 +205,8 @@ def test_stores_of_shards_have_the_same_rows_byte_by_byte(dataset, tmp_path):
     def hashes(root):
         return {
             (path.relative_to(root).parts[0], path.name): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in root.rglob("[0-9]*-*.npz") if not path.relative_to(root).parts[0].startswith("scores")
-        }  # fmt: skip
+            for path in root.rglob("[0-9]*-*.npz")
+        }
 
     assert hashes(tmp_path / "shards") == hashes(tmp_path / "plain")
     for path in (tmp_path / "shards").glob("*/shards/*"):
@@ -260,13 +228,16 @@ def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
 
     expected = run(FeatureCache(tmp_path / "plain"))
     for count in (2, 4):
-        results, _ = shared(tmp_path / f"s{count}", count, run)
-        assert_same(results[0], expected)
-        assert results[0].matched[0].bad_database.keys() == {2}
+        result, _ = shared(tmp_path / f"s{count}", count, run)
+        assert_same(result, expected)
+        assert result.matched[0].bad_database.keys() == {2}
     [bad] = (tmp_path / "s2").glob("Sift*/shards/*/bad.json")
     bad.write_text("[]")
-    with pytest.raises(InputError, match=r"bad\.json: expected reasons by row"):
-        run(FeatureCache(tmp_path / "s2", shard=Shard(0, 3)))
+    [matches] = (tmp_path / "s2").glob("matches-*")
+    shutil.rmtree(matches)
+    for shard in (Shard(0, 3), None):
+        with pytest.raises(InputError, match=r"bad\.json: expected reasons by row"):
+            run(FeatureCache(tmp_path / "s2", shard=shard))
 
 
 def test_stores_of_two_shards_are_written_at_the_same_time_those_of_one_are_not(tmp_path):
@@ -291,3 +262,59 @@ def test_stores_of_two_shards_are_written_at_the_same_time_those_of_one_are_not(
 def test_a_shard_needs_a_folder():
     with pytest.raises(InputError, match="shard=0/2: expected a root as well"):
         FeatureCache(shard=Shard(0, 2))
+
+
+@given(st.lists(st.text(st.characters(codec="utf-8"), min_size=1), unique=True), st.integers(1, 20), st.randoms())
+def test_every_name_is_of_one_shard_whatever_the_order(names, count, rng):
+    rows = [Shard(index, count).rows(names) for index in range(count)]
+    assert sorted(row for rows_of_shard in rows for row in rows_of_shard) == [*range(len(names))]
+    shuffled = [*names]
+    rng.shuffle(shuffled)
+    for index, rows_of_shard in enumerate(rows):
+        assert {shuffled[row] for row in Shard(index, count).rows(shuffled)} == {names[row] for row in rows_of_shard}
+    assert Shard(0, count).rows(names, range(len(names))[:1]) == [row for row in rows[0] if row == 0]
+
+
+def test_names_are_spread_and_assigned_for_ever():
+    names = [f"image{row:04d}.jpg" for row in range(8000)]
+    sizes = np.array([len(Shard(index, 8).rows(names)) for index in range(8)])
+    assert abs(sizes - 1000).max() < 5 * np.sqrt(1000)
+    digest = hashlib.sha256(b"image0000.jpg").digest()
+    assert shard_of("image0000.jpg", 8) == int.from_bytes(digest[:8], "big") % 8
+    assert shard_of("\udcff.jpg", 7) == int.from_bytes(hashlib.sha256(b"\xff.jpg").digest()[:8], "big") % 7
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1", "1/", "/2", "2/2", "-1/2", "0/0", "1.0/2", "0/99999", "0/2/3", " 0/2", "a/b"]
+)
+def test_what_is_no_shard(text):
+    with pytest.raises(InputError, match=r"^shard="):
+        Shard.parse(text)
+
+
+def test_array_expressions():
+    assert indices([]) == ""
+    assert indices([4, 2, 3, 0, 3]) == "0,2-4"
+    assert str(Shard.parse("03/8")) == "3/8"
+
+
+@pytest.mark.parametrize(
+    "ends, message, shards",
+    [
+        ([("a", {1, 2}), ("done", ()), ("b", {4}), ("a", {1})], "a; b", {1, 2, 4}),
+        ([("done", ()), ("done", ())], "done", set()),
+    ],
+)
+def test_what_is_missing_does_not_keep_the_rest(ends, message, shards):
+    """A shard is complete if all that it does is."""
+    calls = []
+
+    def end(line, shards):
+        calls.append(line)
+        raise NotYet(line, shards)
+
+    with pytest.raises(NotYet, match=f"^{message}$") as error:
+        together(lambda: calls.append("first"), *(lambda of=of: end(*of) for of in ends))
+    assert calls == ["first", *(line for line, _ in ends)]
+    assert (error.value.shards, error.value.is_complete) == (shards, not shards)
+    assert together(lambda: 1, lambda: 2) == [1, 2]
