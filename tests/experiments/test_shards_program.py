@@ -91,12 +91,12 @@ def test_wrong_settings(evaluate, typed_in, words):
 
 def test_the_same_shard_twice_at_the_same_time_is_refused(evaluate, tmp_path):
     assert evaluate("shard=1/2")[0] == 0
-    for store in tmp_path.glob("store/Sift-*"):
-        (store / "shards" / "0-of-2").mkdir()
-        with lock_store(store / "shards" / "0-of-2", "features"):
-            code, _, error = evaluate("shard=0/2")
-        assert code == 2
-        assert f"{store}/shards/0-of-2: in use by process {os.getpid()}" in error
+    folder = next(tmp_path.glob("store/Sift-*")) / "shards" / "0-of-2"
+    folder.mkdir()
+    with lock_store(folder, "features"):
+        code, _, error = evaluate("shard=0/2")
+    assert code == 2
+    assert f"{folder}: in use by process {os.getpid()}" in error
 
 
 def test_killed_shards_go_on(settings, plain, tmp_path):
