@@ -15,8 +15,8 @@ def feature(seed, count=30, dimension=16):
     return type(features)(**(vars(features) | {"image_size": np.array(SIZE, np.float32)}))
 
 
-def features_of(num_images, **settings):
-    return [feature(seed, **settings) for seed in range(num_images)]
+def features_of(num_images):
+    return [feature(seed) for seed in range(num_images)]
 
 
 def hloc_parts(features, half=True):
@@ -40,11 +40,10 @@ def append_hloc(path, name, parts, uncertainty=1.0):
             group["keypoints"].attrs["uncertainty"] = uncertainty
 
 
-def write_hloc(path, names, features, half=True, change=None):
-    """A file of hloc; `change` may alter the parts of an image."""
-    for name, image_features in zip(names, features, strict=True):
-        parts = hloc_parts(image_features, half)
-        append_hloc(path, name, parts if change is None else change(name, parts))
+def write_hloc(path, names, features=None, half=True):
+    """A file of hloc, of random features by default."""
+    for name, image_features in zip(names, features or features_of(len(names)), strict=True):
+        append_hloc(path, name, hloc_parts(image_features, half))
     return path
 
 

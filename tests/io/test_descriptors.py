@@ -1,6 +1,5 @@
 """Global descriptors: rows in the data set's order, whatever the file's."""
 
-import h5py
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +8,8 @@ from hypothesis import strategies as st
 from mfvpr import InputError
 from mfvpr.io import read_global_descriptors, write_global_descriptors
 from tests.builders import unit
+from tests.io.checks import one_line_error
+from tests.io.other_programs import append_hloc
 
 NAMES = ["image2.jpg", "image10.jpg", "sub/image 1.jpg"]  # in natural order; Python sorts 10 before 2
 
@@ -20,9 +21,9 @@ def descriptors():
 
 def test_npy_is_in_sorted_order(tmp_path, descriptors):
     np.save(tmp_path / "g.npy", descriptors)  # of image10, image2, sub/image 1
-    np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npy", NAMES), descriptors[[1, 0, 2]])
     np.savez(tmp_path / "g.npz", descriptors=descriptors)
-    np.testing.assert_array_equal(read_global_descriptors(tmp_path / "g.npz", NAMES), descriptors[[1, 0, 2]])
+    for file in ("g.npy", "g.npz"):
+        np.testing.assert_array_equal(read_global_descriptors(tmp_path / file, NAMES), descriptors[[1, 0, 2]])
 
 
 def test_npz_with_names(tmp_path, descriptors):
@@ -33,11 +34,8 @@ def test_npz_with_names(tmp_path, descriptors):
 
 def hloc(path, names, descriptors):
     """As hloc writes global features: float16, with the size of the image."""
-    for name, vector in zip(names, descriptors, strict=True):
-        with h5py.File(path, "a", libver="latest") as file:
-            group = file.create_group(name)
-            group.create_dataset("global_descriptor", data=vector.astype(np.float16))
-            group.create_dataset("image_size", data=np.array([640, 480]))
+    for name, vector in zip(names, descriptors.astype(np.float16), strict=True):
+        append_hloc(path, name, {"global_descriptor": vector, "image_size": np.array([640, 480])})
     return path
 
 
@@ -108,19 +106,16 @@ def test_what_is_refused(tmp_path, file, arrays, message):
         np.savez(path, **arrays)
     else:
         np.save(path, arrays)
-    with pytest.raises(InputError, match=message) as error:
+    with one_line_error(message, file):
         read_global_descriptors(path, NAMES)
-    assert file in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_what_is_refused_of_hloc(tmp_path, descriptors):
     path = hloc(tmp_path / "g.h5", NAMES, descriptors)
     with pytest.raises(InputError, match=r"all 4 images, got 3; .*x\.jpg"):
         read_global_descriptors(path, [*NAMES, "x.jpg"])
-    with h5py.File(path, "a") as file:
-        file.create_group("x.jpg")["global_descriptor"] = np.ones(9, np.float16)
-        file.create_group("y.jpg")["keypoints"] = np.ones((9, 2), np.float16)
+    append_hloc(path, "x.jpg", {"global_descriptor": np.ones(9, np.float16)})
+    append_hloc(path, "y.jpg", {"keypoints": np.ones((9, 2), np.float16)})
     with pytest.raises(InputError, match=r"x\.jpg: .*global_descriptor \[D\].* got \[9\]"):
         read_global_descriptors(path, [*NAMES, "x.jpg"])
     with pytest.raises(InputError, match=r"y\.jpg: .*global_descriptor \[D\].* got none"):

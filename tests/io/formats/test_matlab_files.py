@@ -13,8 +13,8 @@ from mfvpr.checkpoints.networks import network_of, plan_network
 from mfvpr.checkpoints.tables import NETVLAD_MATLAB
 from mfvpr.networks import VggNetVlad
 from mfvpr.utils import InputError
-from tests.checkpoints.test_checkpoint import assert_arrays_or_one_line, random_changes
-from tests.random_checkpoints import cell, matlab_netvlad, matlab_shapes, random_checkpoint, write_matlab
+from tests.checkpoints.test_checkpoint import assert_arrays_or_one_line, random_changes, refused
+from tests.random_checkpoints import cell, matlab_netvlad, matlab_shapes, write_matlab
 
 pytestmark = pytest.mark.thorough
 
@@ -57,12 +57,6 @@ def test_signs_and_axes(tmp_path):
     np.testing.assert_allclose(parameters["average"], [123.68, 116.779, 103.939], rtol=1e-6)
 
 
-def refused(path, words):
-    with pytest.raises(InputError, match=words) as error:
-        read_checkpoint(path)
-    assert "\n" not in str(error.value)
-
-
 def test_cut_and_changed_files_are_arrays_or_one_line(tmp_path):
     unpacked = write_matlab(tmp_path / "a.mat", CONTENT, packed=False).read_bytes()
     packed = write_matlab(tmp_path / "a.mat", CONTENT).read_bytes()
@@ -98,22 +92,14 @@ def test_depth_is_bounded_before_anything_is_read(tmp_path):
     [(name, array)] = read_checkpoint(path).items()
     assert (name.count(".0"), array.tolist()) == (5, [[5]])
     path.write_bytes(HEADER + nested(20_000))
-    refused(path, "expected layers of arrays, got deeper structures")
+    assert "expected layers of arrays, got deeper structures" in refused(path)
 
 
 def test_large_content_and_other_versions_are_refused(tmp_path):
     path = tmp_path / "a.mat"
     path.write_bytes(HEADER + element(15, zlib.compress(bytes(200_000_000), 9)))
-    refused(path, r"expected at most 20 times its \d+,\d+ bytes")
+    assert "expected at most 20 times its " in refused(path)
     path.write_bytes(b"MATLAB 7.3 MAT-file, Platform".ljust(124) + b"\0\2IM" + bytes(1000))
-    refused(path, "expected a MATLAB file of version 5, got 7.3; save it with -v7")
+    assert "expected a MATLAB file of version 5, got 7.3; save it with -v7" in refused(path)
     path.write_bytes(b"MATLAB".ljust(200, b"\1"))
-    refused(path, "this checkpoint is damaged")
-
-
-def test_another_networks_file_is_told(tmp_path):
-    other = {"net": {"layers": cell([{"weights": cell([*random_checkpoint({"a": (3, 3, 3, 4)}).values()])}])}}
-    read = read_checkpoint(write_matlab(tmp_path / "a.mat", other))
-    plan = plan_network(network_of(entry_of("netvlad_tokyotm")).builder())
-    with pytest.raises(InputError, match=r"keys do not fit the network: .*missing"):
-        convert(read, NETVLAD_MATLAB, plan.shapes)
+    assert "this checkpoint is damaged" in refused(path)

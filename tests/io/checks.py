@@ -1,0 +1,29 @@
+"""Expectations of many tests: errors of one line, and little memory."""
+
+import tracemalloc
+from contextlib import contextmanager
+
+import pytest
+
+from mfvpr import InputError
+
+
+@contextmanager
+def one_line_error(message=None, *words):
+    """Expects an error of one line that matches `message` and contains `words`."""
+    with pytest.raises(InputError, match=message) as error:
+        yield
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+    assert all(word in str(error.value) for word in words)
+
+
+@contextmanager
+def memory_below(limit):
+    """Expects that Python and NumPy never hold more than `limit` bytes."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
