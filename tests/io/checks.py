@@ -14,7 +14,7 @@ def one_line_error(message=None, *words):
     with pytest.raises(InputError, match=message) as error:
         yield
     assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 600
+    assert len(str(error.value)) < 400
     assert all(word in str(error.value) for word in words)
 
 
