@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.io import savemat
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 
@@ -296,15 +297,12 @@ def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> di
                           tensors[f"encoder.{position}.bias"][None]] for position in _VGG16}  # fmt: skip
     weights[30] = [tensors["pool.conv.weight"][:, :, 0, 0].T, -tensors["pool.centroids"].T]
     weights[33] = [tensors["WPCA.0.weight"][:, :, 0, 0].T[None, None], tensors["WPCA.0.bias"][None]]
-    layers = np.empty((1, 35), object)
-    for position in range(35):
-        layer: dict[str, Any] = {"name": f"layer{position}", "type": "conv" if position in weights else "relu"}
-        if position in weights:
-            layer["weights"] = cell(weights[position])
-        layers[0, position] = layer
+    layers = [{"name": f"layer{position}", "type": "relu"} for position in range(35)]
+    for position, arrays in weights.items():
+        layers[position] |= {"type": "conv", "weights": cell(arrays)}
     average = np.broadcast_to(np.float32([123.68, 116.779, 103.939]), (6, 5, 3)).copy()
     meta = {"normalization": {"averageImage": average, "imageSize": np.float64([[5, 6, 3]])}, "classes": "none"}
-    return {"net": {"layers": layers, "meta": meta}}
+    return {"net": {"layers": cell(layers), "meta": meta}}
 
 
 def cell(parts: list[Any]) -> np.ndarray:
@@ -316,8 +314,6 @@ def cell(parts: list[Any]) -> np.ndarray:
 
 def write_matlab(path: Path, content: dict[str, Any], *, packed: bool = True) -> Path:
     """A .mat file of version 5."""
-    from scipy.io import savemat
-
     savemat(path, content, do_compression=packed)
     return path
 

@@ -69,9 +69,6 @@ def test_what_is_wrong_is_counted_by_kind_with_an_example_of_each(source):
     assert "2 unknown (net.conv.kernel)" in text
     assert "2 missing (conv.kernel)" in text
     assert "3 of another shape (net.bn.weight: expected (4,), got (7,))" in text
-    source = random_checkpoint(SOURCE_SHAPES)
-    source["net.mix.0.weight"] = source["net.mix.0.weight"].T
-    assert "1 of another shape (net.mix.0.weight: expected (5, 4), got (4, 5))" in message(source)
 
 
 def test_filled_twice_and_ambiguous_rules(source):
@@ -222,7 +219,6 @@ def test_real_weights_are_the_registrys_and_convert(name):
 
 
 def test_registry():
-    assert all(name == entry.name for name, entry in REGISTRY.items())
     assert len({entry.file for entry in REGISTRY.values()}) == len(REGISTRY)
     assert NETWORKS.keys() == REGISTRY.keys()
     hashes = [entry.sha256 for entry in REGISTRY.values() if entry.sha256]

@@ -4,6 +4,8 @@ import hashlib
 import json
 import pickle
 import struct
+from functools import partial
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,9 +19,16 @@ from tests.random_checkpoints import d2net_shapes, random_checkpoint, write_lega
 
 
 @pytest.fixture
-def installed(folder, arrays, tmp_path):
-    (tmp_path / "tiny.pth").write_bytes(b"the source")
-    return save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+def save_tiny(folder, tmp_path):
+    """Saves arrays as `tiny`."""
+    source = tmp_path / "tiny.pth"
+    source.write_bytes(b"the source")
+    return partial(save, "tiny", source=source, parameters=PARAMETERS)
+
+
+@pytest.fixture
+def installed(save_tiny, arrays):
+    return save_tiny(arrays)
 
 
 def refused(words, name="tiny"):
@@ -34,7 +43,7 @@ def refused(words, name="tiny"):
     assert (str(copied), copied.entry) == (message, caught.value.entry)
 
 
-def test_saved_arrays_come_back(installed, folder, arrays, tmp_path):
+def test_saved_arrays_come_back(installed, folder, arrays, save_tiny):
     assert installed == folder / "tiny.safetensors"
     loaded = load("tiny")
     assert loaded.keys() == arrays.keys()
@@ -48,7 +57,7 @@ def test_saved_arrays_come_back(installed, folder, arrays, tmp_path):
         "source_file": "tiny.pth", "source_sha256": hashlib.sha256(b"the source").hexdigest(),
         "format": 1, "rounded": 0,
     }  # fmt: skip
-    save("tiny", dict(reversed(arrays.items())), tmp_path / "tiny.pth", parameters=PARAMETERS)
+    save_tiny(dict(reversed(arrays.items())))
     assert installed.read_bytes() == content
 
 
@@ -58,15 +67,13 @@ def test_model(installed, arrays):
     np.testing.assert_array_equal(model.mix[1].bias[...], arrays["mix.1.bias"])
     np.testing.assert_array_equal(model.bn.var[...], arrays["bn.var"])
     image = np.random.default_rng(0).standard_normal((1, 6, 6, 3)).astype(np.float32)
-    once, again = model(image), model(image)
-    np.testing.assert_array_equal(once, again)  # evaluation mode: no statistics are gathered
-    assert once.shape == (1, 6, 6, 2)
+    np.testing.assert_array_equal(model(image), model(image))  # evaluation mode: no statistics are gathered
 
 
-def test_arrays_of_another_network_are_refused(installed, arrays, tmp_path):
+def test_arrays_of_another_network_are_refused(save_tiny, arrays):
     arrays["conv.extra"] = arrays.pop("conv.bias")
     arrays["mix.0.kernel"] = arrays["mix.0.kernel"].T
-    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    save_tiny(arrays)
     with pytest.raises(InputError, match=r"tiny\.safetensors: keys") as caught:
         load_model("tiny")
     assert all(name in str(caught.value) for name in ("conv.extra", "mix.0.kernel", "conv.bias", "install it again"))
@@ -127,22 +134,14 @@ def test_what_is_no_safetensors_file_is_refused_even_with_its_hash(installed, co
     assert str(caught.value).startswith(f"{installed}: ")
 
 
-def test_a_crash_between_file_and_manifest_leaves_nothing_that_looks_complete(folder, arrays, tmp_path, monkeypatch):
-    (tmp_path / "tiny.pth").write_bytes(b"the source")
-
-    def crash(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(files, "write_text", crash)
-        with pytest.raises(KeyboardInterrupt):
-            save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+def test_a_crash_between_file_and_manifest_leaves_nothing_that_looks_complete(arrays, save_tiny):
+    with patch.object(files, "write_text", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+        save_tiny(arrays)
     refused("there is no manifest")
-    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
-    with monkeypatch.context() as patch:
-        patch.setattr(files, "write_text", crash)
-        with pytest.raises(KeyboardInterrupt):
-            save("tiny", arrays | {"conv.bias": np.ones(4, np.float32)}, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    save_tiny(arrays)
+    arrays["conv.bias"] = np.ones(4, np.float32)
+    with patch.object(files, "write_text", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+        save_tiny(arrays)
     refused("sha256")
 
 
@@ -157,10 +156,10 @@ def test_unknown_names(folder, name):
         load(name)
 
 
-def test_values_that_are_not_finite_are_not_saved(folder, arrays, tmp_path):
+def test_values_that_are_not_finite_are_not_saved(folder, arrays, save_tiny):
     arrays["conv.bias"][1] = np.nan
     with pytest.raises(InputError, match=r"NaN or infinity in conv\.bias"):
-        save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+        save_tiny(arrays)
     assert not folder.exists()
 
 
@@ -182,13 +181,6 @@ class TestInstall:
         tensors = random_checkpoint(SOURCE_SHAPES)
         return write_zip(tmp_path / "tiny.pth", tensors), tensors
 
-    def test_whole_way(self, checkpoint):
-        path, tensors = checkpoint
-        before = path.read_bytes()
-        install(path, "tiny")
-        np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
-        assert path.read_bytes() == before
-
     @pytest.mark.parametrize(
         ("tensors", "words"),
         [
@@ -196,16 +188,8 @@ class TestInstall:
             ({f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES}, "its keys begin with module."),
             ({f"layer{place}.weight": np.zeros(2) for place in range(500)}, "500 unknown (layer0.weight), 10 missing"),
             ({"net.conv.weight": np.zeros(2, np.float16)}, "got Half at net.conv."),
-            (random_checkpoint(SOURCE_SHAPES) | {"net.conv.bias": np.ones(4, np.int64)}, "got int64"),
-            (
-                {
-                    key.replace("conv.bias", "conv.bis"): array
-                    for key, array in random_checkpoint(SOURCE_SHAPES).items()
-                },
-                "1 unknown (net.conv.bis), 1 missing (conv.bias)",
-            ),
         ],
-        ids=["another network", "prefix", "unknown network", "half", "integer", "another key"],
+        ids=["another network", "prefix", "unknown network", "half"],
     )
     def test_foreign_files_are_one_short_line(self, checkpoint, folder, tensors, words):
         path, _ = checkpoint
@@ -224,8 +208,11 @@ class TestInstall:
         third = tensors["net.conv.bias"].astype(np.float64) / 3
         unused = {"net.bn.num_batches_tracked": np.array(7.0)}  # float64 as well
         write_legacy(path, tensors | {"net.conv.bias": third} | unused)
+        before = path.read_bytes()
         install(path, "tiny")
+        assert path.read_bytes() == before
         np.testing.assert_array_equal(load("tiny")["conv.bias"], third.astype(np.float32))
+        np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
         assert read_manifest("tiny").rounded == 1
 
     def test_manifests_without_the_number_of_rounded_tensors_are_read(self, checkpoint):

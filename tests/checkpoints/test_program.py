@@ -1,7 +1,6 @@
 """`python -m experiments.weights` as a user types it."""
 
 import hashlib
-import os
 import signal
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from experiments.weights import main
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
-from tests.random_checkpoints import ALIKED, layered, places365_shapes, random_checkpoint, write_numpy, write_zip
+from tests.random_checkpoints import layered, places365_shapes, random_checkpoint, write_numpy, write_zip
 
 ROOT = Path(__file__).parent.parent.parent
 CONTENT = bytes(range(256)) * 4096
@@ -87,14 +86,9 @@ except SystemExit:
         (["convert", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
         (["convert", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
         (["convert", "nowhere/aliked-n16.pth"], "nowhere/aliked-n16.pth: expected a checkpoint file"),
-        (["convert", "pitts_WPCA512.pth.tar"], "pitts_WPCA512.pth.tar: expected a checkpoint file"),
         (["verify", "d2"], "expected one of d2_tf, "),
         (["download", "d2_tf"], "d2_tf: no hash is published"),
-        (
-            ["download", "vgg16_places365"],
-            "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/Datasets/che",
-        ),
-        (["download", "vgg16_places365"], "checkpoints.zip, or the Caffe model"),
+        (["download", "vgg16_places365"], "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_code_2(refused, folder, arguments, words):
@@ -114,7 +108,7 @@ def test_list(program, folder):
     assert " ".join(lines["vgg16_places365"].split()) == expected
 
 
-def test_convert_list_verify(program, folder, tiny_checkpoint):
+def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
     assert program("verify") == (0, f"nothing is installed in {folder}\n", "")
     code, stdout, stderr = program("convert", tiny_checkpoint)
     assert (code, stderr) == (0, "")
@@ -130,6 +124,8 @@ def test_convert_list_verify(program, folder, tiny_checkpoint):
     code, stdout, _ = program("convert", write_zip(tiny_checkpoint, tensors))
     assert code == 0
     assert stdout.endswith(f"tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32\n")
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=file_sha256(tiny_checkpoint)))
+    assert program("verify") == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
 
 
 def test_missing_weights_are_answered_with_a_command(program, folder, capfd):
@@ -294,27 +290,7 @@ main()
     assert list(folder.iterdir()) == []
 
 
-def run(*arguments, **environment):
-    return subprocess.run([sys.executable, "-m", "experiments.weights", *map(str, arguments)], cwd=ROOT, text=True,
-                          capture_output=True, timeout=120, env=os.environ | environment)  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
-def test_real_weights_from_checkpoint_to_network(tmp_path):
-    place = {"MFVPR_WEIGHTS": str(tmp_path)}
-    done = run("convert", ALIKED / "aliked-n16.pth", **place)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"{tmp_path}/aliked-n16.safetensors: aliked-n16, 677,356 parameters\n"
-    done = run("verify", **place)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "aliked-n16: good, 677,356 parameters as converted\n", "")
-    wrong = run("convert", ALIKED / "aliked-n16.pth", "--as", "aliked-n16rot", **place)
-    assert wrong.returncode == 2
-    assert "got that of aliked-n16\n" in wrong.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["aliked-n16.json", "aliked-n16.safetensors"]
-
-
-def test_places365_from_numpys_file_to_network(program, refused, folder, tmp_path):
+def test_places365_from_numpys_file_to_network(program, folder, tmp_path):
     arrays = random_checkpoint(places365_shapes(full=False))
     unused = {"conv5_3.weights": np.zeros((512, 512, 3, 3), np.float32), "fc8a_1.bias": np.zeros(365)}  # float64
     path = write_numpy(tmp_path / "vgg16_places365.npy", layered(arrays | unused))
@@ -324,7 +300,3 @@ def test_places365_from_numpys_file_to_network(program, refused, folder, tmp_pat
     model = load_model("vgg16_places365")
     assert (model.vgg.conv5_2.kernel[...] == arrays["conv5_2.weights"].transpose(2, 3, 1, 0)).all()
     assert program("verify")[1].startswith("vgg16_places365: good, 12,354,880 parameters as converted, from a vgg16")
-    write_numpy(path, {"conv1_1": {"weights": Path("/")}})
-    refused("vgg16_places365.npy: it asks for pathlib.PosixPath", "convert", path)
-    write_numpy(path, layered(random_checkpoint(SOURCE_SHAPES)))
-    refused("got those of tiny", "convert", path)
