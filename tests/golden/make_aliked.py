@@ -1,13 +1,11 @@
 """Makes aliked.npz: what the public code finds. `python -m tests.golden.make_aliked CLONE WEIGHTS IMAGES`
 
-CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of its files, IMAGES that of grief_season;
-torch is needed as well. The tests read the file without. What the public code uses of torchvision and of its own
-compiled operator is written out here.
+CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of its files, IMAGES that of grief_season.
+What the public code uses of torchvision and of its own compiled operator is written out here.
 """
 
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +13,10 @@ import numpy as np
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.datasets import read_image, resize
 from tests.golden.make_d2net import projections, samples, texture
+from tests.golden.torch_networks import fill, replace_module
 from tests.random_checkpoints import random_checkpoint
 
 GOLDEN = Path(__file__).parent / "aliked.npz"
-WIDTHS = {"aliked-t16": (8, 16, 32, 64)}  # of the others 16, 32, 64, 128; the last is the descriptor's too
-POSITIONS = {"aliked-n32": 32}  # of the others 16
 
 
 class Case(NamedTuple):
@@ -50,10 +47,9 @@ REAL = (
 DRAWN = Case("aliked-t16", 300, 200, None, 0.99)
 
 
-def shapes(variant: str) -> dict[str, tuple[int, ...]]:
-    """The tensors of a checkpoint."""
-    widths, positions = WIDTHS.get(variant, (16, 32, 64, 128)), POSITIONS.get(variant, 16)
-    dimension = widths[-1]
+def smallest_shapes() -> dict[str, tuple[int, ...]]:
+    """The tensors of aliked-t16's checkpoint."""
+    widths, positions, dimension = (8, 16, 32, 64), 16, 64
     tensors: dict[str, tuple[int, ...]] = {}
     for block, (inputs, outputs) in enumerate(zip((3, *widths), widths, strict=False), start=1):
         for place, channels in ((1, inputs), (2, outputs)):
@@ -82,7 +78,7 @@ def shapes(variant: str) -> dict[str, tuple[int, ...]]:
 
 def checkpoint(case: Case, weights: Path) -> dict[str, np.ndarray]:
     """The case's weights, by the public names."""
-    return read_checkpoint(weights / f"{case.variant}.pth") if case.image else random_checkpoint(shapes(case.variant))
+    return read_checkpoint(weights / f"{case.variant}.pth") if case.image else random_checkpoint(smallest_shapes())
 
 
 def picture(case: Case, images: Path) -> np.ndarray:
@@ -132,22 +128,16 @@ def _stubs() -> None:
     import torch
     from torch import nn
 
-    def module(name: str, **contents: object) -> ModuleType:
-        sys.modules[name] = stub = ModuleType(name)
-        stub.__dict__.update(contents)
-        return stub
-
     def conv(inputs: int, outputs: int, size: int) -> nn.Module:
         return nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=False)
 
-    resnet = module("torchvision.models.resnet", conv1x1=lambda *widths: conv(*widths, 1),
-                    conv3x3=lambda *widths: conv(*widths, 3))  # fmt: skip
-    models = module("torchvision.models", resnet=resnet)
-    module("torchvision", ops=module("torchvision.ops", deform_conv2d=_deformable), models=models)
-    module(
-        "torchvision.transforms", ToTensor=lambda: lambda image: torch.from_numpy(image.copy()).permute(2, 0, 1) / 255
-    )
-    module("custom_ops", get_patches=_Patches)
+    convs = {"conv1x1": lambda *widths: conv(*widths, 1), "conv3x3": lambda *widths: conv(*widths, 3)}
+    models = replace_module("torchvision.models", resnet=replace_module("torchvision.models.resnet", **convs))
+    operators = replace_module("torchvision.ops", deform_conv2d=_deformable)
+    replace_module("torchvision", ops=operators, models=models)
+    to_tensor = lambda image: torch.from_numpy(image.copy()).permute(2, 0, 1) / 255  # noqa: E731
+    replace_module("torchvision.transforms", ToTensor=lambda: to_tensor)
+    replace_module("custom_ops", get_patches=_Patches)
     torch.cuda.synchronize = lambda *_: None
 
 
@@ -162,9 +152,7 @@ def main(clone: str, weights: str, images: str) -> None:
         network = ALIKED(
             case.variant, "cpu", scores_th=case.threshold, n_limit=case.max_keypoints, load_pretrained=False
         )
-        values = checkpoint(case, Path(weights))
-        network.load_state_dict({name: torch.from_numpy(np.array(tensor)) for name, tensor in values.items()})
-        network.eval()
+        fill(network, checkpoint(case, Path(weights)))
         image = picture(case, Path(images))
         result = network.run(image)
         with torch.no_grad():

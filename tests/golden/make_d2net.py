@@ -1,6 +1,6 @@
 """Makes d2net.npz: what the public code finds with random weights. `python -m tests.golden.make_d2net CLONE`
 
-CLONE is a clone of https://github.com/mihaidusmanu/d2-net; torch is needed as well. The tests read the file without.
+CLONE is a clone of https://github.com/mihaidusmanu/d2-net.
 """
 
 import sys
@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.golden.torch_networks import fill
 from tests.random_checkpoints import d2net_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "d2net.npz"
@@ -93,9 +94,7 @@ def main(clone: str) -> None:
     from lib.pyramid import process_multiscale
     from lib.utils import preprocess_image
 
-    network = D2Net(use_cuda=False)
-    checkpoint = random_checkpoint(d2net_shapes())
-    network.load_state_dict({name: torch.from_numpy(values) for name, values in checkpoint.items()})
+    network = fill(D2Net(use_cuda=False), random_checkpoint(d2net_shapes()))
     golden = {}
     for case in CASES + PLAIN:
         image = preprocess_image(case.image, case.preprocessing).astype(np.float32)

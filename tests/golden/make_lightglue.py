@@ -1,7 +1,7 @@
 """Makes lightglue.npz: what the public code computes. `python -m tests.golden.make_lightglue CLONE WEIGHTS`
 
 CLONE is a clone of https://github.com/cvg/LightGlue, whose matcher is run in float64 without pruning: small networks of
-random weights, and the published ones for ALIKED, WEIGHTS. The tests read the file without either.
+random weights, and the published ones for ALIKED, WEIGHTS.
 """
 
 import sys

@@ -3,8 +3,8 @@
     python -m tests.golden.make_lightglue_real CLONE WEIGHTS DATA
 
 CLONE is a clone of https://github.com/cvg/LightGlue, WEIGHTS the published ones for ALIKED, DATA a folder that has
-grief_season and corridor; aliked-n16 is installed. Numbers of features are kept, no image. The matcher runs in float64
-without pruning. The tests read the file without all of these but the weights.
+grief_season and corridor; aliked-n16 is installed. The file has features, no image. The matcher runs in float64
+without pruning.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Makes mixvpr.npz: what the public code computes with random weights. `python -m tests.golden.make_mixvpr CLONE`
 
 CLONE is a clone of https://github.com/amaralibey/MixVPR, whose aggregator is run, on top of a ResNet-50 in plain torch;
-both in float64, so that the file holds no rounding errors but its own. The tests read it without either.
+both in float64, so that the file holds no rounding errors but its own.
 """
 
 import sys

@@ -3,19 +3,18 @@
 `python -m tests.golden.make_netvlad PATCHNETVLAD HLOC COSPLACE TORCHVISION` with clones of
 https://github.com/QVPR/Patch-NetVLAD, https://github.com/cvg/Hierarchical-Localization and
 https://github.com/gmberton/CosPlace, and a folder that holds torchvision's package, of which Python's files are enough.
-The tests read the file without any of these.
 """
 
 import importlib
 import sys
 import tempfile
-import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tests.golden.torch_networks import fill, replace_module
 from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 
 GOLDEN = Path(__file__).parent / "netvlad.npz"
@@ -54,8 +53,7 @@ def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None
     import torch
 
     _torchvision(torchvision)
-    sys.modules["sklearn"] = sys.modules["sklearn.neighbors"] = types.ModuleType("sklearn")
-    sys.modules["sklearn.neighbors"].NearestNeighbors = None  # pyright: ignore  (for training)
+    replace_module("sklearn", neighbors=replace_module("sklearn.neighbors", NearestNeighbors=None))  # for training
     with torch.inference_mode():
         golden = dict(_patches(patch_netvlad)) | dict(_positions())
         golden[name("matlab", *MATLAB)] = _matlab(hloc)
@@ -65,24 +63,14 @@ def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None
 
 def _torchvision(folder: str) -> None:
     """Its networks, without its operators, which belong to one version of torch."""
-    for package in ("torchvision", "torchvision.models"):
-        module = types.ModuleType(package)
-        module.__path__ = [f"{folder}/{package.replace('.', '/')}"]
-        module.__version__ = "0.28"
-        sys.modules[package] = module
-    models = sys.modules["torchvision"].models = sys.modules["torchvision.models"]  # pyright: ignore
+    models = replace_module("torchvision.models", __path__=[f"{folder}/torchvision/models"])
+    replace_module("torchvision", __path__=[f"{folder}/torchvision"], __version__="0.28", models=models)
     for part, maker in (("vgg", "vgg16"), ("resnet", "resnet50")):
         setattr(models, maker, _untrained(getattr(importlib.import_module(f"torchvision.models.{part}"), maker)))
 
 
 def _untrained(maker: Callable) -> Callable:
     return lambda **_: maker()
-
-
-def _tensors(checkpoint: dict[str, np.ndarray]) -> dict:
-    import torch
-
-    return {key: torch.from_numpy(np.asarray(array)) for key, array in checkpoint.items()}
 
 
 def normalized(size: tuple[int, int]) -> Any:
@@ -114,8 +102,7 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
         }  # fmt: skip
         channels, encoder = get_backend()
         model = get_model(encoder, channels, config["global_params"], append_pca_layer=outputs is not None)
-        model.load_state_dict(_tensors(netvlad_checkpoint(clusters, outputs, seed)))
-        model.double().eval()
+        fill(model, netvlad_checkpoint(clusters, outputs, seed)).double()
         torch.set_default_dtype(torch.float64)
         encoded = model.pool(model.encoder(normalized(size)))  # pyright: ignore
         torch.set_default_dtype(torch.float32)
@@ -149,9 +136,7 @@ def _matlab(clone: str) -> np.ndarray:
 
     sys.path.insert(0, clone)
     for package in ("hloc", "hloc.extractors", "hloc.utils"):  # without what it imports besides
-        module = types.ModuleType(package)
-        module.__path__ = [f"{clone}/{package.replace('.', '/')}"]
-        sys.modules[package] = module
+        replace_module(package, __path__=[f"{clone}/{package.replace('.', '/')}"])
     extractor = importlib.import_module("hloc.extractors.netvlad")
     clusters, outputs, size, seed = MATLAB
     with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
@@ -170,9 +155,8 @@ def _gem(clone: str, backbone: str, outputs: int, size: tuple[int, int], seed: i
     from cosplace_model.cosplace_network import GeoLocalizationNet
 
     public = {"vgg16": "VGG16", "resnet50": "ResNet50"}[backbone]
-    model = GeoLocalizationNet(public, outputs)
-    model.load_state_dict(_tensors(gem_checkpoint(backbone, outputs, seed)))
-    return model.double().eval()(normalized(size)).numpy()[0]
+    model = fill(GeoLocalizationNet(public, outputs), gem_checkpoint(backbone, outputs, seed))
+    return model.double()(normalized(size)).numpy()[0]
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Makes patch_scores.npz: how Patch-NetVLAD's code scores pairs by patches of three sizes, and ranks candidates.
 
-`python -m tests.golden.make_patch_scores CLONE` with a clone of https://github.com/QVPR/Patch-NetVLAD. The tests read
-the file without it.
+`python -m tests.golden.make_patch_scores CLONE` with a clone of https://github.com/QVPR/Patch-NetVLAD.
 """
 
 import sys
@@ -11,9 +10,10 @@ from unittest.mock import MagicMock
 
 import numpy as np
 
+from tests.golden.make_relatives import MAP, PATCHES, place_patches
+
 GOLDEN = Path(__file__).parent / "patch_scores.npz"
-MAP = (10, 14)  # rows and columns of a feature map, 16 px each
-PATCHES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
+WEIGHTS = (0.45, 0.15, 0.4)  # of the sizes of patches
 DIMENSION = 32
 # Of candidates, so alike that RANSAC needs no luck: how far they are moved (columns, rows), and how many of the patches
 # show the place; None = one color.
@@ -50,11 +50,10 @@ def _scores() -> Iterator[tuple[str, np.ndarray]]:
     for unused in ("patchnetvlad.tools.datasets", "patchnetvlad.models.models_generic"):
         sys.modules.setdefault(unused, MagicMock())
     from match_two import apply_patch_weights  # pyright: ignore
-    from patchnetvlad.models.local_matcher import calc_keypoint_centers_from_patches, normalise_func
+    from patchnetvlad.models.local_matcher import normalise_func
     from patchnetvlad.tools.patch_matcher import PatchMatcher
 
-    config = {"imageresizeH": 16 * MAP[0], "imageresizeW": 16 * MAP[1]}
-    keypoints, indices = zip(*(calc_keypoint_centers_from_patches(config, p, p, 1, 1) for p in PATCHES), strict=True)
+    keypoints, indices = zip(*place_patches(), strict=True)
     features = [descriptors(patch) for patch in PATCHES]
     query = [torch.from_numpy(of_query) for of_query, _ in features]
     for name in MATCHERS:

@@ -1,16 +1,17 @@
 """Makes relatives.npz: scores of public codes. `python -m tests.golden.make_relatives PATCHNETVLAD RERANKING LOSTX`
 
 The arguments are clones of https://github.com/QVPR/Patch-NetVLAD, https://github.com/gbarbarani/re-ranking-for-VPR and
-https://github.com/oravus/lostX, whose functions are called with the inputs below. The tests read the file without them.
+https://github.com/oravus/lostX, whose functions are called with the inputs below.
 """
 
 import importlib
 import sys
 import tempfile
-import types
 from pathlib import Path
 
 import numpy as np
+
+from tests.golden.torch_networks import replace_module
 
 GOLDEN = Path(__file__).parent / "relatives.npz"
 MAP = (10, 14)  # rows and columns of a feature map, 16 px each
@@ -73,11 +74,9 @@ def _patch_netvlad(clone: str) -> np.ndarray:
     import torch
 
     sys.path.insert(0, clone)
-    from patchnetvlad.models.local_matcher import calc_keypoint_centers_from_patches
     from patchnetvlad.tools.patch_matcher import PatchMatcher
 
-    config = {"imageresizeH": 16 * MAP[0], "imageresizeW": 16 * MAP[1]}
-    places = [calc_keypoint_centers_from_patches(config, size, size, 1, 1) for size in PATCHES]
+    places = place_patches()
     for size, (_, indices) in zip(PATCHES, places, strict=True):
         np.testing.assert_array_equal(indices.T, patches(size)[0])
     matcher = PatchMatcher("spatialApproximator", PATCHES, [1] * len(PATCHES), *zip(*places, strict=True))
@@ -88,13 +87,19 @@ def _patch_netvlad(clone: str) -> np.ndarray:
     return np.array(scores)
 
 
+def place_patches() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Keypoints and places on the map of Patch-NetVLAD's patches, by size."""
+    from patchnetvlad.models.local_matcher import calc_keypoint_centers_from_patches
+
+    config = {"imageresizeH": 16 * MAP[0], "imageresizeW": 16 * MAP[1]}
+    return [calc_keypoint_centers_from_patches(config, size, size, 1, 1) for size in PATCHES]
+
+
 def _reranking(clone: str) -> np.ndarray:
     """`[]`: the smaller the better."""
     import torch
 
-    models = types.ModuleType("models")  # without those beside it, which need more
-    models.__path__ = [f"{clone}/src/models"]
-    sys.modules["models"] = models
+    replace_module("models", __path__=[f"{clone}/src/models"])  # without those beside it, which need more
     points0, features0, points1, features1 = (torch.from_numpy(part) for part in keypoints())
     inputs = {"descriptors0": features0.T[None], "descriptors1": features1.T[None]}
     scorer = importlib.import_module("models.rapid").RAPID()

@@ -1,7 +1,6 @@
 """Makes selavpr.npz: what SelaVPR's code gives with random weights, in float64.
 
-`python -m tests.golden.make_selavpr CLONE` with a clone of https://github.com/Lu-Feng/SelaVPR. The tests read the file
-without it.
+`python -m tests.golden.make_selavpr CLONE` with a clone of https://github.com/Lu-Feng/SelaVPR.
 """
 
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tests.golden.make_netvlad import name, normalized, samples
+from tests.golden.torch_networks import fill
 from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 
 GOLDEN = Path(__file__).parent / "selavpr.npz"
@@ -49,13 +49,6 @@ def main(clone: str) -> None:
     np.savez_compressed(GOLDEN, **{key: array.astype(np.float32) for key, array in golden.items()})
 
 
-def _filled(model: Any, checkpoint: dict[str, np.ndarray]) -> Any:
-    import torch
-
-    model.load_state_dict({key: torch.from_numpy(np.asarray(array)) for key, array in checkpoint.items()})
-    return model.double().eval()
-
-
 def _transformer(width: int, depth: int, heads: int, registers: int) -> Any:
     from functools import partial
 
@@ -76,8 +69,8 @@ def _networks() -> Iterator[tuple[str, np.ndarray]]:
     for depth, registers, seed in NETWORKS:
         network.get_backbone = lambda _, depth=depth, registers=registers: _transformer(1024, depth, 16, registers)
         checkpoint = transformer_checkpoint(selavpr_shapes(1024, depth, registers, prefix=""), seed)
-        model = _filled(network.GeoLocalizationNet(types.SimpleNamespace()), checkpoint)
-        local, global_descriptor = model(normalized(SIZE))
+        model = fill(network.GeoLocalizationNet(types.SimpleNamespace()), checkpoint)
+        local, global_descriptor = model.double()(normalized(SIZE))
         case = name("network", depth, registers, seed)
         yield f"{case}/global", global_descriptor.numpy()[0]
         yield f"{case}/local", samples(local.numpy())
@@ -89,10 +82,9 @@ def _backbones() -> Iterator[tuple[str, np.ndarray]]:
     for depth, registers, adapted, size, seed in BACKBONES:
         model = _transformer(WIDTH, depth, 4, registers)
         checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=adapted), seed)
-        zeros = {
-            key: np.zeros(value.shape, np.float32) for key, value in model.state_dict().items() if "adapter" in key
-        }
-        tokens = _filled(model, zeros | checkpoint)(normalized(size))
+        adapters = {key: value.shape for key, value in model.state_dict().items() if "adapter" in key}
+        zeros = {key: np.zeros(shape, np.float32) for key, shape in adapters.items()}
+        tokens = fill(model, zeros | checkpoint).double()(normalized(size))
         case = name("backbone", depth, registers, adapted, *size, seed)
         yield f"{case}/whole", tokens["x_norm_clstoken"].numpy()[0]
         yield f"{case}/maps", samples(tokens["x_norm_patchtokens"].numpy())

@@ -1,23 +1,24 @@
 """Makes ssm.npz: what SSM-VPR's program computes on made-up maps and images. `python -m tests.golden.make_ssm CLONE`
 
 CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose program is run without its windows (torch, scikit-learn,
-scikit-image, on the CPU): its database, its candidates, its spatial matching, its scores. The tests read the file
-without any of these.
+scikit-image, on the CPU): its database, its candidates, its spatial matching, its scores.
 """
 
 import csv
 import os
 import sys
 import tempfile
+from functools import reduce
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 from PIL import Image
 
-from tests.random_checkpoints import places365_shapes, random_checkpoint
+from tests.golden.torch_networks import replace_module
+from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "ssm.npz"
 DATABASE, QUERIES, CANDIDATES = 5, 4, 4
@@ -52,12 +53,11 @@ def picture(row: int, query: bool) -> np.ndarray:
 def main(clone: str) -> None:
     golden: dict[str, np.ndarray] = {}
     program = _program(clone)
-    for case, seed in MAPS.items():
-        golden |= {f"{case}/{name}": array for name, array in _run(program, seed, None, DATABASE, QUERIES).items()}
-    for case, (seed, pixels, *numbers) in IMAGES.items():
-        computed = _run(program, seed, pixels, *numbers)
-        del computed["cells"]  # hundreds of kB
-        golden |= {f"{case}/{name}": array for name, array in computed.items()}
+    cases = {case: (seed, None, DATABASE, QUERIES) for case, seed in MAPS.items()} | IMAGES
+    for case, settings in cases.items():
+        golden |= {f"{case}/{name}": array for name, array in _run(program, *settings).items()}
+        if case in IMAGES:
+            del golden[f"{case}/cells"]  # hundreds of kB
     np.savez_compressed(GOLDEN, **golden)
 
 
@@ -145,13 +145,9 @@ def _program(clone: str) -> Any:
         def retrieve_model(self, method: str) -> Any:
             if self.pixels is None:
                 return None
-            tensors = random_checkpoint(places365_shapes(full=False), self.seed)
             model = VGG16Model.__new__(VGG16Model)
             torch.nn.Module.__init__(model)
-            model.weights_dict = {}
-            for key, array in tensors.items():
-                layer, kind = key.split(".")
-                model.weights_dict.setdefault(layer, {})[kind] = array
+            model.weights_dict = layered(random_checkpoint(places365_shapes(full=False), self.seed))
             for layer, parts in model.weights_dict.items():
                 outputs, inputs = parts["weights"].shape[:2]
                 conv = model._VGG16Model__conv(
@@ -202,23 +198,17 @@ def _without_windows() -> None:
     """Modules of windows and figures are nothing; torchvision's transforms are Pillow's, as the real ones."""
     import torch
 
-    def module(name: str, **members: Any) -> ModuleType:
-        sys.modules[name] = stub = ModuleType(name)
-        for member, value in members.items():
-            setattr(stub, member, value)
-        return stub
-
     class Window:
         pass
 
     names = ("QtCore", "QtGui", "QtWidgets", "QApplication", "QMessageBox", "QThreadPool")
     qt = {name: MagicMock() for name in names} | {"QRunnable": Window}
     for name in ("PyQt5", "PyQt5.QtWidgets", "PyQt5.QtCore", "PyQt5.QtGui", "PyQt5.QtWebEngineWidgets"):
-        module(name, **qt, QMainWindow=Window)
-    module("tkinter", filedialog=MagicMock(), Tk=MagicMock(), messagebox=MagicMock())
-    module("matplotlib", pyplot=MagicMock())
-    module("about", Ui_AboutBox=Window)
-    module("netvlad_model")
+        replace_module(name, **qt, QMainWindow=Window)
+    replace_module("tkinter", filedialog=MagicMock(), Tk=MagicMock(), messagebox=MagicMock())
+    replace_module("matplotlib", pyplot=MagicMock())
+    replace_module("about", Ui_AboutBox=Window)
+    replace_module("netvlad_model")
 
     steps = {
         "Resize": lambda size: lambda image: image.resize(size, Image.Resampling.BILINEAR),
@@ -228,18 +218,13 @@ def _without_windows() -> None:
     }
 
     def compose(parts: list[Any]) -> Any:
-        def run(image: Any) -> Any:
-            for part in parts:
-                image = part(image)
-            return image
-
-        return run
+        return lambda image: reduce(lambda transformed, part: part(transformed), parts, image)
 
     def _column(values: list[float]) -> torch.Tensor:
         return torch.tensor(values)[:, None, None]
 
-    transforms = module("torchvision.transforms", Compose=compose, **steps)
-    module("torchvision", transforms=transforms, models=module("torchvision.models"))
+    transforms = replace_module("torchvision.transforms", Compose=compose, **steps)
+    replace_module("torchvision", transforms=transforms, models=replace_module("torchvision.models"))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Makes ssm_maps.npz: SSM-VPR's maps with random weights. `python -m tests.golden.make_ssm_maps CLONE`
 
-CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose network is run, by torch and in float64, so that the file
-holds no rounding errors but its own. The tests read it without either.
+CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose network is run in float64, so that the file holds no
+rounding errors but its own.
 """
 
 import sys
@@ -54,24 +54,21 @@ def main(clone: str) -> None:
 
     unused = {name: np.zeros(shape, np.float32) for name, shape in places365_shapes().items()}
     golden = {}
-    for seed in SEEDS:
-        weights = unused | checkpoint(seed)
+    for case in CASES:
+        weights = unused | checkpoint(case.seed)
         vgg16_model.load_weights = lambda _, weights=weights: layered(weights)
         network = vgg16_model.VGG16Model("").double().eval()
-        for case in CASES:
-            if case.seed != seed:
-                continue
-            pixels = (case.image / 255 - np.array(MEAN)) / np.array(DEVIATION)
+        pixels = (case.image / 255 - np.array(MEAN)) / np.array(DEVIATION)
+        batch = torch.from_numpy(pixels.transpose(2, 0, 1)[None])
+        for stage in case.stages:
             with torch.inference_mode():
-                batch = torch.from_numpy(pixels.transpose(2, 0, 1)[None])
-                for stage in case.stages:
-                    dense = (network.forward1 if stage == 1 else network.forward2)(batch)[0].numpy().transpose(1, 2, 0)
-                    golden |= {
-                        f"{case}/stage{stage}": samples(dense),
-                        f"{case}/stage{stage}/largest": np.float32(np.abs(dense).max()),
-                        f"{case}/stage{stage}/shape": np.array(dense.shape),
-                    }
-                    print(f"{case}, stage {stage}: {dense.shape}, largest {np.abs(dense).max():.3g}")
+                dense = (network.forward1 if stage == 1 else network.forward2)(batch)[0].numpy().transpose(1, 2, 0)
+            golden |= {
+                f"{case}/stage{stage}": samples(dense),
+                f"{case}/stage{stage}/largest": np.float32(np.abs(dense).max()),
+                f"{case}/stage{stage}/shape": np.array(dense.shape),
+            }
+            print(f"{case}, stage {stage}: {dense.shape}, largest {np.abs(dense).max():.3g}")
     np.savez_compressed(GOLDEN, **golden)
 
 
