@@ -16,32 +16,16 @@ def sampled(dense: np.ndarray, x: float, y: float) -> np.ndarray:
     return total
 
 
-def convolved(dense: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """3 x 3 convolution of a map `[H, W, C]` with a kernel `[3, 3, C, D]`; zeros outside."""
-    height, width, _ = dense.shape
-    padded = np.pad(dense, ((1, 1), (1, 1), (0, 0)))
-    total = np.tile(bias, (height, width, 1)).astype(np.float64)
-    for row in range(height):
-        for column in range(width):
-            for down in range(3):
-                for right in range(3):
-                    total[row, column] += padded[row + down, column + right] @ kernel[down, right]
-    return total
-
-
 def deformed(dense: np.ndarray, kernel: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """The deformable convolution; `offsets` `[H, W, 18]` are (y, x) of each tap, row by row."""
+    """The deformable convolution of a map `[H, W, C]`; `offsets` `[H, W, 18]` are (y, x) of each tap, row by row."""
     height, width, _ = dense.shape
     limit = max(height, width) / 4
     offsets = np.clip(offsets, -limit, limit).reshape(height, width, 3, 3, 2)
     total = np.zeros((height, width, kernel.shape[-1]))
-    for row in range(height):
-        for column in range(width):
-            for down in range(3):
-                for right in range(3):
-                    y, x = offsets[row, column, down, right]
-                    taken = sampled(dense, column + right - 1 + x, row + down - 1 + y)
-                    total[row, column] += taken @ kernel[down, right]
+    for row, column, down, right in np.ndindex(height, width, 3, 3):
+        y, x = offsets[row, column, down, right]
+        values = sampled(dense, column + right - 1 + x, row + down - 1 + y)
+        total[row, column] += values @ kernel[down, right]
     return total
 
 
@@ -53,7 +37,7 @@ def _highest(scores: np.ndarray, row: int, column: int) -> float:
 def peaks(scores: np.ndarray) -> list[tuple[int, int]]:
     """(row, column) of the maxima, in three rounds."""
     height, width = scores.shape
-    places = [(row, column) for row in range(height) for column in range(width)]
+    places = [*np.ndindex(scores.shape)]
     maxima = {place for place in places if scores[place] == _highest(scores, *place)}
     for _ in range(2):
         near = {(row + down - 2, column + right - 2) for row, column in maxima for down, right in np.ndindex(5, 5)}
@@ -76,8 +60,8 @@ def keypoints(scores: np.ndarray, threshold: float, limit: int) -> np.ndarray:
     for row, column in places:
         patch = padded[row : row + 5, column : column + 5]
         weights = np.exp((patch - patch.max()) / 0.1)
-        x = column + sum(weights[i, j] * (j - 2) for i in range(5) for j in range(5)) / weights.sum()
-        y = row + sum(weights[i, j] * (i - 2) for i in range(5) for j in range(5)) / weights.sum()
+        x = column + sum(weights[i, j] * (j - 2) for i, j in np.ndindex(5, 5)) / weights.sum()
+        y = row + sum(weights[i, j] * (i - 2) for i, j in np.ndindex(5, 5)) / weights.sum()
         rows.append((x, y, sampled(scores[..., None], x, y)[0]))
     return np.array(rows).reshape(-1, 3)
 
@@ -92,9 +76,8 @@ def described(features: np.ndarray, point: np.ndarray, head: dict[str, np.ndarra
     column, row = int(point[0]), int(point[1])
     padded = np.pad(features, ((1, 1), (1, 1), (0, 0)))
     hidden = np.array(head["offset1.bias"], np.float64)
-    for down in range(3):
-        for right in range(3):
-            hidden += padded[row + down, column + right] @ head["offset1.kernel"][down, right]
+    for down, right in np.ndindex(3, 3):
+        hidden += padded[row + down, column + right] @ head["offset1.kernel"][down, right]
     moves = _selu(hidden) @ head["offset2.kernel"][0, 0] + head["offset2.bias"]
     limit = max(height, width) / 4
     moves = np.clip(moves, -limit, limit).reshape(2, -1)  # all x, then all y

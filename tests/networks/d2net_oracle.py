@@ -22,19 +22,11 @@ def detected(dense: np.ndarray) -> list[tuple[int, int, int]]:
     """(channel, row, column) that pass the three tests, in this order, of a map `[h, w, C]`."""
     height, width, channels = dense.shape
     positions = []
-    for channel in range(channels):
-        for row in range(height):
-            for column in range(width):
-                value = dense[row, column, channel]
-                rows = slice(max(row - 1, 0), row + 2)
-                columns = slice(max(column - 1, 0), column + 2)
-                strongest = value == dense[row, column].max()
-                if (
-                    strongest
-                    and value == dense[rows, columns, channel].max()
-                    and not _is_edge(dense, channel, row, column)
-                ):
-                    positions.append((channel, row, column))
+    for channel, row, column in np.ndindex(channels, height, width):
+        neighborhood = dense[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2, channel]
+        is_maximum = dense[row, column, channel] == dense[row, column].max() == neighborhood.max()
+        if is_maximum and not _is_edge(dense, channel, row, column):
+            positions.append((channel, row, column))
     return positions
 
 
@@ -69,12 +61,7 @@ def pyramid(maps: list[np.ndarray]) -> list[list[Found]]:
             dense = dense + _enlarged(previous, height, width)
         if banned is not None:
             tall, wide = banned.shape
-            banned = np.array(
-                [
-                    [banned[row * tall // height, column * wide // width] for column in range(width)]
-                    for row in range(height)
-                ]
-            )
+            banned = banned[np.ix_(np.arange(height) * tall // height, np.arange(width) * wide // width)]
         ours = keypoints(dense, banned)
         now = np.zeros((height, width), bool) if banned is None else banned.copy()
         for _, row, column in detected(dense):
@@ -84,21 +71,12 @@ def pyramid(maps: list[np.ndarray]) -> list[list[Found]]:
     return levels
 
 
-def _value(dense: np.ndarray, channel: int, row: int, column: int) -> float:
-    height, width, _ = dense.shape
-    return dense[row, column, channel] if 0 <= row < height and 0 <= column < width else 0.0
-
-
 def _derivatives(dense: np.ndarray, channel: int, row: int, column: int) -> tuple[float, float, float, float, float]:
     """Second derivatives ii, jj, ij and first derivatives i, j (rows, columns); zeros outside."""
-
-    def at(down: int, right: int) -> float:
-        return _value(dense, channel, row + down, column + right)
-
-    ii = at(-1, 0) - 2 * at(0, 0) + at(1, 0)
-    jj = at(0, -1) - 2 * at(0, 0) + at(0, 1)
-    ij = (at(-1, -1) - at(-1, 1) - at(1, -1) + at(1, 1)) / 4
-    return ii, jj, ij, (at(1, 0) - at(-1, 0)) / 2, (at(0, 1) - at(0, -1)) / 2
+    values = np.pad(dense[..., channel], 1)[row : row + 3, column : column + 3]
+    (corner1, up, corner2), (left, center, right), (corner3, down, corner4) = values
+    ij = (corner1 - corner2 - corner3 + corner4) / 4
+    return up - 2 * center + down, left - 2 * center + right, ij, (down - up) / 2, (right - left) / 2
 
 
 def _is_edge(dense: np.ndarray, channel: int, row: int, column: int) -> bool:
@@ -120,8 +98,7 @@ def _enlarged(dense: np.ndarray, height: int, width: int) -> np.ndarray:
     """Bilinear; the corners stay the corners."""
     tall, wide, channels = dense.shape
     result = np.zeros((height, width, channels))
-    for row in range(height):
-        for column in range(width):
-            at_row, at_column = row * (tall - 1) / (height - 1), column * (wide - 1) / (width - 1)
-            result[row, column] = _bilinear(dense, min(at_row, tall - 1), min(at_column, wide - 1))
+    for row, column in np.ndindex(height, width):
+        at_row, at_column = row * (tall - 1) / (height - 1), column * (wide - 1) / (width - 1)
+        result[row, column] = _bilinear(dense, min(at_row, tall - 1), min(at_column, wide - 1))
     return result

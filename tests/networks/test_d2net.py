@@ -7,10 +7,6 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
-from mfvpr.checkpoints import entry_of
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.tables import D2NET
 from mfvpr.features import D2NetFeatures
 from mfvpr.features import d2net as features_d2net
 from mfvpr.features.network import compile_network
@@ -18,8 +14,9 @@ from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
 from mfvpr.networks.imagenet import preprocess
 from tests.builders import local
-from tests.golden.make_d2net import CASES, GOLDEN, PLAIN, projections, samples, texture
+from tests.golden.make_d2net import CASES, PLAIN, projections, samples, texture
 from tests.networks import d2net_oracle as oracle
+from tests.networks.checkpoints import fill_published
 from tests.random_checkpoints import d2net_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
@@ -27,8 +24,7 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture(scope="module")
 def model() -> D2Net:
-    plan = blueprint(entry_of("d2_tf"))
-    return plan.filled(convert(random_checkpoint(d2net_shapes()), D2NET, plan.shapes))
+    return fill_published("d2_tf", random_checkpoint(d2net_shapes()))
 
 
 class Tiny(nnx.Module):
@@ -76,25 +72,22 @@ def assert_same(level, expected, ratio=1.0):
     points = np.array([(keypoint.x, keypoint.y) for keypoint in expected]).reshape(-1, 2) * ratio
     np.testing.assert_allclose(level.keypoints[:count], points, atol=1e-4)
     np.testing.assert_allclose(level.scores[:count], [keypoint.score for keypoint in expected], rtol=1e-6)
-    descriptors = np.array([keypoint.descriptor for keypoint in expected]).reshape(count, -1)
-    np.testing.assert_allclose(level.descriptors[:count], descriptors.reshape(count, -1), atol=1e-5)
+    for descriptor, keypoint in zip(level.descriptors, expected, strict=False):
+        np.testing.assert_allclose(descriptor, keypoint.descriptor, atol=1e-5)
 
 
-def test_the_network_has_the_published_size():
-    plan = blueprint(entry_of("d2_tf"))
-    assert plan.parameters == 7_635_264
-    model = plan.filled({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
-    for pixels, side in ((336, 83), (320, 79)):
-        image = jax.ShapeDtypeStruct((1, pixels, pixels, 3), jnp.float32)
-        assert jax.eval_shape(model, image).shape == (1, side, side, 512)
+def assert_golden(features, golden, case, keypoints_atol, projections_atol):
+    assert len(features.scores) == len(golden[f"{case}/scores"])
+    np.testing.assert_allclose(features.keypoints, golden[f"{case}/keypoints"], atol=keypoints_atol)
+    np.testing.assert_allclose(features.scores, golden[f"{case}/scores"], rtol=1e-5)
+    expected = golden[f"{case}/projections"]
+    np.testing.assert_allclose(projections(features.descriptors), expected, atol=projections_atol)
 
 
 @pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_maps_and_features_are_those_of_the_public_code(model, case):
-    with np.load(GOLDEN) as file:
-        golden = {name: file[f"{case}/{name}"] for name in ("dense", "keypoints", "scores", "projections")}
+def test_maps_and_features_are_those_of_the_public_code(model, golden, case):
     maps = []
 
     class Observed(nnx.Module):
@@ -113,11 +106,10 @@ def test_maps_and_features_are_those_of_the_public_code(model, case):
     features = extractor(texture(*size)[None])[0].features
     jax.effects_barrier()
     (dense,) = maps[len(maps) // 2]  # at full size
-    np.testing.assert_allclose(samples(dense), golden["dense"], rtol=1e-5, atol=1e-5 * golden["dense"].max())
-    assert len(features.scores) == len(golden["scores"]) > 200
-    np.testing.assert_allclose(features.keypoints, golden["keypoints"], atol=1e-3)
-    np.testing.assert_allclose(features.scores, golden["scores"], rtol=1e-5)
-    np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-5)
+    expected = golden[f"{case}/dense"]
+    np.testing.assert_allclose(samples(dense), expected, rtol=1e-5, atol=1e-5 * expected.max())
+    assert_golden(features, golden, case, 1e-3, 1e-5)
+    assert len(features.scores) > 200
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-6)
     np.testing.assert_array_equal(features.image_size, size)
     assert features.mask.all()
@@ -131,15 +123,11 @@ def plain(model) -> D2NetFeatures:
 @pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", PLAIN, ids=str)
-def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, case):
+def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, golden, case):
     """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
-    with np.load(GOLDEN) as file:
-        golden = {name: file[f"{case}/{name}"] for name in ("keypoints", "scores", "projections")}
     (features,) = local(plain(case.image[None]))
-    assert len(features.scores) == len(golden["scores"]) > 10
-    np.testing.assert_allclose(features.keypoints, golden["keypoints"], atol=1e-2)
-    np.testing.assert_allclose(features.scores, golden["scores"], rtol=1e-5)
-    np.testing.assert_allclose(projections(features.descriptors), golden["projections"], atol=1e-4)
+    assert_golden(features, golden, case, 1e-2, 1e-4)
+    assert len(features.scores) > 10
 
 
 @pytest.mark.optimized
@@ -160,16 +148,10 @@ def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
     np.testing.assert_allclose(usual, uniform, atol=1e-5 * uniform.max())
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_detection_agrees_with_the_oracle(seed):
-    dense = smooth(seed)
-    expected = oracle.keypoints(dense.astype(np.float64))
-    assert expected
-    assert_same(*detected(dense), expected)
-
-
-def test_detection_agrees_with_the_oracle_without_relu():
-    dense = smooth(0) - np.float32(4)  # all below the zeros around the map
+@pytest.mark.parametrize(("seed", "offset"), [*((seed, 0) for seed in range(6)), (0, -4)])
+def test_detection_agrees_with_the_oracle(seed, offset):
+    """Also without ReLU: of maps that are below the zeros around them."""
+    dense = smooth(seed) + np.float32(offset)
     expected = oracle.keypoints(dense.astype(np.float64))
     assert expected
     assert_same(*detected(dense), expected)
@@ -189,22 +171,20 @@ def test_maps_of_the_oracle_meet_every_rule():
     assert at_border > 5
 
 
-def test_scales_agree_with_the_oracle():
-    maps = [smooth(seed, *size) for seed, size in enumerate(((4, 7), (9, 15), (20, 31)))]
+FLAT = np.ones((6, 5, 6), np.float32)
+
+
+@pytest.mark.parametrize(("maps", "num_empty"), [
+    ((smooth(0, 4, 7), smooth(1, 9, 15), smooth(2, 20, 31)), 0), ((FLAT, smooth(1)), 1),
+], ids=["textured", "flat"])  # fmt: skip
+def test_scales_agree_with_the_oracle(maps, num_empty):
+    """A scale without keypoints adds nothing to the next."""
     expected = oracle.pyramid([dense.astype(np.float64) for dense in maps])
-    assert all(expected)
-    ratios = ((2.0, 2.0), (1.0, 1.0), (0.5, 0.5))
+    assert sum(not keypoints for keypoints in expected) == num_empty
+    ratios = ((2.0, 2.0), (1.0, 1.0), (0.5, 0.5))[: len(maps)]
     levels = detected(*maps, ratios=ratios)
-    for level, ours, (ratio, _) in zip(levels, expected, ratios, strict=True):
-        assert_same(level, ours, ratio)
-
-
-def test_a_scale_without_keypoints_adds_nothing_to_the_next():
-    flat, textured = np.ones((6, 5, 6), np.float32), smooth(1)
-    empty, level = detected(flat, textured, ratios=((2.0, 2.0), (1.0, 1.0)))
-    assert empty.count == 0
-    expected = oracle.pyramid([flat.astype(np.float64), textured.astype(np.float64)])[1]
-    assert_same(level, expected)
+    for level, keypoints, (ratio, _) in zip(levels, expected, ratios, strict=True):
+        assert_same(level, keypoints, ratio)
 
 
 def test_of_channels_that_tie_the_first_is_reported():

@@ -8,10 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint, plan_network
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.matching import LightGlueMatching
 from mfvpr.networks import LightGlue
@@ -20,7 +19,8 @@ from mfvpr.types import per_keypoint
 from mfvpr.utils import InputError
 from tests import random_checkpoints
 from tests.golden import make_lightglue_real
-from tests.golden.make_lightglue import DEPTH, GOLDEN, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
+from tests.golden.make_lightglue import DEPTH, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
+from tests.networks.checkpoints import fill, fill_published
 
 pytestmark = pytest.mark.thorough
 
@@ -28,17 +28,18 @@ INPUTS = SMALL["inputs"]
 assigned = jax.jit(assignment)
 
 
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(GOLDEN))
+build_small = partial(LightGlue, *SMALL.values())
+
+
+@cache
+def small_network(seed=0, sure=None):
+    return fill(build_small, LIGHTGLUE, checkpoint(seed, sure))
 
 
 @cache
 def small(seed=0, sure=None, dtype=np.float32):
-    """The packed weights of a small network, through the published keys."""
-    plan = plan_network(partial(LightGlue, *SMALL.values()))
-    model = plan.filled(convert(checkpoint(seed, sure), LIGHTGLUE, plan.shapes))
-    return jax.jit(LightGlue.packed)(jax.tree.map(lambda leaf: leaf.astype(dtype), model))
+    """The packed weights of a small network."""
+    return jax.jit(LightGlue.packed)(jax.tree.map(lambda leaf: leaf.astype(dtype), small_network(seed, sure)))
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +50,7 @@ def real_golden():
 @pytest.fixture(scope="module")
 def matcher():
     """With the published weights."""
-    plan = blueprint(entry_of("aliked_lightglue"))
-    return LightGlueMatching.of(
-        plan.filled(convert(read_checkpoint(random_checkpoints.LIGHTGLUE), LIGHTGLUE, plan.shapes))
-    )
+    return LightGlueMatching.of(fill_published("aliked_lightglue", read_checkpoint(random_checkpoints.LIGHTGLUE)))
 
 
 match_one = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
@@ -158,20 +156,16 @@ def test_published_weights_assign_as_the_public_code(golden, matcher):
 
 
 def test_older_names_of_the_published_tensors_are_known():
-    plan = plan_network(partial(LightGlue, *SMALL.values()))
-    tensors = checkpoint(0)
-    older = {
-        re.sub(r"transformers\.(\d)\.(self|cross)_attn", r"\2_attn.\1", key): array for key, array in tensors.items()
-    }
+    shapes, tensors = plan_network(build_small).shapes, checkpoint(0)
+    name, older_name = r"transformers\.(\d)\.(self|cross)_attn", r"\2_attn.\1"
+    older = {re.sub(name, older_name, key): array for key, array in tensors.items()}
     assert older.keys() != tensors.keys()
-    converted, expected = (
-        convert(named, LIGHTGLUE, plan.shapes) for named in (older | {"confidence_thresholds": np.zeros(3)}, tensors)
-    )
-    assert all(np.array_equal(converted[path], expected[path]) for path in plan.shapes)
+    converted = convert(older | {"confidence_thresholds": np.zeros(3)}, LIGHTGLUE, shapes)
+    expected = convert(tensors, LIGHTGLUE, shapes)
+    assert all(np.array_equal(converted[path], expected[path]) for path in shapes)
+    twice = {"self_attn.0.Wqkv.bias": tensors["transformers.0.self_attn.Wqkv.bias"]}
     with pytest.raises(InputError, match=r"1 .*\(self_attn.0.Wqkv.bias .*transformers.0.self_attn.Wqkv.bias\)"):
-        convert(
-            tensors | {"self_attn.0.Wqkv.bias": tensors["transformers.0.self_attn.Wqkv.bias"]}, LIGHTGLUE, plan.shapes
-        )
+        convert(tensors | twice, LIGHTGLUE, shapes)
 
 
 @pytest.mark.optimized

@@ -6,36 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 
-from mfvpr.checkpoints import entry_of
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.tables import MIXVPR
 from mfvpr.features import MixVprDescriptor
-from mfvpr.networks import MixVPR, ResNet50
+from mfvpr.networks import MixVPR
 from mfvpr.networks.mixvpr import preprocess
 from mfvpr.utils import InputError
-from tests.golden.make_mixvpr import GOLDEN, SIZES, faint_maps, images
+from tests.golden.make_mixvpr import SIZES, faint_maps, images
 from tests.golden.make_netvlad import samples
+from tests.networks.checkpoints import fill_published
 from tests.networks.test_netvlad import RELATIVE, assert_close
 from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
 
-PARAMETERS = {4096: 10_880_900, 512: 10_092_898, 128: 9_896_098}
-
-
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(GOLDEN))
-
 
 def published(channels, rows):
-    """The network with random weights, through the published keys."""
-    network = blueprint(entry_of(f"mixvpr_{channels * rows}"))
-    checkpoint = random_checkpoint(mixvpr_shapes(channels, rows))
-    return network.filled(convert(checkpoint, MIXVPR, network.shapes))
+    return fill_published(f"mixvpr_{channels * rows}", random_checkpoint(mixvpr_shapes(channels, rows)))
 
 
 @pytest.fixture(scope="module")
@@ -129,22 +115,3 @@ def test_other_image_sizes_are_refused(model):
         model(jnp.zeros((1, 480, 640, 3)))
     with pytest.raises(InputError, match=r"MixVPR: .*320 x 320 px, got 336 x 300"):
         MixVprDescriptor(model)(np.zeros((1, 300, 336, 3), np.uint8))
-
-
-def test_no_images_give_no_descriptors(model):
-    assert MixVprDescriptor(model)(np.zeros((0, 320, 320, 3), np.uint8)) == []
-
-
-def test_parameter_counts():
-    assert {width: blueprint(entry_of(f"mixvpr_{width}")).parameters for width in PARAMETERS} == PARAMETERS
-
-
-@pytest.mark.parametrize(
-    "last, shape, parameters", [("layer3", (20, 20, 1024), 8_543_296), ("layer4", (10, 10, 2048), 23_508_032)]
-)
-def test_backbones_sizes(last, shape, parameters):
-    with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
-        backbone = nnx.eval_shape(lambda: ResNet50(last, rngs=nnx.Rngs(0)))
-    images = jax.ShapeDtypeStruct((1, 320, 320, 3), jnp.float32)
-    assert nnx.eval_shape(lambda model, x: model(x), backbone, images).shape == (1, *shape)
-    assert sum(leaf.size for leaf in jax.tree.leaves(nnx.state(backbone, nnx.Param))) == parameters

@@ -7,32 +7,20 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import network_of, plan_network
 from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
 from mfvpr.networks.gem import GeneralizedMean
 from mfvpr.networks.netvlad import CHANNELS
 from mfvpr.utils import InputError
-from tests.golden.make_netvlad import CASES, GEM, GOLDEN, MATLAB, PATCHES, image, name, samples
+from tests.golden.make_netvlad import CASES, GEM, MATLAB, PATCHES, image, name, samples
+from tests.networks.checkpoints import fill, fill_published
 from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
 
 pytestmark = pytest.mark.thorough
 
 RELATIVE = 1e-5  # of the largest value
-
-
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(GOLDEN))
-
-
-def filled(build, table, checkpoint):
-    plan = plan_network(build)
-    return plan.filled(convert(checkpoint, table, plan.shapes))
 
 
 def assert_close(actual, expected):
@@ -44,7 +32,7 @@ def assert_close(actual, expected):
 @pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
 def test_descriptors_and_patches_are_the_public_codes(golden, case):
     clusters, outputs, size, seed = case
-    network = filled(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
+    network = fill(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
     sizes = PATCHES.get(outputs, ())
     with_patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)
     descriptors, patches = with_patches(network, network.preprocess(image(size)), sizes)
@@ -62,7 +50,7 @@ def test_descriptors_and_patches_are_the_public_codes(golden, case):
 def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path):
     clusters, outputs, size, seed = MATLAB
     read = read_checkpoint(write_matlab(tmp_path / "struct.mat", matlab_netvlad(clusters, outputs, seed)))
-    network = filled(partial(VggNetVlad, clusters, outputs, original=True), NETVLAD_MATLAB, read)
+    network = fill(partial(VggNetVlad, clusters, outputs, original=True), NETVLAD_MATLAB, read)
     vector = GlobalDescriptor(network, size)(image(size))[0].vector
     assert_close(vector, golden[name("matlab", *MATLAB)])
     floats = GlobalDescriptor(network, size)(image(size).astype(np.float32))[0].vector
@@ -74,8 +62,7 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
 @pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
 def test_generalized_means_are_cosplaces(golden, case):
     backbone, outputs, size, seed = case
-    network = network_of(entry_of(f"cosplace_{backbone}_{outputs}"))
-    model = filled(network.builder(), network.table, gem_checkpoint(backbone, outputs, seed))
+    model = fill_published(f"cosplace_{backbone}_{outputs}", gem_checkpoint(backbone, outputs, seed))
     extractor = GlobalDescriptor(model, size)
     assert (extractor.vector_size, extractor.scales) == (outputs, ())
     assert_close(extractor(image(size))[0].vector, golden[name("gem", *case)])
@@ -131,7 +118,7 @@ def test_the_generalized_mean_is_its_definition(power, unit):
 
 @pytest.fixture(scope="module")
 def small():
-    return filled(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
+    return fill(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
 
 
 @pytest.mark.slow
@@ -163,6 +150,6 @@ def test_what_cannot_be_is_refused(small, options, words):
         GlobalDescriptor(small, **options)
     with pytest.raises(InputError, match="expected images of 64 x 48 px, got 48 x 64"):
         GlobalDescriptor(small, (64, 48))(np.zeros((1, 64, 48, 3), np.uint8))
-    unprojected = filled(partial(VggNetVlad, 4, None), NETVLAD, netvlad_checkpoint(4, None))
+    unprojected = fill(partial(VggNetVlad, 4, None), NETVLAD, netvlad_checkpoint(4, None))
     with pytest.raises(InputError, match=r"components=3: expected None.*whitening"):
         GlobalDescriptor(unprojected, components=3)

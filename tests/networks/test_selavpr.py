@@ -20,21 +20,17 @@ from mfvpr.utils import InputError, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import make_matches
 from tests.golden.make_netvlad import image, name, samples
-from tests.golden.make_selavpr import BACKBONES, GOLDEN, MATCHES, NETWORKS, SIZE, WIDTH, maps
-from tests.networks.test_netvlad import assert_close, filled
+from tests.golden.make_selavpr import BACKBONES, MATCHES, NETWORKS, SIZE, WIDTH, maps
+from tests.networks.checkpoints import fill
+from tests.networks.test_netvlad import assert_close
 from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
 
 pytestmark = pytest.mark.thorough
 
 
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(GOLDEN))
-
-
 def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
     build = partial(SelaVpr, width, depth, width // 64, registers=registers)
-    return filled(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
+    return fill(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
 
 
 @pytest.mark.optimized
@@ -60,11 +56,11 @@ def test_tokens_are_the_public_codes(golden, case):
         backbone = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
         unadapted = transformer_checkpoint(shapes, seed)
         checkpoint = unadapted | {f"backbone.{key}": value for key, value in backbone.items()}
-        transformer = filled(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
+        transformer = fill(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
     else:
         build = partial(VisionTransformer, WIDTH, depth, 4, registers=registers)
         checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
-        transformer = filled(build, DINOV2, checkpoint)
+        transformer = fill(build, DINOV2, checkpoint)
     class_token, tokens = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
     key = name("backbone", *case[:3], *size, seed)
     assert tokens.shape == (1, size[1] // 14, size[0] // 14, WIDTH)
@@ -175,7 +171,7 @@ def test_sizes_without_whole_patches_are_refused(size):
 
 def test_tokens_are_descriptors_of_images():
     shapes = dinov2_shapes(64, 2)
-    transformer = filled(partial(VisionTransformer, 64, 2, 4), DINOV2, transformer_checkpoint(shapes))
+    transformer = fill(partial(VisionTransformer, 64, 2, 4), DINOV2, transformer_checkpoint(shapes))
     size = (42, 28)
     class_token, token_maps = transformer(transformer.preprocess(image(size)))
     tokens = np.asarray(token_maps[0], np.float64).reshape(-1, 64)

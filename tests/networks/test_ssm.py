@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints import entry_of
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.tables import SSM
 from mfvpr.networks import SsmVgg, imagenet
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
+from tests.networks.checkpoints import fill_published
 
 pytestmark = pytest.mark.thorough
 
@@ -29,9 +26,7 @@ def golden():
 
 @cache
 def published(seed):
-    """The network with random weights, through the published keys."""
-    network = blueprint(entry_of("vgg16_places365"))
-    return network.filled(convert(checkpoint(seed), SSM, network.shapes))
+    return fill_published("vgg16_places365", checkpoint(seed))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,0 +1,11 @@
+"""Numbers of the public codes."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def golden(request):
+    """The arrays of `tests/golden/NAME.npz` for the tests of `test_NAME.py`."""
+    name = request.path.stem.removeprefix("test_")
+    return dict(np.load(request.config.rootpath / "tests" / "golden" / f"{name}.npz"))
