@@ -32,9 +32,9 @@ class Counting:
             yield row, image
 
 
-def images_of(counts, seed=0):
+def images_of(counts, seed=0, **options):
     rng = np.random.default_rng(seed)
-    return [make_features(rng, count) for count in counts]
+    return [make_features(rng, count, **options) for count in counts]
 
 
 def counted(counts):
@@ -63,8 +63,7 @@ def assert_are(got, images, rows):
 
 
 def test_own_features_lose_their_padding_and_nothing_else():
-    rng = np.random.default_rng(0)
-    images = [make_features(rng, count, capacity=9) for count in (9, 0, 4)]
+    images = images_of([9, 0, 4], capacity=9)
     feature_set = FeatureSet.of(images)
     assert len(feature_set) == 3
     assert feature_set.counts.tolist() == [9, 0, 4]
@@ -78,9 +77,8 @@ def test_own_features_lose_their_padding_and_nothing_else():
 
 def test_own_features_of_any_type_are_matched_in_single_precision():
     [image] = images_of([5])
-    integers = replace(
-        image, keypoints=np.round(image.keypoints).astype(int), descriptors=image.descriptors.astype(np.float64)
-    )
+    keypoints = np.round(image.keypoints).astype(int)
+    integers = replace(image, keypoints=keypoints, descriptors=image.descriptors.astype(np.float64))
     feature_set = FeatureSet.of([integers, image])
     for row in range(2):
         dtypes = {part.name: getattr(feature_set[row], part.name).dtype for part in fields(Features)}
@@ -94,17 +92,14 @@ def spoiled(**changes):
         return replace(image, **changes)
 
 
-@pytest.mark.parametrize(
-    "images, message",
-    [
-        ([], "at least one image, got none"),
-        ([spoiled(descriptors=np.zeros((16, 5), np.float32))], r"image 0: .*\[N, D\].*\(16, 5\).*transpose"),
-        ([spoiled(scores=np.zeros((5, 1), np.float32))], r"image 0: .*scores \[N\]"),
-        ([spoiled(mask=np.ones(5))], "mask .* bool"),
-        ([*images_of([3]), spoiled(descriptors=2 * images_of([5])[0].descriptors)], "image 1: .*unit length, got 2;"),
-        ([*images_of([3]), make_features(np.random.default_rng(0), 3, dimension=8)], "image 1: .*16 .*, got 8;"),
-    ],
-)
+@pytest.mark.parametrize(("images", "message"), [
+    ([], "at least one image, got none"),
+    ([spoiled(descriptors=np.zeros((16, 5), np.float32))], r"image 0: .*\[N, D\].*\(16, 5\).*transpose"),
+    ([spoiled(scores=np.zeros((5, 1), np.float32))], r"image 0: .*scores \[N\]"),
+    ([spoiled(mask=np.ones(5))], "mask .* bool"),
+    ([*images_of([3]), spoiled(descriptors=2 * images_of([5])[0].descriptors)], "image 1: .*unit length, got 2;"),
+    ([*images_of([3]), make_features(np.random.default_rng(0), 3, dimension=8)], "image 1: .*16 .*, got 8;"),
+])  # fmt: skip
 def test_own_features_that_do_not_fit_are_refused(images, message):
     with pytest.raises(InputError, match=message) as error:
         FeatureSet.of(images)
@@ -195,9 +190,8 @@ def test_what_fits_is_read_once():
 def test_few_slots_hold_the_rows_in_use_and_reads_are_as_few_as_can_be():
     """Against a model that knows what was used when."""
     counts = [30] * 60 + [200] * 40
-    images = images_of(counts)
-    source = Counting(FeatureSet.of(images).source)
-    slots = Slots(FeatureSet(source, {}), np.arange(100), 0, DEVICE)
+    images, (features, source) = images_of(counts), counted(counts)
+    slots = Slots(features, np.arange(100), 0, DEVICE)
     source.reads.clear()
     rng = np.random.default_rng(1)
     there, reads = {32: [], 224: []}, 0  # by capacity, what was used longest ago first
@@ -246,7 +240,7 @@ def test_rows_are_written_by_one_program_for_each_capacity(compilations):
     rng = np.random.default_rng(5)
 
     def use(counts, num_rows, budget):
-        features = FeatureSet.of([make_features(rng, count, dimension=24) for count in counts])
+        features = FeatureSet.of(images_of(counts, dimension=24))
         slots = Slots(features, np.arange(len(counts)), budget, DEVICE)
         for part in slots.parts(rng.permutation(len(counts))[:num_rows]):
             jax.block_until_ready(slots.put(slots.stage(part)))

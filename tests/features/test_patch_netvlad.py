@@ -1,6 +1,5 @@
 """Patch-NetVLAD as a system: patches of several sizes, scored by themselves and fused; one pass with its own filter."""
 
-import json
 from dataclasses import replace
 from functools import partial
 
@@ -10,7 +9,6 @@ import pytest
 
 import mfvpr
 from experiments import stages
-from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import NETVLAD
 from mfvpr.datasets import folder_dataset
@@ -20,9 +18,11 @@ from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache, features, vectors
 from mfvpr.utils import InputError
+from tests.features.conftest import read_rows
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
-from tests.programs import results, typed
+from tests.networks.checkpoints import fill
+from tests.programs import results
 from tests.random_checkpoints import netvlad_checkpoint
 
 pytestmark = pytest.mark.thorough
@@ -41,8 +41,7 @@ SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
 
 @pytest.fixture(scope="module")
 def model():
-    plan = plan_network(partial(VggNetVlad, 4, 16))
-    return plan.filled(convert(netvlad_checkpoint(4, 16), NETVLAD, plan.shapes))
+    return fill(partial(VggNetVlad, 4, 16), NETVLAD, netvlad_checkpoint(4, 16))
 
 
 @pytest.fixture(scope="module")
@@ -172,15 +171,14 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
 
 
 @pytest.fixture
-def program(weights, street_settings, tmp_path, monkeypatch, capsys):
+def program(run_program, weights, street_settings, tmp_path, monkeypatch):
+    """Run a command line with small images; return its folder and its messages."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
     small = ("features.weights=patchnetvlad_mapillary_128", "features.image_size=[160,128]", "candidates=5")
 
-    def run(kind, *more, last=()):
+    def run(kind, *more, code=0):
         out = tmp_path / str(len([*tmp_path.iterdir()]))
-        options = (*street_settings, *more, *small, f"out={out}", *last)
-        code, stdout, stderr = typed(monkeypatch, capsys, kind, *options)
-        return out, code, stdout, stderr
+        return out, run_program(kind, *street_settings, *small, f"out={out}", *more, code=code)
 
     return run
 
@@ -192,12 +190,10 @@ def program(weights, street_settings, tmp_path, monkeypatch, capsys):
 def test_its_configurations_run_by_name(program, system, scorer):
     reach = () if scorer == "homography" else ("scorer.size=[80,48]",)
     if reach:  # at another size of images, that of the configuration is another score
-        _, code, _, stderr = program("evaluate", f"system={system}")
-        assert code == 2
+        _, stderr = program("evaluate", f"system={system}", code=2)
         assert "scorer.size=[560, 400]: expected [80, 48]" in stderr
-    out, code, _, stderr = program("evaluate", f"system={system}", "figures=2", *reach)
-    assert code == 0, stderr
-    rows = json.loads((out / "results.json").read_text())
+    out, _ = program("evaluate", f"system={system}", "figures=2", *reach)
+    rows = read_rows(out)
     assert [row["system"] for row in rows if row["decides"]] == [scorer] * 3
     assert rows[0]["features"]["patch_sizes"] == ([2, 5, 8] if "performance" in system else [5])
     assert rows[0]["filter"]["name"] == "same"
@@ -207,15 +203,11 @@ def test_its_configurations_run_by_name(program, system, scorer):
 def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
     options = ("features=patch_netvlad", "features.patch_sizes=[2,4]", "retrieval=same", "scorer=count")
     many = (*options, "scorer=histogram", "features.scale_weights=[1,3]")
-    out, code, _, stderr = program("sweep", *many, "grid.bin_size=[8,16]")
-    assert code == 0, stderr
-    swept = results(out)["settings"]
-    for setting in swept[:2]:
-        alone, code, _, stderr = program("evaluate", *many, f"scorer.bin_size={setting['parameters']['bin_size']}",
-                                         "figures=0")  # fmt: skip
-        assert code == 0, stderr
-        rows = json.loads((alone / "results.json").read_text())
-        expected = [row["recall_at"]["1"] for row in rows if row["system"] == "histogram"]
+    out, _ = program("sweep", *many, "grid.bin_size=[8,16]")
+    for setting in results(out)["settings"][:2]:
+        bin_size = setting["parameters"]["bin_size"]
+        alone, _ = program("evaluate", *many, f"scorer.bin_size={bin_size}", "figures=0")
+        expected = [row["recall_at"]["1"] for row in read_rows(alone) if row["system"] == "histogram"]
         assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
 
 
@@ -226,24 +218,20 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
     (("features.image_size=null",), "features.image_size=null: expected width and height"),
 ])  # fmt: skip
 def test_settings_of_other_sizes_are_refused(program, options, words):
-    _, code, _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", last=options)
-    assert code == 2
+    _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", *options, code=2)
     assert words in stderr
 
 
 def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
     scales = ("features=patch_netvlad", "features.patch_sizes=[2,4]")
-    _, code, _, stderr = program("learn", *scales, "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]")
-    assert code == 2
-    words = "features.patch_sizes=[2, 4]: expected one size"
-    assert words in stderr.splitlines()[-1]
+    options = "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]"
+    _, stderr = program("learn", *scales, *options, code=2)
+    assert "features.patch_sizes=[2, 4]: expected one size" in stderr.splitlines()[-1]
     monkeypatch.setattr(stages, "dataset_of", None)  # told before
-    _, code, _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]")
-    assert code == 2
+    _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]", code=2)
     assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr
 
 
-def test_other_features_have_no_global_descriptor(street_settings, tmp_path, monkeypatch, capsys):
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *street_settings, "retrieval=same", f"out={tmp_path}/out")
-    assert code == 2
+def test_other_features_have_no_global_descriptor(run_program, street_settings, tmp_path):
+    stderr = run_program("evaluate", *street_settings, "retrieval=same", f"out={tmp_path}/out", code=2)
     assert "retrieval=same: expected features with a global descriptor" in stderr

@@ -1,18 +1,14 @@
 """SelaVPR as a system, and DINOv2 as a filter, by name, with weights converted as anybody's are; small networks."""
 
-import json
-import signal
-import sys
 from functools import partial
 
 import numpy as np
 import pytest
 
-from experiments import weights
 from mfvpr.checkpoints import networks
 from mfvpr.checkpoints.tables import DINOV2, SELAVPR
 from mfvpr.networks import SelaVpr, VisionTransformer
-from tests.programs import typed
+from tests.features.conftest import read_rows
 from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint, write_zip
 
 
@@ -26,7 +22,7 @@ def training(tensors):
 
 
 @pytest.fixture
-def program(street_settings, tmp_path, monkeypatch, capsys):
+def program(run_program, street_settings, tmp_path, monkeypatch):
     """A command line, with small networks under the published names, none of which is installed yet."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
@@ -36,22 +32,9 @@ def program(street_settings, tmp_path, monkeypatch, capsys):
     build = partial(VisionTransformer, 64, 1, 1)
     monkeypatch.setitem(networks.NETWORKS, "dinov2_vits14", networks.Network(lambda: build, DINOV2))
 
-    def converted(*arguments):
-        monkeypatch.setattr(sys, "argv", ["weights", *map(str, arguments)])
-        handler, code = signal.getsignal(signal.SIGTERM), 0
-        capsys.readouterr()
-        try:
-            weights.main()
-        except SystemExit as end:
-            code = end.code or 0
-        signal.signal(signal.SIGTERM, handler)
-        return code, *capsys.readouterr()
-
-    def run(kind, *more):
-        if kind == "weights":
-            return converted(*more)
-        options = (*street_settings, f"out={tmp_path}/out", *more)
-        return typed(monkeypatch, capsys, kind, *options)
+    def run(kind, *more, code=0):
+        settings = () if kind == "weights" else (*street_settings, f"out={tmp_path}/out")
+        return run_program(kind, *settings, *more, code=code)
 
     return run
 
@@ -66,14 +49,11 @@ def checkpoint(folder, name="SelaVPR_msls", registers=0):
     ("selavpr_msls", "SelaVPR_msls"), ("selavpr_pitts", "SelaVPR_pitts30k"),
 ])  # fmt: skip
 def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, system, file):
-    code, _, stderr = program("evaluate", f"system={system}")
-    assert code == 2
+    stderr = program("evaluate", f"system={system}", code=2)
     assert f"not installed in {tmp_path}/weights; get {file}.pth from https://drive.google.com/" in stderr
-    code, _, stderr = program("weights", "convert", checkpoint(tmp_path, file))
-    assert code == 0, stderr
-    code, _, stderr = program("evaluate", f"system={system}", "features.image_size=[56,42]", "candidates=6")
-    assert code == 0, stderr
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())
+    program("weights", "convert", checkpoint(tmp_path, file))
+    program("evaluate", f"system={system}", "features.image_size=[56,42]", "candidates=6")
+    rows = read_rows(tmp_path / "out")
     assert [row["system"] for row in rows if row["decides"]] == ["count"] * 3
     assert (rows[0]["filter"]["name"], rows[0]["candidates"]) == ("same", 6)
     assert {row["parameters"]["single"] for row in rows if row["system"] == "count"} == {"zero"}
@@ -81,50 +61,37 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
 
 @pytest.mark.slow
 def test_its_positions_serve_the_scores_of_shifts(program, tmp_path):
-    assert program("weights", "convert", checkpoint(tmp_path))[0] == 0
+    program("weights", "convert", checkpoint(tmp_path))
     options = "features=selavpr", "features.image_size=[112,84]", "retrieval=same", "scorer=histogram", "candidates=6"
-    code, _, stderr = program("evaluate", *options, "figures=0")
-    assert code == 0, stderr
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert {row["features"]["name"] for row in rows} == {"selavpr"}
+    program("evaluate", *options, "figures=0")
+    assert {row["features"]["name"] for row in read_rows(tmp_path / "out")} == {"selavpr"}
 
 
 def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_path):
     without, with_registers = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
-    code, _, stderr = program("weights", "convert", without, "--as", "selavpr_msls_registers")
-    assert code == 2
+    stderr = program("weights", "convert", without, "--as", "selavpr_msls_registers", code=2)
     assert "1 missing (backbone.registers); use the official SelaVPR_reg4_msls.pth" in stderr
-    code, _, stderr = program("weights", "convert", with_registers, "--as", "selavpr_msls")
-    assert code == 2
-    assert "register_tokens" in stderr
-    assert program("weights", "convert", with_registers)[0] == 0
+    assert "register_tokens" in program("weights", "convert", with_registers, "--as", "selavpr_msls", code=2)
+    program("weights", "convert", with_registers)
     small = "features.image_size=[28,28]", "candidates=3", "figures=0"
-    code, _, stderr = program("evaluate", "system=selavpr_msls", "features.weights=selavpr_msls_registers", *small)
-    assert code == 0, stderr
+    program("evaluate", "system=selavpr_msls", "features.weights=selavpr_msls_registers", *small)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pooling", ["cls", "gem"])
 def test_dinov2_is_a_filter(program, tmp_path, pooling):
     tensors = transformer_checkpoint(dinov2_shapes(64, 1))
-    path = write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors)
-    assert program("weights", "convert", path)[0] == 0
+    program("weights", "convert", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
     options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
     small = "features.max_keypoints=50", "candidates=5", "figures=0"
-    code, _, stderr = program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
-    assert code == 0, stderr
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert {row["filter"]["pooling"] for row in rows} == {pooling}
-    code, _, stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2")
-    assert code == 2
+    program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
+    assert {row["filter"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
+    stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2", code=2)
     assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
 
 
 def test_wrong_weights_are_told(program, tmp_path):
     path = write_zip(tmp_path / "SelaVPR_msls.pth", transformer_checkpoint(dinov2_shapes(64, 1)))
-    code, _, stderr = program("weights", "convert", path)
-    assert code == 2
-    assert "expected the keys of another network, got those of dinov2" in stderr or "dinov2" in stderr
-    code, _, stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf")
-    assert code == 2
+    assert "expected the keys of another network, got those of dinov2" in program("weights", "convert", path, code=2)
+    stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf", code=2)
     assert "features.weights=d2_tf: expected weights of selavpr: one of selavpr_pitts30k" in stderr

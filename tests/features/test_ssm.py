@@ -10,11 +10,11 @@ import pytest
 from flax import nnx
 
 import mfvpr
-from mfvpr import Features, Shortlist
 from mfvpr.datasets import ImageFolder, folder_dataset, sequences_dataset
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
+from mfvpr.features.network import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matching import Matching
@@ -28,6 +28,7 @@ from mfvpr.utils import InputError
 from mfvpr.utils.fingerprints import difference, fingerprint
 from mfvpr.utils.whitening import Whitening, fit_whitening
 from tests.builders import local
+from tests.matching.arrays import make_shortlist
 
 pytestmark = pytest.mark.thorough
 
@@ -59,22 +60,25 @@ def dataset(small_street):
     return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
+@pytest.fixture(scope="module")
+def learned(cells, dataset):
+    """The cells with a whitening of the database."""
+    return fit_to_database(cells, dataset.database, FeatureCache())
+
+
 # Windows
 
 
 @pytest.mark.parametrize(("shape", "size", "stride"), [((5, 7, 2), 3, 1), ((8, 5, 3), 3, 2), ((4, 4, 1), 4, 1)])
 def test_windows_are_those_of_the_loops(shape, size, stride):
     image_map, positions = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
-    expected = [
-        image_map[row : row + size, column : column + size].reshape(-1)
-        for row in range(0, shape[0] - size + 1, stride)
-        for column in range(0, shape[1] - size + 1, stride)
-    ]
+    expected = [image_map[row : row + size, column : column + size].reshape(-1)
+                for row in range(0, shape[0] - size + 1, stride)
+                for column in range(0, shape[1] - size + 1, stride)]  # fmt: skip
     assert positions.count == len(expected) == np.prod(positions.grid)
     np.testing.assert_array_equal(positions.take(image_map, np.arange(positions.count)), expected)
-    np.testing.assert_array_equal(
-        positions.take(image_map, np.array([1, 0]) % positions.count), np.take(expected, [1, 0], 0, mode="wrap")
-    )
+    places = np.array([1, 0]) % positions.count
+    np.testing.assert_array_equal(positions.take(image_map, places), np.take(expected, places, 0))
 
 
 def test_a_convolution_is_the_whitening_of_every_window():
@@ -113,14 +117,6 @@ def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, ze
     assert replace(how, seed=8).drawn(9) != rows
 
 
-def test_images_that_cannot_be_read_have_no_windows():
-    rng, positions, how = np.random.default_rng(4), Windows((4, 4, 2), 3), WindowFitting(3, dtype="float64")
-    maps = {row: rng.normal(size=(4, 4, 2)) for row in range(6) if row != 2}
-    learned = how.fit([maps], positions, how.drawn(6))
-    expected = fit_whitening(np.concatenate([positions.take(values, np.arange(4)) for values in maps.values()]), 3)
-    np.testing.assert_array_equal(learned.components, expected.components)
-
-
 def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
     monkeypatch.setattr(windows, "free_host_bytes", lambda: 3 * 10**9)
     rows = [*range(250)]
@@ -130,25 +126,22 @@ def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
 
 def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
     single_image = ImageFolder(dataset.database.root, dataset.database.names[:1])
-    few = replace(cells, whitening=WindowFitting(12))
+    few, enough = (replace(cells, whitening=WindowFitting(dimension)) for dimension in (12, 11))
     with pytest.raises(InputError, match=r"12 descriptors .*got 12 .*4608"):
         fit_to_database(few, single_image, FeatureCache())
-    assert np.isfinite(
-        fit_to_database(replace(cells, whitening=WindowFitting(11)), single_image, FeatureCache()).whitening.components
-    ).all()
+    assert np.isfinite(fit_to_database(enough, single_image, FeatureCache()).whitening.components).all()
 
 
 # Images
 
 
-def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
-    learned = fit_to_database(cells, dataset.database, FeatureCache())
+def test_cells_are_whitened_windows_at_their_places(model, cells, learned):
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
     maps = [image_map.vector.reshape(5, 6, 512).astype(np.float64) for image_map in SsmMaps(model, 2, SMALL)(images)]
     windows_of_map = Windows((5, 6, 512), 3)
+    whitening = learned.whitening
     assert cells.scales == learned.scales == ((6, 12, 1.0),)
     for features, image_map in zip(local(learned(images)), maps, strict=True):
-        whitening = learned.whitening
         expected = (windows_of_map.take(image_map, np.arange(12)) - whitening.mean) @ whitening.components.T
         np.testing.assert_allclose(features.descriptors, expected, atol=1e-4 * np.abs(expected).max())
         assert features.descriptors.dtype == features.keypoints.dtype == np.float32
@@ -159,16 +152,9 @@ def test_cells_are_whitened_windows_at_their_places(model, cells, dataset):
     np.testing.assert_allclose(np.linalg.norm(maps[0], axis=-1), 1, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("pixels", "stride", "grid"),
-    [(224, 1, (26, 26)), (336, 1, (40, 40)), (448, 1, (54, 54)), (416, 2, (25, 25))],
-)
-def test_the_grids_are_the_published_ones(model, pixels, stride, grid):
-    assert SsmCells(model, (pixels, pixels), stride=stride).windows.grid == grid
-
-
-def test_the_filter_has_36_windows_of_125_numbers(model):
-    assert SsmWindows(model).windows.count == 36
+def test_grids_and_windows_are_the_published_ones(model):
+    for pixels, stride, side in ((224, 1, 26), (336, 1, 40), (448, 1, 54), (416, 2, 25)):
+        assert SsmCells(model, (pixels, pixels), stride=stride).windows.grid == (side, side)
     assert SsmWindows(model).windows.dimension == 41472
     assert SsmWindows(model).vector_size == 36 * 125
 
@@ -181,31 +167,26 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
     with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
         cells(np.zeros((1, 40, 48, 3), np.uint8))
     with pytest.raises(InputError, match=r"SsmCells: .*whitening .*4608 .*got .*41472"):
-        replace(cells, whitening=nothing(41472, 3))(np.zeros((1, 40, 48, 3), np.uint8))
+        replace(cells, whitening=Whitening(np.zeros(41472), np.zeros((3, 41472))))(np.zeros((1, 40, 48, 3), np.uint8))
 
 
 @pytest.mark.parametrize(("images", "printed"), [(220, 161.5), (1415, 911.4)])
-def test_databases_are_of_the_published_size(model, images, printed, tmp_path):
+def test_databases_are_of_the_published_size(model, images, printed):
     """In MiB: vectors of both stages in float32, and both whitenings, the second in float64."""
     arrays, whitenings = 0, 0
     for extractor, vectors in ((SsmWindows(model), 36), (SsmCells(model), 1600)):
         how, positions = extractor.whitening, extractor.windows
-        learned = Whitening(
-            *(np.zeros(shape, how.dtype) for shape in (positions.dimension, (how.dimension, positions.dimension)))
-        )
         assert positions.count == vectors
-        arrays += np.zeros((positions.count, learned.dimension), np.float32).nbytes
-        whitenings += learned.mean.nbytes + learned.components.nbytes
+        arrays += 4 * vectors * how.dimension
+        whitenings += np.dtype(how.dtype).itemsize * (1 + how.dimension) * positions.dimension
     assert (images * arrays + whitenings) / 2**20 == pytest.approx(printed, rel=0.01)
     assert whitenings / 2**20 == pytest.approx(19.93 + 3.55, rel=0.01)
 
 
 def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
     """Directions of cells in float16, beside their lengths, places and scores."""
-    cache = FeatureCache(tmp_path)
-    [store] = cache.local(
-        dataset.database, fit_to_database(replace(cells, whitening=WindowFitting(100)), dataset.database, cache)
-    )
+    cache, wide = FeatureCache(tmp_path), replace(cells, whitening=WindowFitting(100))
+    [store] = cache.local(dataset.database, fit_to_database(wide, dataset.database, cache))
     [(_, features)] = store.read([0])
     parts = pack_features(features)
     assert features.descriptors.nbytes == 12 * 100 * 4
@@ -216,41 +197,33 @@ def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
 # What is learned
 
 
-def nothing(size, dimension, dtype="float32"):
-    """A whitening of the right shapes."""
-    return Whitening(np.zeros(size, dtype), np.zeros((dimension, size), dtype))
-
-
 def kept(root):
     return sorted(root.glob("*whitening*.npz"))
 
 
-def test_what_is_learned_is_kept_and_made_once(cells, dataset, tmp_path):
+def labeled_cache(root, labels):
+    """A cache that adds what it computes to the labels."""
+    return FeatureCache(root, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+
+
+def test_what_is_learned_is_kept_and_made_once(cells, learned, dataset, tmp_path):
     labels = []
-
-    def cache():
-        return FeatureCache(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
-
-    first = fit_to_database(cells, dataset.database, cache())
+    first, again = (fit_to_database(cells, dataset.database, labeled_cache(tmp_path, labels)) for _ in range(2))
     assert labels == ["SsmCells whitening"]
-    again = fit_to_database(cells, dataset.database, cache())
-    assert labels == ["SsmCells whitening"]
-    assert fit_to_database(again, dataset.database, cache()) is again
+    assert fit_to_database(again, dataset.database, FeatureCache()) is again
     np.testing.assert_array_equal(again.whitening.components, first.whitening.components)
-    np.testing.assert_array_equal(
-        fit_to_database(cells, dataset.database, FeatureCache()).whitening.mean, first.whitening.mean
-    )
+    np.testing.assert_array_equal(learned.whitening.mean, first.whitening.mean)
     [path] = kept(tmp_path)
     assert {*np.load(path).files} == {"mean", "components", "recipe"}
 
 
 def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
     cache, how, other = FeatureCache(tmp_path), cells.whitening, network(1)
-    learned = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
+    extractors = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
     assert len(kept(tmp_path)) == 2
-    assert not np.array_equal(*(extractor.whitening.components for extractor in learned))
+    assert not np.array_equal(*(extractor.whitening.components for extractor in extractors))
     # A hash of it is part of all that is computed with it.
-    recipes = [cache.recipe(dataset.database, replace(cells, whitening=extractor.whitening)) for extractor in learned]
+    recipes = [cache.recipe(dataset.database, extractor) for extractor in extractors]
     assert "whitening" in difference(*recipes)
     variants = [
         cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
@@ -262,15 +235,11 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     ]  # fmt: skip
     recipes = [whitening_recipe(extractor, extractor.whitening, dataset.database, cache) for extractor in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
-    same = replace(cells, batch_size=1)
-    assert whitening_recipe(same, how, dataset.database, cache) == recipes[0]
+    assert whitening_recipe(replace(cells, batch_size=1), how, dataset.database, cache) == recipes[0]
 
 
-def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_path):
-    learned, image = (
-        fit_to_database(cells, dataset.database, FeatureCache(tmp_path)),
-        np.zeros((1, 40, 48, 3), np.uint8),
-    )
+def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, dataset, tmp_path):
+    image = np.zeros((1, 40, 48, 3), np.uint8)
     for change in (
         {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
         {"image_size": (40, 48)},
@@ -278,7 +247,8 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, dataset, tmp_
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image)
     assert len(replace(learned, batch_size=1)(image)) == 1
-    assert fit_to_database(cells, dataset.database, FeatureCache()).whitening.origin == learned.whitening.origin != ""
+    cached = fit_to_database(cells, dataset.database, FeatureCache(tmp_path))
+    assert cached.whitening.origin == learned.whitening.origin != ""
 
 
 def test_files_that_are_damaged_or_exchanged_are_refused(cells, dataset, tmp_path):
@@ -308,13 +278,11 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
 
 
 def test_candidates_without_cells_score_zero():
-    vectors, size = np.eye(16, dtype=np.float32), np.full(2, 48, np.float32)
-    image = Features(np.zeros((16, 2), np.float32), vectors, np.ones(16, np.float32), np.ones(16, bool), size)
-    empty = jax.tree.map(lambda leaf: leaf[:0], image)
-    empty = replace(empty, image_size=size)
+    image, empty = (
+        local_features(np.zeros((count, 2)), np.eye(count, 16, dtype=np.float32), (48, 48)) for count in (16, 0)
+    )
     queries, database = (FeatureSet.of(images, unit_length=False) for images in ([image, empty], [empty, image]))
-    indices = np.array([[0, 1]] * 2, np.int32)
-    candidates = Shortlist(indices, np.zeros((2, 2), np.float32), indices >= 0)
+    candidates = make_shortlist([[0, 1]] * 2)
     matches = stages.match(queries, database, candidates, CANDIDATE)
     scores = stages.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
     np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
@@ -330,11 +298,9 @@ def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
 
 
 def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, dataset, tmp_path):
-    labels = []
-    cache = FeatureCache(tmp_path, track=lambda label: labels.append(label) or (lambda items, total=None: items))
-    root = small_street / "queries"
-    several = sequences_dataset(small_street / "database", [root, small_street / "database"], ground_truth="none")
-    options = {"candidates": 3, "matching": CANDIDATE, "cache": cache}
+    labels, database = [], small_street / "database"
+    several = sequences_dataset(database, [small_street / "queries", database], ground_truth="none")
+    options = {"candidates": 3, "matching": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
     report = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = report.matched

@@ -5,29 +5,18 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import Features, GridAnchors, Shortlist
-from mfvpr.checkpoints import entry_of
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.tables import SSM
+from mfvpr import GridAnchors, Shortlist
 from mfvpr.datasets import resize
 from mfvpr.features import WindowFitting
+from mfvpr.features.network import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation
 from mfvpr.retrieval.ssm_voting import vote
 from tests.builders import make_matches
-from tests.golden.make_ssm import (
-    CANDIDATES,
-    DATABASE,
-    DIMENSIONS,
-    GOLDEN,
-    IMAGES,
-    MAPS,
-    QUERIES,
-    made_up_map,
-    picture,
-)
+from tests.golden import make_ssm
+from tests.golden.make_ssm import CANDIDATES, DIMENSIONS, IMAGES, MAPS, made_up_map, picture
+from tests.networks.checkpoints import fill_published
 from tests.random_checkpoints import places365_shapes, random_checkpoint
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
@@ -41,7 +30,7 @@ match = jax.jit(mfvpr.match, static_argnames="cross_check")
 
 @pytest.fixture(scope="module")
 def golden():
-    return dict(np.load(GOLDEN))
+    return dict(np.load(make_ssm.GOLDEN))
 
 
 def described(maps, stage, num_database):
@@ -52,12 +41,25 @@ def described(maps, stage, num_database):
     return vectors[:num_database], vectors[num_database:]
 
 
-def of_maps(seed, stage):
+def rows_of(num_database, num_queries):
+    """(row, whether it is a query) of all images."""
+    return [*((row, False) for row in range(num_database)), *((row, True) for row in range(num_queries))]
+
+
+def of_maps(case, stage):
     """Whitened windows of the made-up maps."""
-    rows = [(row, False) for row in range(DATABASE)] + [(row, True) for row in range(QUERIES)]
-    return described(
-        np.asarray(normalize_maps(np.stack([made_up_map(seed, stage, *row) for row in rows]))), stage, DATABASE
-    )
+    maps = [made_up_map(MAPS[case], stage, *row) for row in rows_of(make_ssm.DATABASE, make_ssm.QUERIES)]
+    return described(np.asarray(normalize_maps(np.stack(maps))), stage, make_ssm.DATABASE)
+
+
+def of_images(case, stage):
+    """Whitened windows of the pictures by a network with random weights."""
+    seed, pixels, *counts = IMAGES[case]
+    size = (224, 224) if stage == 1 else (pixels, pixels)
+    model = fill_published("vgg16_places365", random_checkpoint(places365_shapes(full=False), seed))
+    maps = SsmMaps(model, stage, size)
+    computed = maps(np.stack([resize(picture(*row), size) for row in rows_of(*counts)]))
+    return described(np.stack([result.vector.reshape(maps.shape) for result in computed]), stage, counts[0])
 
 
 def assert_same_space(got, expected, tolerance):
@@ -77,28 +79,25 @@ def assert_votes(shortlist, votes, candidates):
 
 @pytest.mark.parametrize("case", MAPS)
 def test_windows_and_their_votes(golden, case):
-    database, queries = of_maps(MAPS[case], 1)
+    database, queries = of_maps(case, 1)
     assert_same_space(database, golden[f"{case}/windows"], 2e-4)  # which sums in float32
     assert_votes(vote(queries, database, CANDIDATES), golden[f"{case}/votes"], golden[f"{case}/candidates"])
 
 
 @pytest.mark.parametrize("case", MAPS)
 def test_cells_and_their_matches(golden, case):
-    database, queries = of_maps(MAPS[case], 2)
+    database, queries = of_maps(case, 2)
     assert_same_space(database, golden[f"{case}/cells"], 1e-6)
-    for query, rows in enumerate(golden[f"{case}/candidates"]):
-        for place, row in enumerate(rows):
-            matches = match(image(queries[query]), image(database[row]), cross_check="candidate")
-            np.testing.assert_array_equal(matches.index0, golden[f"{case}/index"][query, place].reshape(-1))
-            np.testing.assert_array_equal(matches.index1, np.arange(len(database[row])))
-            assert int(score(GridAnchors(10), matches)) == golden[f"{case}/scores"][query, place]
+    for place, row in np.ndenumerate(golden[f"{case}/candidates"]):
+        matches = match(image(queries[place[0]]), image(database[row]), cross_check="candidate")
+        np.testing.assert_array_equal(matches.index0, golden[f"{case}/index"][place].reshape(-1))
+        np.testing.assert_array_equal(matches.index1, np.arange(len(database[row])))
+        assert int(score(GridAnchors(10), matches)) == golden[f"{case}/scores"][place]
 
 
 def image(vectors):
     """Features of cells."""
-    count = len(vectors)
-    return Features(np.zeros((count, 2), np.float32), vectors, np.ones(count, np.float32), np.ones(count, bool),
-                    np.full(2, 100, np.float32))  # fmt: skip
+    return local_features(np.zeros((len(vectors), 2)), vectors, (100, 100))
 
 
 @pytest.mark.parametrize("case", [*MAPS, *IMAGES])
@@ -108,11 +107,11 @@ def test_scores_are_equal_as_whole_numbers(golden, case):
     side = index.shape[-1]
     cells = np.arange(side**2)
     points = np.zeros((side**2, 2))
-    for query, place in np.ndindex(index.shape[:2]):
-        pair = make_matches(points, points, index0=index[query, place].reshape(-1), index1=cells,
-                            count0=side**2, count1=side**2)  # fmt: skip
-        assert int(score(GridAnchors(side), pair)) == golden[f"{case}/scores"][query, place]
-        assert int(score(GridAnchors(side, outside="zero"), pair)) == golden[f"{case}/zero_scores"][query, place]
+    counts = {"count0": side**2, "count1": side**2}
+    for place in np.ndindex(index.shape[:2]):
+        pair = make_matches(points, points, index0=index[place].reshape(-1), index1=cells, **counts)
+        assert int(score(GridAnchors(side), pair)) == golden[f"{case}/scores"][place]
+        assert int(score(GridAnchors(side, outside="zero"), pair)) == golden[f"{case}/zero_scores"][place]
 
 
 @pytest.mark.parametrize("case", [*MAPS, *IMAGES])
@@ -124,26 +123,9 @@ def test_frame_correlation_weighs_as_published(golden, case):
     assert (got[2:] > scores[2:]).all()
 
 
-@pytest.fixture(scope="module")
-def of_images():
-    """Whitened windows of the pictures by a network with random weights."""
-
-    def of_images(case, stage):
-        seed, pixels, num_database, num_queries = IMAGES[case]
-        pixels = 224 if stage == 1 else pixels
-        plan = blueprint(entry_of("vgg16_places365"))
-        model = plan.filled(convert(random_checkpoint(places365_shapes(full=False), seed), SSM, plan.shapes))
-        rows = [(row, False) for row in range(num_database)] + [(row, True) for row in range(num_queries)]
-        maps = SsmMaps(model, stage, (pixels, pixels))
-        computed = maps(np.stack([resize(picture(*row), (pixels, pixels)) for row in rows]))
-        return described(np.stack([result.vector.reshape(maps.shape) for result in computed]), stage, num_database)
-
-    return of_images
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("case", IMAGES)
-def test_images_get_the_votes_of_the_public_program(golden, of_images, case):
+def test_images_get_the_votes_of_the_public_program(golden, case):
     database, queries = of_images(case, 1)
     assert_same_space(database, golden[f"{case}/windows"], 1e-4)
     shortlist = vote(queries, database, min(CANDIDATES, len(database)))
@@ -152,14 +134,13 @@ def test_images_get_the_votes_of_the_public_program(golden, of_images, case):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", IMAGES)
-def test_images_get_the_matches_of_the_public_program(golden, of_images, case):
+def test_images_get_the_matches_of_the_public_program(golden, case):
     """None differs where this was written; elsewhere rounding may choose the other of two that are as near."""
     database, queries = of_images(case, 2)
     side = golden[f"{case}/index"].shape[-1]
-    for query, rows in enumerate(golden[f"{case}/candidates"]):
-        for place, row in enumerate(rows):
-            matches = match(image(queries[query]), image(database[row]), cross_check="candidate")
-            equal = np.asarray(matches.index0) == golden[f"{case}/index"][query, place].reshape(-1)
-            assert equal.mean() > 0.999
-            if equal.all():
-                assert int(score(GridAnchors(side), matches)) == golden[f"{case}/scores"][query, place]
+    for place, row in np.ndenumerate(golden[f"{case}/candidates"]):
+        matches = match(image(queries[place[0]]), image(database[row]), cross_check="candidate")
+        equal = np.asarray(matches.index0) == golden[f"{case}/index"][place].reshape(-1)
+        assert equal.mean() > 0.999
+        if equal.all():
+            assert int(score(GridAnchors(side), matches)) == golden[f"{case}/scores"][place]

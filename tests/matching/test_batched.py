@@ -25,6 +25,7 @@ from mfvpr.types import Shortlist, per_match, per_pair
 from mfvpr.utils import ragged
 from tests.builders import make_features
 from tests.features.test_feature_set import Counting
+from tests.matching.arrays import make_shortlist
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
@@ -49,11 +50,12 @@ def images_of(counts, seed, *, longest=1.0):
 
 
 def shortlist_of(seed=0, queries=20, database=80):
-    """Rows in any order; the second query has no candidates, the fourth fewer than others."""
+    """Rows in any order; the second query has no candidates, the fourth fewer, the fifth one of them twice."""
     rng = np.random.default_rng(seed)
     indices = np.array([rng.permutation(database)[:CANDIDATES] for _ in range(queries)], np.int32)
     indices[1:2] = -1
     indices[3:4, 5:] = -1
+    indices[4:5, 1] = indices[4:5, 0] = 3
     return Shortlist(indices, rng.random(indices.shape, np.float32), indices >= 0)
 
 
@@ -112,17 +114,10 @@ def assert_same(first, second):
 
 @pytest.mark.optimized
 @pytest.mark.first_case
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"cross_check": "none"},
-        {"max_distance": 0.6, "max_matches": 7},
-        {"cross_check": "opencv_legacy", "chunk_size": 3},
-        {"cross_check": "candidate"},
-    ],
-    ids=["mutual", "none", "filtered", "chunks", "candidate"],
-)
+@pytest.mark.parametrize("options", [
+    {}, {"cross_check": "none"}, {"max_distance": 0.6, "max_matches": 7}, {"cross_check": "candidate"},
+    {"cross_check": "opencv_legacy", "chunk_size": 3},
+], ids=["mutual", "none", "filtered", "candidate", "chunks"])  # fmt: skip
 @pytest.mark.parametrize("memory", [None, SMALL], ids=["all fits", "few slots"])
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
@@ -131,14 +126,16 @@ def test_every_pair_is_matched_as_alone(options, memory):
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
     assert match_set.counts.sum() > 300
+    assert match_set.counts[4, 0] == match_set.counts[4, 1] > 0
     assert_as_alone(match_set, queries, database, candidates, expected)
 
 
-def test_descriptors_need_not_be_of_unit_length():
-    queries, database = sets(3.0)
-    candidates = shortlist_of(1)
+@pytest.mark.parametrize("longest", [1.0, 3.0])
+def test_descriptors_of_any_length_and_queries_of_several_capacities(longest):
+    database, queries = sets(longest)
+    candidates = shortlist_of(2, len(queries), len(database))
     match_set = stages.match(queries, database, candidates, memory=SMALL)
-    assert max(matches.distance.max(initial=0) for matches in match_set.matches) > 2
+    assert (max(matches.distance.max(initial=0) for matches in match_set.matches) > 2) == (longest > 1)
     assert_as_alone(match_set, queries, database, candidates, expected_of(queries, database, candidates))
 
 
@@ -169,47 +166,28 @@ def test_stored_features_are_matched_as_those_in_memory(tmp_path):
     assert max(stored[1].source.reads.values()) > 1
 
 
-def test_queries_may_be_of_several_capacities():
-    database, queries = sets()
-    candidates = shortlist_of(2, len(queries), len(database))
-    match_set = stages.match(queries, database, candidates, memory=SMALL)
-    assert_as_alone(match_set, queries, database, candidates, expected_of(queries, database, candidates))
-
-
 @pytest.mark.parametrize("number", [0, 1, QUERIES, QUERIES + 1])
 def test_any_number_of_queries(number):
     """Other queries do not change the matches of a query."""
     (queries, database), candidates = sets(), shortlist_of()
     subset = FeatureSet(InMemory({row: queries[row] for row in range(number)}, number), {})
     few = jax.tree.map(lambda leaf: leaf[:number], candidates)
-    if number:
-        match_set = stages.match(subset, database, few)
-        assert_same(match_set, stages.match(queries, database, candidates).take(range(number)))
-    else:
+    if number == 0:
         with unchecked_shapes():  # counts without a row have no columns
             assert list(stages.match(subset, database, few).matches) == []
+        return
+    assert_same(stages.match(subset, database, few), stages.match(queries, database, candidates).take(range(number)))
 
 
 def test_nothing_to_match():
     """Images without keypoints, and queries without candidates."""
     queries, database = sets()
     empty = FeatureSet.of(images_of([0, 0], 0))
-    for side0, side1, indices in ((empty, database, [[0, 1]] * 2), (queries, empty, [[1, 0]] * len(queries)),
-                                (empty, empty, [[-1, -1]] * 2)):  # fmt: skip
-        indices = np.array(indices, np.int32)
-        match_set = stages.match(side0, side1, Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0))
-        assert match_set.counts.shape == indices.shape
+    for side0, side1, rows in ((empty, database, [0, 1]), (queries, empty, [1, 0]), (empty, empty, [-1, -1])):
+        match_set = stages.match(side0, side1, make_shortlist([rows] * len(side0)))
+        assert match_set.counts.shape == (len(side0), 2)
         assert not match_set.counts.any()
         assert match_set[0].mask.shape == (2, 64)
-
-
-def test_a_candidate_that_comes_twice_is_matched_twice():
-    queries, database = sets()
-    indices = np.array([[3, 3, 1]] * len(queries), np.int32)
-    twice = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
-    match_set = stages.match(queries, database, twice)
-    assert (match_set.counts[:, 0] == match_set.counts[:, 1]).all()
-    assert_as_alone(match_set, queries, database, twice, expected_of(queries, database, twice))
 
 
 def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
@@ -233,6 +211,10 @@ def for_devices():
     return queries, database, shortlist_of(0, 70, 40)
 
 
+def as_hex(match_set):
+    return [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(match_set.matches))]
+
+
 def on_devices(out):
     """Rankings and matches, with eight devices and with one, as JSON."""
     queries, database, candidates = for_devices()
@@ -240,8 +222,7 @@ def on_devices(out):
     for devices, memory in ((jax.devices(), SMALL), (jax.devices()[-1:], SMALL), (None, None)):
         match_set = stages.match(queries, database, candidates, devices=devices, memory=memory)
         scores = stages.score({"histogram": mfvpr.HistogramOfShifts()}, match_set, candidates)["histogram"]
-        content = [np.asarray(leaf).tobytes().hex() for leaf in jax.tree.leaves(list(match_set.matches))]
-        results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": content})
+        results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": as_hex(match_set)})
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))
 
 
@@ -249,19 +230,14 @@ def on_devices(out):
 def test_eight_devices_give_what_one_gives(tmp_path):
     call = f"from tests.matching.test_batched import on_devices; on_devices({str(tmp_path / 'out.json')!r})"
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
-    done = subprocess.run(
-        [sys.executable, "-c", call],
-        cwd=ROOT, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    subprocess.run(
+        [sys.executable, "-c", call], cwd=ROOT, env=os.environ | {"XLA_FLAGS": flags}, timeout=120, check=True
+    )
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["devices"] == 8
     first, *rest = content["results"]
-    assert len(rest) == 2
-    assert all(other == first for other in rest)
-    here = stages.match(*for_devices())
-    leaves = jax.tree.leaves(list(here.matches))
-    assert first["matches"] == [np.asarray(leaf).tobytes().hex() for leaf in leaves]
+    assert rest == [first, first]
+    assert first["matches"] == as_hex(stages.match(*for_devices()))
 
 
 # What comes out
@@ -314,9 +290,8 @@ def test_batches_have_every_pair_with_matches_once(match_set):
             of_query = match_set[query + 3]
             real = matches.mask[number]
             for name, values in per_match(matches).items():
-                np.testing.assert_array_equal(
-                    values[number][real], per_match(of_query)[name][candidate][of_query.mask[candidate]]
-                )
+                expected = per_match(of_query)[name][candidate][of_query.mask[candidate]]
+                np.testing.assert_array_equal(values[number][real], expected)
             np.testing.assert_array_equal(matches.image_size1[number], of_query.image_size1[candidate])
     np.testing.assert_array_equal(seen, counts.reshape(-1) > 0)
     assert (slots(match_set) >= match_set.counts).all()
@@ -340,8 +315,7 @@ def test_some_queries_are_matched_as_all_of_them():
     rng = np.random.default_rng(3)
     queries = FeatureSet.of([make_features(rng, count) for count in (20, 200, 150)])
     database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
-    indices = np.array([[0, 1], [2, 3], [3, 2]], np.int32)
-    listed = Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
+    listed = make_shortlist([[0, 1], [2, 3], [3, 2]])
     options = {"matcher": Matching(), "memory": None, "devices": jax.local_devices()[:1]}
     sizes, call = [], batched.match_pairs
 
@@ -355,5 +329,4 @@ def test_some_queries_are_matched_as_all_of_them():
         of_all, sizes[:] = {*sizes}, []
         alone = dict(batched.match_queries(queries, database, listed, [0], **options))
     assert {*sizes} < of_all
-    for expected, actual in zip(jax.tree.leaves(together[0].matches), jax.tree.leaves(alone[0].matches), strict=True):
-        np.testing.assert_array_equal(expected, actual)
+    jax.tree.map(np.testing.assert_array_equal, alone[0].matches, together[0].matches)

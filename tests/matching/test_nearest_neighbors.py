@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import Features, compact, filter_matches, match, match_candidates, retrieve
+from mfvpr import compact, filter_matches, match, match_candidates, retrieve
 from mfvpr.matching import Matching, match_pairs, nearest_neighbors
-from mfvpr.types import per_match, per_pair
+from mfvpr.types import per_keypoint, per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, unit
+from tests.matching.arrays import stack
 
 pytestmark = pytest.mark.thorough
 
@@ -27,9 +28,14 @@ compact_once = jax.jit(compact, static_argnames="capacity")
 
 
 def found(matches):
-    """[(index0, points1, distance)] of the real slots."""
+    """(index0, points1, distance) of the real slots."""
     slots = np.flatnonzero(matches.mask)
     return tuple(np.asarray(values)[slots] for values in (matches.index0, matches.points1, matches.distance))
+
+
+def assert_pairs(matches, expected):
+    """The same keypoints are matched, in the same order."""
+    assert list(zip(found(matches)[0], matches.index1[matches.mask], strict=True)) == [(i, j) for i, j, _ in expected]
 
 
 @st.composite
@@ -51,8 +57,7 @@ def test_agrees_with_the_oracle(pair, mode):
     expected = oracles.nearest(features0.descriptors[features0.mask], features1.descriptors[features1.mask], mode)
     matches = match_once(features0, features1, cross_check=mode)
     index0, points1, distance = found(matches)
-    assert list(index0) == [i for i, _, _ in expected]
-    assert list(matches.index1[matches.mask]) == [j for _, j, _ in expected]
+    assert_pairs(matches, expected)
     np.testing.assert_array_equal(matches.points0[matches.mask], features0.keypoints[index0])
     np.testing.assert_array_equal(points1, [features1.keypoints[j] for _, j, _ in expected] or np.zeros((0, 2)))
     np.testing.assert_allclose(distance, [d for _, _, d in expected], atol=1e-6)
@@ -67,22 +72,12 @@ def test_an_image_matched_with_itself_is_at_distance_zero(mode):
     assert (distance == 0).all()
 
 
-def test_first_index_wins_on_both_sides():
-    rng = np.random.default_rng(1)
-    copies = make_features(rng, 3)
-    copies.descriptors[:] = copies.descriptors[0]
-    slots, points1, _ = found(match_once(copies, copies))
-    assert list(slots) == [0]
-    np.testing.assert_array_equal(points1[0], copies.keypoints[0])
-
-
 @pytest.mark.parametrize("chunk_size", [None, 1, 2, 3, 5, 50])
 def test_every_chunk_size_gives_the_loop(chunk_size):
     rng = np.random.default_rng(2)
     query = make_features(rng, 20, capacity=24)
     candidates = [make_features(rng, count, capacity=30) for count in (30, 0, 7, 1, 22)]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
-    got = match_candidates_once(query, batch, with_ratio=True, chunk_size=chunk_size)
+    got = match_candidates_once(query, stack(candidates), with_ratio=True, chunk_size=chunk_size)
     for row, candidate in enumerate(candidates):
         alone = match_once(query, candidate, with_ratio=True)
         np.testing.assert_array_equal(got.mask[row], alone.mask)
@@ -95,11 +90,8 @@ def test_every_chunk_size_gives_the_loop(chunk_size):
 def test_similarities_of_all_candidates_never_exist_at_once_on_a_cpu():
     """The compiled program's temporary memory is one similarity matrix or two, not fifty."""
     num, candidates = 256, 50
-    image = Features(
-        *(jax.ShapeDtypeStruct(s, d) for s, d in [((num, 2), "f4"), ((num, 64), "f4"), ((num,), "f4"), ((num,), bool)]),
-        jax.ShapeDtypeStruct((2,), "f4"),
-    )
-    batch = jax.tree.map(lambda s: jax.ShapeDtypeStruct((candidates, *s.shape), s.dtype), image)
+    image = make_features(np.random.default_rng(0), num, dimension=64)
+    batch = stack([image] * candidates)
     compiled = jax.jit(match_candidates).lower(image, batch).compile()
     assert compiled.memory_analysis().temp_size_in_bytes < 6 * num * num * 4
 
@@ -109,8 +101,7 @@ def test_gradients_reach_the_descriptors_and_are_finite():
     features0, features1 = make_features(rng, 10, capacity=12), make_features(rng, 9, capacity=12)
 
     def total(descriptors):
-        image = Features(features0.keypoints, descriptors, features0.scores, features0.mask, features0.image_size)
-        matches = match(image, features1)
+        matches = match(replace(features0, descriptors=descriptors), features1)
         return jnp.sum(jnp.where(matches.mask, matches.distance, 0.0))
 
     gradient = jax.jit(jax.grad(total))(jnp.asarray(features0.descriptors))
@@ -147,7 +138,7 @@ def test_compact_moves_real_matches_to_the_front_in_order():
 @pytest.mark.parametrize("counts", [(0, 0), (0, 5), (5, 0)])
 def test_images_without_a_single_slot(mode, counts):
     features0, features1 = (make_features(np.random.default_rng(6), count) for count in counts)
-    batch = jax.tree.map(lambda leaf: np.stack([leaf] * 5), features1)
+    batch = stack([features1] * 5)
     for matches in (
         match_once(features0, features1, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode),
@@ -170,11 +161,9 @@ def test_padding_is_not_nearer_than_what_looks_the_opposite(mode):
     real = [features.descriptors[features.mask] for features in pair]
     assert (real[0] @ real[1].T).max() < 0
     matches = match_once(*pair, cross_check=mode, with_ratio=True)
-    expected = oracles.nearest(*real, mode)
-    assert [(i, j) for i, j, _ in expected] == list(zip(found(matches)[0], matches.index1[matches.mask], strict=True))
+    assert_pairs(matches, oracles.nearest(*real, mode))
     alone = [
-        jax.tree.map(lambda field, f=f: field[f.mask] if np.ndim(field) and len(field) == 32 else field, f)
-        for f in pair
+        replace(image, **{name: values[image.mask] for name, values in per_keypoint(image).items()}) for image in pair
     ]
     ratio = match_once(*alone, cross_check=mode, with_ratio=True).ratio
     slots = np.flatnonzero(pair[mode == "candidate"].mask)
@@ -197,11 +186,10 @@ def test_numbers_that_do_not_come_out_even_in_blocks(mode, counts):
     rng = np.random.default_rng(13)
     pair = [make_features(rng, count, capacity=count) for count in counts]
     matches = match_once(*pair, cross_check=mode, with_ratio=True)
-    expected = oracles.nearest(*(features.descriptors for features in pair), mode)
     slots = counts[mode == "candidate"]
     assert matches.mask.shape == (slots,)
     assert {len(values) for values in per_match(matches).values()} == {slots}
-    assert [(i, j) for i, j, _ in expected] == list(zip(found(matches)[0], matches.index1[matches.mask], strict=True))
+    assert_pairs(matches, oracles.nearest(*(features.descriptors for features in pair), mode))
     assert (int(matches.count0), int(matches.count1)) == counts
 
 
@@ -257,8 +245,7 @@ def test_half_precision_gives_what_single_precision_of_the_same_values_gives():
     pair = [make_features(rng, 60, dimension=64) for _ in range(2)]
     half = [replace(features, descriptors=features.descriptors.astype(np.float16)) for features in pair]
     single = [replace(features, descriptors=features.descriptors.astype(np.float32)) for features in half]
-    for got, expected in zip(jax.tree.leaves(match_once(*half)), jax.tree.leaves(match_once(*single)), strict=True):
-        np.testing.assert_array_equal(got, expected)
+    jax.tree.map(np.testing.assert_array_equal, match_once(*half), match_once(*single))
     descriptors = [features.descriptors for features in half]
     lists = [retrieve(*(values.astype(kind) for values in descriptors), num_candidates=9) for kind in ("f2", "f4")]
     np.testing.assert_array_equal(lists[0].indices, lists[1].indices)
@@ -276,7 +263,7 @@ def test_a_distance_at_the_limit_is_near_enough():
 def test_whoever_calls_it_matching_compiles_once(compilations):
     rng = np.random.default_rng(6)
     query, *candidates = (make_features(rng, 20) for _ in range(5))
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
+    batch = stack(candidates)
     calls = [
         lambda limit: match_candidates(query, batch),
         lambda limit: match_candidates(query, batch, with_ratio=True),
@@ -300,10 +287,9 @@ def test_pairs_are_matched_as_each_of_them(chunk_size):
         [make_features(rng, count, capacity=20) for count in counts] for counts in ((20, 7), (18, 0, 20))
     )
     pairs = np.array([(0, 0), (1, 2), (0, 1), (1, 0), (0, 2), (0, 0), (1, 1)], np.int32)
-    stacks = [jax.tree.map(lambda *leaves: np.stack(leaves), *side) for side in (queries, candidates)]
     for count in (0, 1, 5, 7):
         matcher = Matching(max_distance=1.1, max_matches=3, chunk_size=chunk_size)
-        got = match_pairs(*stacks, pairs, count, matcher)
+        got = match_pairs(stack(queries), stack(candidates), pairs, count, matcher)
         for place, (query, candidate) in enumerate(pairs[:count]):
             alone = match_once(queries[query], candidates[candidate], with_ratio=True)
             expected = filter_matches(alone, max_distance=1.1, max_matches=3)

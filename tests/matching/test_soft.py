@@ -1,6 +1,6 @@
 """Soft matching against the float64 loop, its limit, and where it degenerates; the ratio of the two nearest."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import match, soft_match
+from mfvpr.types import per_keypoint
 from tests import soft_oracles
 from tests.builders import double, make_features
+from tests.matching.arrays import stack
 
 pytestmark = pytest.mark.thorough
 
@@ -38,8 +40,7 @@ def feature_pairs(draw):
 
 def shuffled(features, order):
     """The same image with its slots in another order."""
-    rows = {f.name: getattr(features, f.name)[order] for f in fields(features) if f.name != "image_size"}
-    return replace(features, **rows)
+    return replace(features, **{name: values[order] for name, values in per_keypoint(features).items()})
 
 
 def usable(features):
@@ -76,10 +77,8 @@ def test_soft_becomes_hard(seed):
         mutual = hard["mutual"].mask.astype(float)
         real, errors = hard["none"].mask, []
         for smooth in cool:
-            gaps = [
-                jnp.max(jnp.abs(getattr(smooth, name) - getattr(hard["none"], name))[real])
-                for name in ("points1", "distance", "scores1")
-            ]
+            gaps = [jnp.max(jnp.abs(getattr(smooth, name) - getattr(hard["none"], name))[real])
+                    for name in ("points1", "distance", "scores1")]  # fmt: skip
             errors.append([float(jnp.mean(jnp.abs(smooth.confidence - mutual)[real])), *map(float, gaps)])
     errors = np.array(errors)
     np.testing.assert_array_equal(cool[0].mask, real)
@@ -92,8 +91,7 @@ def test_order_and_batch_do_not_matter():
     rng = np.random.default_rng(3)
     query = make_features(rng, 15, capacity=18)
     candidates = [make_features(rng, count, capacity=20) for count in (20, 0, 1, 11)]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *candidates)
-    got = jax.jit(jax.vmap(partial(soft_match, temperature=0.1), in_axes=(None, 0)))(query, batch)
+    got = jax.jit(jax.vmap(partial(soft_match, temperature=0.1), in_axes=(None, 0)))(query, stack(candidates))
     order0, order1 = rng.permutation(18), rng.permutation(20)
     for row, candidate in enumerate(candidates):
         alone = soft(query, candidate, temperature=0.1)

@@ -20,16 +20,17 @@ def folder(root, count=3):
     return ImageFolder(root, tuple(f"{row}.png" for row in range(count)))
 
 
-@pytest.mark.parametrize(
-    "read",
-    [
-        lambda files, other: FeatureFiles(files).opened(other, partial=False),
-        lambda files, other: DescriptorFiles(files).shortlist(
-            QuerySequence("a", other, None), other, 2, FeatureCache()
-        ),
-        lambda files, other: ShortlistFiles(files).shortlist(QuerySequence("a", other, None), other, 2, FeatureCache()),
-    ],
-)
+def list_candidates(source, queries, database):
+    """Rows of the first query's candidates."""
+    filtered = source.shortlist(QuerySequence("q", queries, None), database, 1, FeatureCache())
+    return filtered.candidates.indices[0].tolist()
+
+
+@pytest.mark.parametrize("read", [
+    lambda files, other: FeatureFiles(files).opened(other, partial=False),
+    lambda files, other: list_candidates(DescriptorFiles(files), other, other),
+    lambda files, other: list_candidates(ShortlistFiles(files), other, other),
+])  # fmt: skip
 def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
     with pytest.raises(InputError, match=r"/other: .*one of: .*/known; "):
         read({tmp_path / "known": File(tmp_path / "a.npz")}, folder(tmp_path / "other"))
@@ -66,8 +67,7 @@ def written(root, names, file):
 def read_both(database, queries, files):
     """Read the database, then the queries."""
     if "global" in files[database.root].path.name:
-        sequence = QuerySequence("q", queries, None)
-        return DescriptorFiles(files).shortlist(sequence, database, 1, FeatureCache())
+        return list_candidates(DescriptorFiles(files), queries, database)
     source = FeatureFiles(files)
     return [source.opened(folder, partial=False) for folder in (database, queries)]
 
@@ -123,11 +123,7 @@ def test_pairs_within_the_database_are_not_of_queries(tmp_path):
     def candidates(names, images=queries, **prefixes):
         pairs.write_text("{} {}\n".format(*names))
         files = ShortlistFiles({images.root: File(pairs, prefixes.get("query", ""))}, prefixes.get("database", ""))
-        return (
-            files.shortlist(QuerySequence("q", images, None), database, 1, FeatureCache())
-            .candidates.indices[0]
-            .tolist()
-        )
+        return list_candidates(files, images, database)
 
     with pytest.raises(InputError, match=r"db/0\.png for .*database/0\.png and for .*queries/0\.png; "):
         candidates(["db/0.png", "db/0.png"])

@@ -57,9 +57,9 @@ def test_excluded_images_neither_get_votes_nor_fill_up():
 
 
 def test_more_queries_than_go_together():
-    queries, database = windows(2, 70), windows(2, 6)
-    got = vote(queries, database, 2, excluded=Positives.from_rows([[row % 6] for row in range(70)], 6))
-    assert_lists(got, by_loops(queries, database, 2, [[row % 6] for row in range(70)]), 2)
+    queries, database, excluded = windows(2, 70), windows(2, 6), [[row % 6] for row in range(70)]
+    got = vote(queries, database, 2, excluded=Positives.from_rows(excluded, 6))
+    assert_lists(got, by_loops(queries, database, 2, excluded), 2)
 
 
 def test_equal_votes_go_by_row_and_equal_windows_by_image():
