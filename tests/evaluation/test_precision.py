@@ -44,19 +44,15 @@ def test_perfect_and_hopeless_confidences():
     assert (perfect.average_precision, perfect.recall_at(1.0)) == (1.0, 1.0)
     assert precision_recall(np.arange(10.0), right).recall_at(1.0) == 0
     assert precision_recall(-np.arange(10.0), right).recall_at(1.0) == 0.6
-    same = precision_recall(np.ones(10), right, right)  # all or none
-    assert (same.precision.tolist(), same.recall.tolist()) == ([0.6], [1.0])
-    none = precision_recall(np.full(10, np.nan), ~right & right)
-    assert (none.average_precision, none.recall_at(0.5), len(none.thresholds)) == (0.0, 0.0, 0)
+    for has_answer in (np.zeros(10, bool), None):
+        none = precision_recall(np.full(10, np.nan), np.zeros(10, bool), has_answer)
+        assert (none.average_precision, none.recall_at(0.5), len(none.thresholds)) == (0.0, 0.0, 0)
 
 
-def test_answers_to_queries_without_a_place_cost_precision_and_no_recall():
-    confidence, right = np.array([0.9, 0.8, 0.7]), np.array([True, False, True])
-    curve = precision_recall(confidence, right, np.array([True, False, True]))
-    assert curve.recall.tolist() == [0.5, 0.5, 1.0]
-    np.testing.assert_allclose(curve.precision, [1, 1 / 2, 2 / 3])
+def test_correct_predictions_for_queries_without_positives_are_refused():
+    right = np.array([False, True])
     with pytest.raises(InputError, match="no correct predictions for queries without positives"):
-        precision_recall(confidence, ~right, np.array([True, False, True]))
+        precision_recall(np.array([0.9, 0.8]), right, ~right)
 
 
 @pytest.mark.parametrize("bins", [1, 4, 10])
@@ -91,7 +87,3 @@ def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
 def test_equal_confidences_are_answered_together_however_large(value, right):
     curve = precision_recall(np.array([value, value]), np.array(right))
     assert (curve.precision.tolist(), curve.recall.tolist(), curve.average_precision) == ([0.5], [0.5], 0.25)
-
-
-def test_without_any_answer_there_is_no_curve():
-    assert len(precision_recall(np.full(2, np.nan), np.zeros(2, bool)).thresholds) == 0

@@ -42,14 +42,10 @@ def test_queries_without_a_place_are_in_both_halves_of_a_map(share):
 
 
 def test_halves_of_a_map_where_most_queries_wait_at_its_end():
-    places = np.r_[np.arange(0, 60, 3), np.full(40, 59)]
-    parts = [Positives.from_matrix(frame_positives(places, np.arange(60), tolerance=1))] * 2
-    first, second = halves_of_map(parts, "frames")
-    assert len(first.report) == 2 * 40
-    assert len(second.report) == 2 * 20
-    for end in (places, 59 - places):  # or at its start
-        parts = [Positives.from_matrix(frame_positives(end, np.arange(60), tolerance=1))] * 2
-        assert sorted(len(half.report) for half in halves_of_map(parts, "frames")) == [2 * 20, 2 * 40]
+    waiting_last = np.r_[np.arange(0, 60, 3), np.full(40, 59)]
+    for places, expected in ((waiting_last, [2 * 40, 2 * 20]), (59 - waiting_last, [2 * 20, 2 * 40])):
+        parts = [Positives.from_matrix(frame_positives(places, np.arange(60), tolerance=1))] * 2
+        assert [len(half.report) for half in halves_of_map(parts, "frames")] == expected
     without_places = halves_of_map([Positives.from_rows([[]] * 4, 3)] * 2, "m")
     assert [len(half.report) for half in without_places] == [4, 4]
 

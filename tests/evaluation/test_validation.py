@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets import FrameTruth, folder_dataset, image_folder
+from mfvpr.datasets import FrameTruth, image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
 from mfvpr.matching import Matching
@@ -26,11 +26,6 @@ pytestmark = pytest.mark.thorough
 SIFT = Sift(max_keypoints=20, image_size=(160, 120))
 FRAMES = FrameCorrelation()
 HISTOGRAM = {"histogram": mfvpr.HistogramOfShifts()}
-
-
-@pytest.fixture(scope="module")
-def dataset(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
 @dataclass(frozen=True)
