@@ -1,6 +1,5 @@
 """The way over a data set, stage by stage, on a synthetic street and on broken images."""
 
-import itertools
 from dataclasses import replace
 
 import jax
@@ -9,7 +8,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets import folder_dataset, image_folder
+from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.matching import Matching, MatchSet
@@ -22,9 +21,9 @@ from mfvpr.storage.matches import StoredMatches, open_match_store
 from mfvpr.tuning.sweeps import sweep
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
-from tests import oracles
-from tests.builders import of_query, random_matches, real
+from tests.builders import of_query, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title
+from tests.storage.synthetic_features import assert_same_match_sets, interrupt_after
 
 pytestmark = pytest.mark.thorough
 
@@ -32,71 +31,19 @@ SIFT = Sift(max_keypoints=400)
 
 
 @pytest.fixture(scope="module")
-def street(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+def features(dataset):
+    return [FeatureCache().local(folder, SIFT)[0] for folder in (dataset.database, dataset.queries)]
 
 
 @pytest.fixture(scope="module")
-def features(street):
-    return [FeatureCache().local(folder, SIFT)[0] for folder in (street.database, street.queries)]
-
-
-@pytest.fixture(scope="module")
-def candidates(street):
+def candidates(dataset):
     vlad = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
-    return vlad.shortlist(street.only, street.database, 6, FeatureCache()).candidates
+    return vlad.shortlist(dataset.only, dataset.database, 6, FeatureCache()).candidates
 
 
 @pytest.fixture(scope="module")
 def matches(features, candidates):
     return stages.match(features[1], features[0], candidates)
-
-
-def test_matches_are_those_of_every_pair(features, candidates, matches):
-    database, queries = features
-    for query in (0, 7):
-        padded = matches[query]
-        assert padded.mask.shape == (6, matches.capacity)
-        for place, row in enumerate(candidates.indices[query]):
-            alone = mfvpr.match(queries[query], database[row])
-            pair = jax.tree.map(lambda field, place=place: field[place], padded)
-            for got, expected in zip(real(pair), real(alone), strict=True):
-                np.testing.assert_allclose(got, expected, atol=1e-6)
-
-
-def test_scores_are_those_of_the_oracle(candidates, matches):
-    scorers = {"histogram": mfvpr.HistogramOfShifts(), "anchor": mfvpr.AnchorPoints(), "sum": mfvpr.AggregatedScore()}
-    scores = stages.score(scorers, matches, candidates)
-    for place in range(6):
-        points0, points1, distance, s0, s1 = real(jax.tree.map(lambda field, p=place: field[p], matches[3]))
-        size, weights = (336, 336), s0 + s1
-        expected = {
-            "histogram": oracles.histogram_score(points1 - points0, weights, size, size),
-            "anchor": oracles.anchor_points(points0, points1, weights, size, size),
-            "sum": oracles.aggregated_score(points1 - points0, oracles.dmf_weight(distance), size),
-        }
-        for name, value in expected.items():
-            np.testing.assert_allclose(scores[name][3, place], value, rtol=1e-4)
-
-
-def test_the_street_is_recognized(street, candidates, matches):
-    scores = stages.score({"h": mfvpr.HistogramOfShifts()}, matches, candidates)["h"]
-    rows = np.take_along_axis(candidates.indices, ranking.rank_shortlist(candidates, scores), axis=1)
-    assert mfvpr.recall_at_k(rows, street.truth.positives(1), [1])[0] >= 0.8
-
-
-def test_fusion_with_a_constant_and_balanced(candidates, matches):
-    scores = stages.score({"count": mfvpr.MatchCount()}, matches, candidates)["count"]
-    fused = ranking.fuse_shortlist(candidates, scores, 10.0)
-    np.testing.assert_allclose(fused, 10 * candidates.scores + scores, rtol=1e-5)
-    distance = np.sqrt(2 - 2 * candidates.scores)
-    euclidean = ranking.fuse_shortlist(candidates, scores, 10.0, filter_score="negative_euclidean")
-    np.testing.assert_allclose(euclidean, scores - 10 * distance, rtol=1e-5)
-    order = ranking.rank_shortlist(candidates, 0 * scores, ties="index")
-    by_index = np.take_along_axis(candidates.indices, order, axis=1)
-    np.testing.assert_array_equal(by_index, np.sort(candidates.indices, axis=1))
-    added = ranking.fuse_shortlist(candidates, scores, None) - scores
-    np.testing.assert_allclose(added.std(axis=1), scores.std(axis=1), rtol=1e-3)
 
 
 def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
@@ -116,26 +63,9 @@ def open_store(tmp_path):
     return open_store
 
 
-def killed_after(number):
-    """Progress that ends in a kill after so many queries."""
-
-    def track(items, _):
-        yield from itertools.islice(items, number)
-        raise KeyboardInterrupt
-
-    return track
-
-
 def nothing_done(items, total):
     """Progress of what is not to be done."""
     raise AssertionError(f"{total} queries are matched again")
-
-
-def assert_same_matches(got, expected):
-    np.testing.assert_array_equal(got.counts, expected.counts)
-    assert got.capacity == expected.capacity
-    for query in range(len(expected.counts)):
-        jax.tree.map(np.testing.assert_array_equal, got[query], expected[query])
 
 
 def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, open_store, monkeypatch):
@@ -150,10 +80,10 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
         read_again, _ = stages.stored_matches(store, memory=1e-5)
     assert isinstance(read_again.matches, StoredMatches)
     assert len(read_again.matches) == len(first)
-    assert_same_matches(first, matches)
+    assert_same_match_sets(first, matches)
     assert ((first[0].ratio > 0) == first[0].mask).all()
     for later in (again, alone, read_again, read_again.take(range(10))):
-        assert_same_matches(later, first)
+        assert_same_match_sets(later, first)
         np.testing.assert_array_equal(later.image_sizes, first.image_sizes)
     jax.tree.map(np.testing.assert_array_equal, stored, candidates)
     scorers = {"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints(), "s": mfvpr.AggregatedScore()}
@@ -169,14 +99,14 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
 
 def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, open_store):
     with open_store() as store, pytest.raises(KeyboardInterrupt):
-        stages.match(features[1], features[0], candidates, store=store, track=killed_after(9))
+        stages.match(features[1], features[0], candidates, store=store, track=interrupt_after(9))
     with open_store() as store:
         assert store.done.tolist() == [True] * stages.STORE_BATCH + [False] * 2
         with pytest.raises(InputError, match=r"store: .*10 queries, got 8"):
             stages.stored_matches(store)
         resumed = stages.match(features[1], features[0], candidates, store=store)
     with open_store(name="uninterrupted") as store:
-        assert_same_matches(resumed, stages.match(features[1], features[0], candidates, store=store))
+        assert_same_match_sets(resumed, stages.match(features[1], features[0], candidates, store=store))
 
 
 @pytest.fixture
@@ -203,7 +133,7 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed, open_store):
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
     matches = stages.match(features, features, candidates)
     with open_store(5, 5) as store:
-        assert_same_matches(stages.match(features, features, candidates, store=store), matches)
+        assert_same_match_sets(stages.match(features, features, candidates, store=store), matches)
         np.testing.assert_array_equal(stages.stored_matches(store)[1].mask, candidates.mask)
     scores = stages.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
     for values in scores.values():
@@ -214,7 +144,7 @@ def test_skipped_images_are_listed_and_never_shortlisted(mixed, open_store):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
+def test_features_that_are_not_finite_are_named_and_rank_last(dataset, value):
     class Broken:
         image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 3
         vector_size, scales = SIFT.vector_size, SIFT.scales
@@ -228,10 +158,10 @@ def test_features_that_are_not_finite_are_named_and_rank_last(street, value):
             return described
 
     cache, extractor = FeatureCache(), Broken()
-    [features] = cache.local(street.database, extractor)
+    [features] = cache.local(dataset.database, extractor)
     assert list(features.bad) == [1]
     assert "0001.png" in features.bad[1]
-    descriptors = cache.vectors(street.database, Aggregated(extractor, VladFitting(num_words=4)), street.database)
+    descriptors = cache.vectors(dataset.database, Aggregated(extractor, VladFitting(num_words=4)), dataset.database)
     candidates = EXACT.shortlist(descriptors.values, descriptors.values, 10)
     assert (candidates.indices != 1).all()
 

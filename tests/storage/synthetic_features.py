@@ -1,9 +1,10 @@
 """Small stores of features and of matches, for tests."""
 
 import hashlib
+import itertools
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from mfvpr import Features, Matches
+from mfvpr.matching import MatchSet
 from mfvpr.storage import manifest as store_manifest
 from mfvpr.storage.features import open_store, round_as_stored
 from mfvpr.storage.matches import QueryMatches, open_match_store
@@ -41,6 +43,23 @@ def assert_same(got: Features | QueryMatches, expected: Features | QueryMatches)
     for values, expected_values in zip(arrays, expected_arrays, strict=True):
         assert (values.shape, values.dtype) == (expected_values.shape, expected_values.dtype)
         assert values.tobytes() == expected_values.tobytes()
+
+
+def assert_same_match_sets(got: MatchSet, expected: MatchSet) -> None:
+    np.testing.assert_array_equal(got.counts, expected.counts)
+    assert got.capacity == expected.capacity
+    for query in range(len(expected.counts)):
+        jax.tree.map(np.testing.assert_array_equal, got[query], expected[query])
+
+
+def interrupt_after(number: int) -> Callable[[Iterable[Any], int], Iterator[Any]]:
+    """Progress that is interrupted after so many steps."""
+
+    def track(steps: Iterable[Any], _: int) -> Iterator[Any]:
+        yield from itertools.islice(steps, number)
+        raise KeyboardInterrupt
+
+    return track
 
 
 def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5), **more: Any) -> QueryMatches:

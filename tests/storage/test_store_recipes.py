@@ -1,7 +1,7 @@
 """Which store belongs to what; stores half done, or of something else, as the pipeline and the programs meet them."""
 
 import shutil
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +10,8 @@ from mfvpr import InputError, Shortlist
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet
 from mfvpr.storage.matches import open_match_store
-from mfvpr.types import Matches
 from tests.programs import composed, matches_path
-from tests.storage.synthetic_features import digests, features_of
+from tests.storage.synthetic_features import assert_same_match_sets, digests, features_of, interrupt_after
 
 # Matches of another shortlist
 
@@ -37,31 +36,10 @@ def opened(tmp_path):
     return lambda: open_match_store(tmp_path / "s", {"of": "any"}, **sizes)
 
 
-def assert_same(got, expected):
-    np.testing.assert_array_equal(got.counts, expected.counts)
-    for matches, expected_matches in zip(got.matches, expected.matches, strict=True):
-        for part in fields(Matches):
-            np.testing.assert_array_equal(getattr(matches, part.name), getattr(expected_matches, part.name))
-
-
-class Interrupted(Exception):
-    pass
-
-
-def _interrupting(after):
-    def track(rows, _):
-        for number, row in enumerate(rows):
-            if number == after:
-                raise Interrupted
-            yield row
-
-    return track
-
-
 def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidates, opened, monkeypatch):
     monkeypatch.setattr(stages, "STORE_BATCH", 2)
-    with opened() as store, pytest.raises(Interrupted):
-        stages.match(drawn, drawn, candidates, store=store, track=_interrupting(5))
+    with opened() as store, pytest.raises(KeyboardInterrupt):
+        stages.match(drawn, drawn, candidates, store=store, track=interrupt_after(5))
     shortlists = [
         replace(candidates, indices=candidates.indices[:, ::-1]),
         replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),
@@ -76,10 +54,8 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
                 stages.match(drawn, drawn, shortlist, store=store)
             assert digests(store.folder) == before
     with opened() as store:
-        assert_same(
-            stages.match(drawn, drawn, candidates, store=store),
-            stages.match(drawn, drawn, candidates),
-        )
+        again = stages.match(drawn, drawn, candidates, store=store)
+        assert_same_match_sets(again, stages.match(drawn, drawn, candidates))
         np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, candidates.indices)
 
 
