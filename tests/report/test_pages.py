@@ -316,8 +316,8 @@ def test_edited_tables_are_errors_or_nothing_but_text(error_with, run):
         assert path.name in ("confidence.csv", "skipped.csv") or any(reasons[1:]), path
 
 
-def test_help_and_the_library_wait_for_no_charts():
+def test_the_library_and_its_evaluation_wait_for_no_optional_package():
     code = ("import sys, mfvpr; from experiments import evaluation; "
-            "assert not {'plotly', 'jinja2', 'playwright'} & {*sys.modules}")  # fmt: skip
+            "assert not {'plotly', 'jinja2', 'playwright', 'optax', 'orbax'} & {*sys.modules}")  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")

@@ -2,8 +2,7 @@
 
 import json
 import shutil
-import subprocess
-import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -14,7 +13,8 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.tuning.learning import checkpoints
-from tests.tuning.learning.toys import RECIPE, ROOT, START, contents, program, same, train
+from tests.storage.synthetic_features import DAMAGE
+from tests.tuning.learning.toys import RECIPE, START, contents, program, same, train
 
 pytestmark = pytest.mark.thorough
 
@@ -38,9 +38,7 @@ def test_what_comes_back_is_what_was_saved(tmp_path):
     assert restored is not None
     state, progress = restored
     assert progress == [[100, None, 0.1 + 0.2]]
-    dtypes = jax.tree.map(lambda leaf: leaf.dtype, (state, STATE))
-    assert dtypes[0] == dtypes[1]
-    jax.tree.map(np.testing.assert_array_equal, state, STATE)
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), state, STATE)
 
 
 @pytest.mark.parametrize(
@@ -56,6 +54,7 @@ def test_what_comes_back_is_what_was_saved(tmp_path):
          'parameters.offset="float32[3]", expected "float32[4]"'),
         ({"parameters": {"slope": 1.0}}, 'parameters.offset="float32[3]", expected nothing'),
         ({"optimizer": optax.sgd(0.1)}, 'optimizer.0.count="int32[]", expected nothing'),
+        ({"steps": 5}, "this checkpoint is of step 10, expected at most 5"),
     ],
 )  # fmt: skip
 def test_another_training_is_refused_and_nothing_changes(finished, changes, difference):
@@ -64,13 +63,6 @@ def test_another_training_is_refused_and_nothing_changes(finished, changes, diff
         train(finished, **changes)
     assert str(refusal.value).startswith(f"{finished}: ")
     assert f"{difference}; " in str(refusal.value)
-    assert contents(finished) == before
-
-
-def test_fewer_steps_than_were_made_are_refused(finished):
-    before = contents(finished)
-    with pytest.raises(InputError, match=r"step 10, .*5; "):
-        train(finished, steps=5)
     assert contents(finished) == before
 
 
@@ -103,23 +95,13 @@ def test_folders_of_something_else_are_refused(tmp_path):
     assert contents(tmp_path) == before
 
 
-def flip(content):
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-
-
-def tear(content):
-    return content[: len(content) // 2]
-
-
-@pytest.mark.parametrize("item, damage", [("arrays", flip), ("arrays", tear), ("record", tear)])
-def test_damage_is_told_and_the_one_before_still_serves(tmp_path, item, damage):
+@pytest.mark.parametrize("part, damage", [("arrays", "flipped"), ("arrays", "half"), ("record", "half")])
+def test_damage_is_told_and_the_one_before_still_serves(tmp_path, part, damage):
     state = {"only": np.random.default_rng(0).normal(size=(20, 30)).astype(np.float32)}
     for step in (1, 2):
         checkpoints.save(tmp_path, step, {}, state, [step])
-    files = [path for path in (tmp_path / "2" / item).rglob("*") if path.is_file() and path.suffix != ".txt"]
-    largest = max(files, key=lambda path: path.stat().st_size)
-    largest.write_bytes(damage(largest.read_bytes()))
+    files = [path for path in (tmp_path / "2" / part).rglob("*") if path.is_file() and path.suffix != ".txt"]
+    DAMAGE[damage](max(files, key=lambda path: path.stat().st_size))
     with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as refusal:
         checkpoints.restore(tmp_path, {}, state)
     assert "\n" not in str(refusal.value)
@@ -157,10 +139,8 @@ def test_killed_while_saving_the_newest_whole_one_is_there(tmp_path):
     assert len([path.name for path in tmp_path.iterdir()]) == 2
 
 
-def test_the_terminal_stays_quiet_and_the_package_light(tmp_path):
+def test_the_terminal_stays_quiet(tmp_path):
     """In a process of its own, where no test has set up warnings or logs."""
-    light = "import sys, mfvpr; assert not {'optax', 'orbax'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", light], cwd=ROOT, check=True)
     done = program(f"train(Path({str(tmp_path)!r}), steps=10); train(Path({str(tmp_path)!r}))")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert same(train(tmp_path), train())

@@ -86,17 +86,11 @@ def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
     [split] = training_splits(joined.match_set, joined.candidates, joined.judge)
     scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
     compared = comparison._HalfComparison(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
-    last = parts[2]
-    alone = training_splits(*_halved(last))[0]
+    alone = training_splits(parts[2].match_set, parts[2].candidates, path(seed=2)[0])[0]
     expected = comparison._HalfComparison(alone, Axes(scorer, {}, {}), Options(), None, untracked_stages)
     for setting in ({}, {"c": None}, {"c": 3.0}):
         got = compared.evaluate("it", scorer, setting).hits[:, alone.half.report]
         np.testing.assert_array_equal(got, expected.evaluate("it", scorer, setting).hits)
-
-
-def _halved(data_set):
-    judge, _, _ = path(seed=2)
-    return data_set.match_set, data_set.candidates, judge
 
 
 def test_databases_stand_side_by_side():

@@ -58,15 +58,9 @@ def test_full_rank_keeps_dot_products_and_matches():
 def test_principal_directions_are_the_right_singular_vectors(dimension):
     descriptors = random_descriptors(3)
     matrix = np.asarray(Projection.principal(descriptors, dimension).matrix, np.float64)
-    _, strengths, vectors = np.linalg.svd(descriptors.astype(np.float64), full_matrices=False)
+    _, _, vectors = np.linalg.svd(descriptors.astype(np.float64), full_matrices=False)
     np.testing.assert_allclose(matrix.T @ matrix, np.eye(dimension), atol=1e-6)
     np.testing.assert_allclose(np.abs(np.sum(matrix * vectors[:dimension].T, axis=0)), 1, atol=1e-6)
-    energy = np.sum((descriptors @ matrix) ** 2)
-    np.testing.assert_allclose(energy, np.sum(strengths[:dimension] ** 2), rtol=1e-6)
-    rng = np.random.default_rng(4)
-    for _ in range(20):  # no other subspace keeps more
-        other, _ = np.linalg.qr(rng.normal(size=(12, dimension)))
-        assert np.sum((descriptors @ other) ** 2) <= energy * (1 + 1e-6)
 
 
 def test_fewer_descriptors_than_dimensions_still_give_orthonormal_columns():

@@ -1,19 +1,13 @@
 """Training: what it finds, when it ends, and that an interruption changes nothing."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-from mfvpr import HistogramOfShifts, InputError, score_candidates
-from mfvpr.scoring.learned_weight import ABSOLUTE, LearnedWeight
-from mfvpr.tuning.learning.losses import cross_entropy, mean_loss
-from mfvpr.tuning.learning.parameters import from_logarithms, to_logarithms
-from mfvpr.tuning.learning.training import TrainingError, fit
-from tests.builders import make_matches
+from mfvpr import InputError
+from mfvpr.tuning.learning.training import TrainingError
 from tests.tuning.learning.toys import START, batches, contents, objective, program, same, train, validate
 
 pytestmark = pytest.mark.thorough
@@ -32,58 +26,6 @@ def test_finds_the_least_squares_line():
     result = train(steps=400, batches=lambda step: (x, y), optimizer=optax.adam(0.1), validate=None, every=400)
     np.testing.assert_allclose(result.parameters["slope"], slope, atol=1e-4)
     np.testing.assert_allclose(result.parameters["offset"], offset, atol=1e-4)
-
-
-def test_recovers_a_planted_temperature():
-    """Labels drawn from softmax(scores / 0.4): the likelihood is largest there."""
-    rng = np.random.default_rng(0)
-    scores = rng.normal(size=(4000, 6)).astype(np.float32)
-    right = np.argmax(scores / 0.4 + rng.gumbel(size=scores.shape), axis=1)
-    positives, mask = np.arange(6)[None] == right[:, None], np.ones(scores.shape, bool)
-
-    def likelihood(parameters, _):
-        return mean_loss(cross_entropy, scores / from_logarithms(parameters)["temperature"], positives, mask)
-
-    result = fit(
-        to_logarithms({"temperature": 3.0}), likelihood, lambda step: None, optimizer=optax.adam(0.1), steps=120
-    )
-    assert float(from_logarithms(result.parameters)["temperature"]) == pytest.approx(0.4, rel=0.05)
-
-
-def test_a_learned_weight_finds_which_matches_count():
-    """Right candidates agree on a shift by their close matches, wrong ones by their distant matches."""
-    rng = np.random.default_rng(1)
-
-    def pair(right):
-        close = np.arange(20) < 10
-        points0 = rng.uniform(50, 250, (20, 2))
-        agree = close if right else ~close
-        points1 = np.where(agree[:, None], points0 + 30, rng.uniform(50, 250, (20, 2)))
-        distance = np.where(close, 0.3, 1.1) + rng.uniform(-0.1, 0.1, 20)
-        return make_matches(points0, points1, distance=distance, ratio=rng.uniform(0, 1, 20), capacity=24)
-
-    pairs = [pair(candidate == 0) for _ in range(6) for candidate in range(4)]
-    matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(6, 4, *leaves[0].shape), *pairs)
-    positives, mask = np.tile(np.arange(4) == 0, (6, 1)), np.ones((6, 4), bool)
-
-    def scores(weight):
-        scorer = HistogramOfShifts(bin_size=40.0, sigma=40.0, weight=weight, max_bins=17)
-        return jax.vmap(lambda of_query: score_candidates(scorer, of_query))(matches)
-
-    start = LearnedWeight.create(jax.random.key(0), matches, names=ABSOLUTE)
-
-    @jax.jit
-    def loss(weight, _):
-        return mean_loss(cross_entropy, scores(weight), positives, mask)
-
-    result = fit(start, loss, lambda step: None, optimizer=optax.adam(0.05), steps=40)
-    assert loss(start, None) > 1
-    assert loss(result.parameters, None) < 0.1
-    close, distant = (replace(pairs[0], distance=np.full(24, distance, np.float32)) for distance in (0.3, 1.1))
-    weigh = jax.jit(LearnedWeight.__call__)
-    assert np.all((weigh(result.parameters, close) > 2 * weigh(result.parameters, distant))[:20])
-    for name in ("center", "scale"):
-        np.testing.assert_array_equal(getattr(result.parameters, name), getattr(start, name))
 
 
 def test_history_and_best(uninterrupted):

@@ -19,6 +19,7 @@ from mfvpr.tuning.sweeps.settings import groups
 from mfvpr.types import Shortlist
 from tests.builders import of_query, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
+from tests.storage.synthetic_features import DAMAGE, interrupt_after
 
 pytestmark = pytest.mark.thorough
 
@@ -135,40 +136,32 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
             assert (first_rows[:, CANDIDATES:] == -1).all()
 
 
-def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, monkeypatch):
+@pytest.fixture
+def block_scores(monkeypatch):
+    """Scores of every block that the test computes."""
+    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
+    scores = module["block_scores"]
+    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
+    return computed
+
+
+def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, block_scores):
     scorer, settings = mfvpr.HistogramOfShifts(), sweeps.grid({"sigma": [9.0, 12.0, 20.0], "c": [None, 0.5]})
     expected = sweeps.sweep(scorer, settings, *data)
-
-    class Stopped(Exception):
-        pass
-
-    def stops(steps, total):
-        for number, step in enumerate(steps):
-            if number == 4:
-                raise Stopped
-            yield step
-
+    block_scores.clear()
     chunks = {"settings_per_block": 1, "queries_per_block": 3, "folder": tmp_path}
-    with pytest.raises(Stopped):
-        sweeps.sweep(scorer, settings, *data, track=stops, **chunks)
-    files = sorted(tmp_path.iterdir())
-    assert len(files) == 4
-    files[0].write_bytes(files[0].read_bytes()[:-5])
-    files[1].write_bytes(b"")
-    turned = bytearray(files[2].read_bytes())
-    turned[len(turned) // 2] ^= 1  # a row of the right shape, but another
-    files[2].write_bytes(turned)
-    computed = []
-    module = vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
-    scores = module["block_scores"]
-    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(1) or scores(*inputs))
-    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
-    assert len(computed) == 9 - 4 + 3
-    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
-    assert len(computed) == 9 - 4 + 3
+    with pytest.raises(KeyboardInterrupt):
+        sweeps.sweep(scorer, settings, *data, track=interrupt_after(4), **chunks)
+    assert len(block_scores) == 4
+    for file, damage in zip(sorted(tmp_path.iterdir()), ("short", "empty", "flipped", None), strict=True):
+        if damage:
+            DAMAGE[damage](file)
+    for _ in range(2):
+        np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
+        assert len(block_scores) == 9 + 3
     other = [{**setting, "sigma": setting["sigma"] + 1} for setting in settings]
     sweeps.sweep(scorer, other, *data, **chunks)
-    assert len(computed) == 9 - 4 + 3 + 9
+    assert len(block_scores) == 9 + 3 + 9
 
 
 def test_one_program_per_shape_and_capacity(data, compilations):
@@ -244,22 +237,24 @@ OTHER_DATA = {
 }  # fmt: skip
 
 
+def sweep_with_folder(folder, scorer, settings, *data, **options):
+    """Rows without a folder of blocks; those with it are the same."""
+    expected = sweeps.sweep(scorer, settings, *data, **options)
+    stored = sweeps.sweep(scorer, settings, *data, **options, folder=folder)
+    np.testing.assert_array_equal(stored, expected, err_msg=str(options))
+    return expected
+
+
 @pytest.mark.parametrize("change", OTHER_DATA)
 def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, change):
     scorer, settings = mfvpr.HistogramOfShifts(bin_size=20.0), [{"sigma": 9.0, "c": 0.5}, {"sigma": 20.0, "c": 0.5}]
-    sweeps.sweep(scorer, settings, *data, folder=tmp_path)
-    other = OTHER_DATA[change](*data)
-    expected = sweeps.sweep(scorer, settings, *other)
-    np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *other, folder=tmp_path), expected)
-    np.testing.assert_array_equal(
-        sweeps.sweep(scorer, settings, *data, folder=tmp_path), sweeps.sweep(scorer, settings, *data)
-    )
+    for match_set, candidates in (data, OTHER_DATA[change](*data), data):
+        sweep_with_folder(tmp_path, scorer, settings, match_set, candidates)
 
 
 def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_path):
-    _, candidates = data
-    settings = [{"max_distance": 0.3}, {"max_distance": 2.0}]
-    view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
+    limits, fused = [{"max_distance": 0.3}, {"max_distance": 2.0}], [{"c": 10.0}, {"c": 20.0}]
+    view = np.random.default_rng(1).random(data[1].mask.shape) < 0.6
 
     def scorer(factor):
         @mfvpr.value
@@ -271,39 +266,27 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
 
         return Score()
 
-    cases = [
-        (scorer(1.0), {}),
-        (scorer(-1.0), {}),
-        (scorer(1.0), {"views": [view]}),
-        (scorer(1.0), {"views": [~view]}),
-        (scorer(1.0), {"ties": "index"}),
-        (lambda matches: mfvpr.MatchCount()(matches), {}),
-        (lambda matches: -mfvpr.MatchCount()(matches), {}),
-    ]
-    fused = [{"c": c} for c in (10.0, 20.0)]
-    for changed_scorer, options in cases:
-        expected = sweeps.sweep(changed_scorer, settings, *data, **options)
-        np.testing.assert_array_equal(
-            sweeps.sweep(changed_scorer, settings, *data, **options, folder=tmp_path), expected, err_msg=str(options)
-        )
-    for kind in ("cosine", "negative_euclidean"):
-        expected = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind)
-        stored = sweeps.sweep(mfvpr.MatchCount(), fused, *data, filter_score=kind, folder=tmp_path)
-        np.testing.assert_array_equal(stored, expected)
+    for changed_scorer, settings, options in (
+        (scorer(1.0), limits, {}),
+        (scorer(-1.0), limits, {}),
+        (scorer(1.0), limits, {"views": [view]}),
+        (scorer(1.0), limits, {"views": [~view]}),
+        (scorer(1.0), limits, {"ties": "index"}),
+        (lambda matches: mfvpr.MatchCount()(matches), limits, {}),
+        (lambda matches: -mfvpr.MatchCount()(matches), limits, {}),
+        (mfvpr.MatchCount(), fused, {"filter_score": "cosine"}),
+        (mfvpr.MatchCount(), fused, {"filter_score": "negative_euclidean"}),
+    ):
+        sweep_with_folder(tmp_path, changed_scorer, settings, *data, **options)
 
 
 def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
     """The numbers of one data set are not those of another."""
     match_set, candidates = data
     scorer, settings = mfvpr.RapidSpatialScore(per_feature=True), [{"c": 1e5}]
-    fewer = [replace(matches, count0=np.int32(1)) for matches in match_set.matches]
-    expected = []
-    for matches in (match_set.matches, fewer):
-        expected.append(sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates))
-        for _ in range(2):
-            stored = sweeps.sweep(scorer, settings, replace(match_set, matches=matches), candidates, folder=tmp_path)
-            np.testing.assert_array_equal(stored, expected[-1])
-    assert (expected[0] != expected[1]).any()
+    fewer = replace(match_set, matches=[replace(matches, count0=np.int32(1)) for matches in match_set.matches])
+    rows = [sweep_with_folder(tmp_path, scorer, settings, pairs, candidates) for pairs in (match_set, fewer) * 2]
+    assert (rows[0] != rows[1]).any()
 
 
 def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
@@ -336,9 +319,7 @@ def signed_by_pairs(sign):
 @pytest.mark.parametrize("scorer", [signed_by_slots, signed_by_pairs])
 def test_code_that_depends_on_a_shape_is_told_apart(data, tmp_path, scorer):
     for sign in (1.0, -1.0):
-        expected = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data)
-        got = sweeps.sweep(scorer(sign), [{"max_distance": 2.0}], *data, folder=tmp_path)
-        np.testing.assert_array_equal(got, expected)
+        sweep_with_folder(tmp_path, scorer(sign), [{"max_distance": 2.0}], *data)
 
 
 def test_a_number_named_as_the_filters_share_is_refused(data):
@@ -356,18 +337,15 @@ def test_a_number_named_as_the_filters_share_is_refused(data):
 @pytest.mark.parametrize(
     "scorer", [mfvpr.AnchorPoints(), mfvpr.AggregatedScore(), Sampled(jax.random.key(3))], ids=title
 )
-def test_pairs_score_the_same_in_a_smaller_set(data, scorer, monkeypatch):
+def test_pairs_score_the_same_in_a_smaller_set(data, scorer, block_scores):
     """To the bit: else near ties would go another way."""
     match_set, candidates = data
     few = replace(match_set, matches=match_set.matches[:2], counts=match_set.counts[:2])
     assert shapes(few) == shapes(match_set)
-    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
-    scores = module["block_scores"]
-    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
     for pairs in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(pairs.matches)], candidates)  # noqa: B023
         sweeps.sweep(scorer, [{"max_distance": 2.0}], pairs, listed)
-    np.testing.assert_array_equal(computed[0][..., :2, :], computed[1])
+    np.testing.assert_array_equal(block_scores[0][..., :2, :], block_scores[1])
 
 
 def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
