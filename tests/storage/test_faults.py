@@ -81,11 +81,6 @@ def test_the_lock_holds_within_a_process_and_ends_with_an_error(tmp_path):
     assert (tmp_path / "s" / "lock").read_text() == ""
 
 
-def read_whole(folder: str) -> None:
-    """Print the rows of a complete store."""
-    print(*read_all(Path(folder)))
-
-
 @of_both_kinds
 def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subject):
     fill(tmp_path / "s", subject=subject)
@@ -93,7 +88,7 @@ def test_a_complete_store_is_read_by_any_number_at_the_same_time(tmp_path, subje
         assert first.done.all()
         assert [row for row, _ in second.read()] == [row for row, _ in first.read()] == [0, 1, 2]
         if subject is FEATURES:
-            assert run_here(f"read_whole({str(tmp_path / 's')!r})").split() == ["0", "1", "2"]
+            assert run_here(f"print(*read_all(Path({str(tmp_path / 's')!r})))").split() == ["0", "1", "2"]
 
 
 def test_a_store_is_read_while_another_process_writes_it(tmp_path, request):
