@@ -190,14 +190,6 @@ def test_equal_systems_seldom_differ_by_blocks_and_often_by_mcnemar(recall):
     assert np.mean(coins) > 0.25
 
 
-def test_a_gain_all_along_the_path_is_significant():
-    """As on real images: ten queries gained of 101, none lost; eleven blocks of which only one is ahead."""
-    first = np.random.default_rng(0).random(101) < 0.8
-    second = first.copy()
-    second[np.flatnonzero(first)[::8][:10]] = False
-    assert block_sign_flips(first, second, block=9) == (9, 10, 2 / 2**10)
-
-
 def test_systems_that_agree_do_not_differ_and_one_always_ahead_does():
     hits = np.arange(20) < 15
     assert block_sign_flips(hits, hits) == (8, 0, 1.0)  # the cube root, squared
