@@ -169,5 +169,5 @@ class Ranking:
         scores: re-ranking scores in the shortlist's order (not sorted).
     """
 
-    order: Int[Array, "queries candidates"]
-    scores: Float[Array, "queries candidates"]
+    order: Int[Array, "*queries candidates"]
+    scores: Float[Array, "*queries candidates"]

@@ -245,7 +245,7 @@ def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
 
 
 def rerank(
-    scores: Float[Array, "queries candidates"], mask: Bool[Array, "queries candidates"] | None = None
+    scores: Float[Array, "*queries candidates"], mask: Bool[Array, "*queries candidates"] | None = None
 ) -> Ranking:
     """Ranking of a shortlist by the re-ranking scores of its candidates."""
     return Ranking(order=rank(scores, mask), scores=scores)
