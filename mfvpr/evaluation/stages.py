@@ -70,7 +70,10 @@ def match(
     requested = range(len(queries)) if rows is None else rows
     if store is None:
         matched = [query for _, query in track(match_rows(requested), len(requested))]
-        return MatchSet.of([query.matches for query in matched], np.array([query.counts for query in matched]))
+        counts = np.array([query.counts for query in matched], np.int32).reshape(
+            len(matched), candidates.indices.shape[1]
+        )
+        return MatchSet.of([query.matches for query in matched], counts)
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
