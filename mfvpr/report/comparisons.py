@@ -144,4 +144,6 @@ def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, Le
 
 
 _weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))
-_raw = compiled(jax.vmap(lambda weight, matches: weight.center + weight.scale * weight.inputs(matches), (None, 0)))
+_raw = compiled(
+    jax.vmap(lambda weight, matches: weight.center[None] + weight.scale[None] * weight.inputs(matches), (None, 0))
+)

@@ -1,4 +1,4 @@
-"""What the programs of this folder share: networks of torch, and modules in place of what public codes import."""
+"""Networks of torch, and modules in place of those that public code imports, for the programs of this folder."""
 
 import sys
 from types import ModuleType

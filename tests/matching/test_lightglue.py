@@ -138,8 +138,8 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
 
 
 def test_what_changes_matches_changes_their_recipe():
-    others = matcher(seed=1), matcher(filter_threshold=0.2), matcher(depth_confidence=0.9)
-    recipes = [str(recipe_of(matching)) for matching in (Matching(), matcher(), *others)]
+    changed = matcher(seed=1), matcher(filter_threshold=0.2), matcher(depth_confidence=0.9)
+    recipes = [str(recipe_of(matching)) for matching in (Matching(), matcher(), *changed)]
     assert len({*recipes}) == len(recipes)
     assert recipes[1] == str(recipe_of(matcher(chunk_size=5)))
     assert recipes[1] == str(recipe_of(LightGlueMatching.of(small_network(), **OPTIONS)))
