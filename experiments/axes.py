@@ -95,7 +95,7 @@ def _plain_c(settings: dict[str, Any]) -> Any:
     """The setting fusion.c, which must not fuse several scores here."""
     if (c := settings["fusion"]["c"]) == "zscore":
         raise SettingsError(
-            "fusion.c=zscore: expected a number or auto, as sweeps and learning add the filter to one score; set "
+            "fusion.c=zscore: expected a number or auto, as sweeps and learning add retrieval to one score; set "
             "fusion.c=auto fusion.weights=null, which ranks alike for weights of 1"
         )
     return c

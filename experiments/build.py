@@ -22,8 +22,8 @@ from mfvpr.retrieval import (
     DescriptorFiles,
     ExactSearch,
     FeatureFiles,
-    Filter,
     Retrieval,
+    Retriever,
     ShortlistFiles,
     WhitenedSearch,
 )
@@ -103,7 +103,7 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     return Sift(**_only(options, Sift, "features=sift"))
 
 
-def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Filter:
+def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
     name, options = settings["name"], _without(settings, "name", "whiten")
     if name == "pairs":
@@ -121,7 +121,7 @@ def filter(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Data
         return Retrieval(_network_extractor("retrieval", name, options), search)
     if isinstance(local, FeatureFiles) or not local.vector_size:
         raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
-                            "choose another filter")  # fmt: skip
+                            "choose another retrieval")  # fmt: skip
     return Retrieval(local, search)
 
 
@@ -131,7 +131,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
     names = {field.name for field in fields(extractor_class)}
     if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
-        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's filter"}[name]
+        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's retrieval"}[name]
         expected = list(extractor_class.image_size)
         raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
@@ -181,7 +181,7 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 
 def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
-    root = None if settings["store"] is None else expand_user(settings["store"])
+    root = None if settings["cache"] is None else expand_user(settings["cache"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
     return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
                         wait=settings.get("multirun", False), shard=shard)  # fmt: skip
@@ -199,9 +199,9 @@ def where(settings: dict[str, Any]) -> dict[str, Any]:
 
 def fusion(settings: dict[str, Any]) -> Fusion:
     """The fusion of a score with that of the retrieval, and with those of other scorers."""
-    c, filter_score, weights = (settings["fusion"][name] for name in ("c", "filter_score", "weights"))
+    c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
     c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
-    return Fusion(c, filter_score, weights or {})
+    return Fusion(c, retrieval_score, weights or {})
 
 
 def frames(settings: dict[str, Any]) -> FrameCorrelation | None:

@@ -35,6 +35,7 @@ _EXPLANATIONS = {  # by their patterns in errors of Hydra and OmegaConf
     "each, add --multirun",
     r"^Error merging override (\S+)": r"\1: this is a group of settings; set one of its members (see --help)",
 }
+_RENAMED = {"store": "cache", "fusion.filter_score": "fusion.retrieval_score"}  # in version 0.3.0
 _MAX_DIGITS = 300  # beyond float64, and Python does not parse thousands of digits
 
 
@@ -145,6 +146,8 @@ def _explain(error: Exception, config: str) -> str:
 
 def _suggestion(wrong: str, config: str) -> str:
     """Suggest a setting for an unknown one: in its group, in another choice of its group, or a similar name."""
+    if wrong in _RENAMED:
+        return f"its name is {_RENAMED[wrong]} now"
     chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
     settings: Any = OmegaConf.to_container(compose_program(config, chosen))
     values = dict(nodes(settings))

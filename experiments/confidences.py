@@ -40,7 +40,7 @@ def check(
     if file is None:
         return None
     if not file.systems:
-        raise SettingsError(f"confidence={file.path}: expected p of systems, got none: the run that left it could fit "
+        raise SettingsError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
                             "none, as where there is but one candidate")  # fmt: skip
     if headline not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
@@ -49,13 +49,13 @@ def check(
     if before & now:
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
     if not any(file.systems[headline].weights):
-        tell(f"warning: confidence={file.path} cannot tell right answers from wrong ones: p is the same for all")
-    recall = [] if _threshold(settings, images) in (None, file.origin.get("right_within")) else ["recall"]
+        tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
+    recall = [] if _threshold(settings, images) in (None, file.origin.get("correct_within")) else ["recall"]
     candidates = num_candidates(settings, images)
     other = {name: other_settings(file.origin, name, settings, candidates) + recall for name in file.systems}
     if other[headline]:
-        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: p may "
-             "mean nothing here")  # fmt: skip
+        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: "
+             "it may mean nothing here")  # fmt: skip
     usable = {name: system for name, system in file.systems.items() if {*other[name]} <= {*other[headline]}}
     if unusable := [name for name in file.systems if name not in usable]:
         tell(f"confidence={file.path}: nothing is said of {', '.join(unusable)}, which had other settings there")
@@ -97,13 +97,13 @@ def _system_settings(settings: Any, system: str) -> dict[str, Any]:
     return {**settings, "scorer": parts}
 
 
-def origin(settings: Mapping[str, Any], images: Images, judged: EvaluationReport) -> dict[str, Any]:
+def origin(settings: Mapping[str, Any], images: Images, evaluation: EvaluationReport) -> dict[str, Any]:
     """The data and settings that the confidence of a run was fitted with, for its file."""
     return {
         "dataset": images.dataset.name,
         "data_fingerprint": images.fingerprints,
-        "queries": sum(len(sequence.images) for sequence in judged.sequences),
-        "right_within": _threshold(settings, images),
+        "queries": sum(len(sequence.images) for sequence in evaluation.sequences),
+        "correct_within": _threshold(settings, images),
         "candidates": num_candidates(settings, images),
         "ground_truth": truth.description(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.describe_settings(settings["scorer"])},

@@ -26,7 +26,7 @@ from mfvpr.report.evaluations import (
 )
 from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking import Fusion
-from mfvpr.reranking.results import COHORT, FILTER, FRAMES
+from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage import NotYet
 from mfvpr.storage.feature_writers import open_sinks
@@ -43,8 +43,8 @@ class Outcome:
     settings: dict[str, Any]
     images: Images
     tools: Tools
-    judged: EvaluationReport
-    assured: CalibratedPredictions
+    report: EvaluationReport
+    calibrated: CalibratedPredictions
     parameters: dict[str, dict[str, Any]]
     histogram: HistogramOfShifts | None
     figures: list[Figure]
@@ -93,7 +93,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     fusions = {name: fusion.renamed(main, name) for name in fused_systems}
     confidence = confidences.check(confidence, headline, settings, images)
     result = evaluation.evaluate(
-        images.dataset, tools.extractor, tools.filter, scorers, candidates=settings["candidates"],
+        images.dataset, tools.extractor, tools.retriever, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused=fusions, cohort=cohort,
         correlated={headline: frames} if frames else {}, ties=settings["ties"], cache=tools.cache, watch=watch,
         **tools.where,
@@ -102,14 +102,14 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
-    judged = EvaluationReport(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
+    report = EvaluationReport(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = scorers.get("histogram")
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
-    assured = CalibratedPredictions(judged, confidence and confidence.systems, settings["threshold"])
-    all_figures = query_figures(judged, tools.extractor, figure_queries, assured.refused_of_headline, histogram)
-    all_figures += confidence_figures(assured) if figure_queries else []
+    calibrated = CalibratedPredictions(report, confidence and confidence.systems, settings["threshold"])
+    all_figures = query_figures(report, tools.extractor, figure_queries, calibrated.refused_of_headline, histogram)
+    all_figures += confidence_figures(calibrated) if figure_queries else []
     deciding = histogram if main == "histogram" else None
-    return Outcome(settings, images, tools, judged, assured, parameters, deciding, all_figures)
+    return Outcome(settings, images, tools, report, calibrated, parameters, deciding, all_figures)
 
 
 def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusion]) -> dict[str, dict[str, Any]]:
@@ -123,26 +123,26 @@ def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusio
         fusion.system(name): (member_parameters if name == main else scorers[name]) | settings["fusion"]
         for name, fusion in fusions.items()
     }
-    return {FILTER: {}, **scorers, **fused}
+    return {RETRIEVAL: {}, **scorers, **fused}
 
 
 def ground_truth(outcome: Outcome) -> dict[str, Any]:
     """Description and fingerprint of the ground truth."""
-    dataset, thresholds = outcome.images.dataset, outcome.judged.thresholds
+    dataset, thresholds = outcome.images.dataset, outcome.report.thresholds
     return truth.description(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
 
 
 def text(outcome: Outcome) -> str:
     """Heading and tables for the terminal."""
-    tables = [recall_table(outcome.judged)] if outcome.judged.thresholds else []
+    tables = [recall_table(outcome.report)] if outcome.report.thresholds else []
     if tables and outcome.settings["confidence"]:
-        tables.append(confidence_table(outcome.assured))
+        tables.append(confidence_table(outcome.calibrated))
     return "\n".join([f"{heading(outcome)}\n", *(table.text() for table in tables)])
 
 
 def heading(outcome: Outcome) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
-    settings, dataset, matched = outcome.settings, outcome.images.dataset, outcome.judged.result.matched
+    settings, dataset, matched = outcome.settings, outcome.images.dataset, outcome.report.result.matched
     queries = sum(len(sequence.images) for sequence in dataset.sequences)
     bad_queries = sum(len(sequence.bad_queries) for sequence in matched)
     bad_database = len({row for sequence in matched for row in sequence.bad_database})
@@ -166,21 +166,21 @@ def _skip_note(number: int) -> str:
 def write(folder: Path, outcome: Outcome) -> None:
     """Write all files of a run folder but the figures."""
     runs.write_json(folder / "results.json", result_rows(outcome))
-    if outcome.judged.thresholds:
-        runs.write_table(folder, recall_table(outcome.judged), heading(outcome))
-    write_rankings(folder, outcome.judged, outcome.assured.refused_of_headline)
-    write_gains(folder, outcome.judged)
-    write_confidence(folder, outcome.assured, confidences.origin(outcome.settings, outcome.images, outcome.judged))
+    if outcome.report.thresholds:
+        runs.write_table(folder, recall_table(outcome.report), heading(outcome))
+    write_rankings(folder, outcome.report, outcome.calibrated.refused_of_headline)
+    write_gains(folder, outcome.report)
+    write_confidence(folder, outcome.calibrated, confidences.origin(outcome.settings, outcome.images, outcome.report))
     if outcome.histogram is not None:
-        write_shifts(folder, outcome.judged, outcome.histogram, outcome.assured.refused_of_headline)
-    write_skipped(folder, outcome.judged.result)
+        write_shifts(folder, outcome.report, outcome.histogram, outcome.calibrated.refused_of_headline)
+    write_skipped(folder, outcome.report.result)
 
 
 def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
     """One row per system and threshold, and per sequence if there are several."""
-    judged, settings, dataset = outcome.judged, outcome.settings, outcome.images.dataset
+    report, settings, dataset = outcome.report, outcome.settings, outcome.images.dataset
     common = {
-        "filter": settings["retrieval"],
+        "retrieval": settings["retrieval"],
         "features": settings["features"],
         "matching": settings["matching"],
         "candidates": _num_candidates(outcome),
@@ -192,19 +192,19 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "ground_truth": ground_truth(outcome),
         "reading": outcome.images.reading,
         "bytes_per_image": _bytes_per_image(outcome),
-        "seconds": judged.result.seconds,
+        "seconds": report.result.seconds,
         "versions": versions(),
     }
     rows = []
     for name, parameters in outcome.parameters.items():
-        scorers = [part for part in name.split(" + ") if part not in (COHORT, FILTER, FRAMES)]
+        scorers = [part for part in name.split(" + ") if part not in (COHORT, RETRIEVAL, FRAMES)]
         system = {
             "system": name,
             "scorer": " + ".join(scorers) or "none",
-            "decides": name == judged.headline,
+            "decides": name == report.headline,
             "parameters": parameters,
         }
-        rows += [system | recall | common for recall in _recalls(judged, name)]
+        rows += [system | recall | common for recall in _recalls(report, name)]
     return rows
 
 
@@ -216,24 +216,24 @@ def _bytes_per_image(outcome: Outcome) -> int | None:
     return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))
 
 
-def _recalls(judged: EvaluationReport, system: str) -> list[dict[str, Any]]:
+def _recalls(report: EvaluationReport, system: str) -> list[dict[str, Any]]:
     """Threshold and recall by K; for several sequences, of each sequence and their mean."""
-    if not judged.thresholds:
+    if not report.thresholds:
         return [{"recall_at": {}}]
-    known = judged.sequences[0].truth
+    known = report.sequences[0].truth
     name = _THRESHOLD_NAMES.get(known.unit) if known else None
-    several = len(judged.sequences) > 1
+    several = len(report.sequences) > 1
     return [
         ({"sequence": sequence} if several else {})
         | ({name: threshold} if name else {})
-        | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(judged.ks, recall[index], strict=True)}}
-        for sequence, recall in judged.parts(system)
-        for index, threshold in enumerate(judged.thresholds)
+        | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(report.ks, recall[index], strict=True)}}
+        for sequence, recall in report.parts(system)
+        for index, threshold in enumerate(report.thresholds)
     ]
 
 
 def _num_candidates(outcome: Outcome) -> int:
-    return int(outcome.judged.result.matched[0].candidates.indices.shape[1])
+    return int(outcome.report.result.matched[0].candidates.indices.shape[1])
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:

@@ -48,11 +48,11 @@ def learn(settings: dict[str, Any]) -> None:
             data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
-            comparison = compare(axes, data.judge, data.match_set, data.candidates, options,
+            comparison = compare(axes, data.protocol, data.match_set, data.candidates, options,
                                  checkpoints=checkpoints, track=console.track)  # fmt: skip
         heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
-        left_out = ("dataset", "store", "out", "checkpoints", "multirun", "command")
+        left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command")
         about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
         results = {
             **(about if report else _about(teach[0])), **comparisons.comparison_json(comparison),
@@ -88,11 +88,11 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     tools, images = stages.begun(settings, watch)
-    judge = truth.judge(settings, images.dataset)
+    protocol = truth.evaluation_protocol(settings, images.dataset)
     matches, candidates = stages.match_data_set(settings, tools, images, watch)
     assert not isinstance(matches, Scales)
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
-    part = Part(data_sets.label(settings["dataset"]), judge, matches, candidates)
+    part = Part(data_sets.label(settings["dataset"]), protocol, matches, candidates)
     return Prepared(part, images, recipe, truth.description(settings, images.dataset))
 
 
@@ -128,22 +128,22 @@ def _about(data_set: Prepared) -> dict[str, Any]:
 def _options(settings: dict[str, Any]) -> Options:
     names = ("ties", "steps", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     return Options(
-        c=own_c(settings), filter_score=settings["fusion"]["filter_score"], loss=LOSSES[settings["loss"]],
+        c=own_c(settings), retrieval_score=settings["fusion"]["retrieval_score"], loss=LOSSES[settings["loss"]],
         inputs=_INPUTS[settings["inputs"]], **{name: settings[name] for name in names},
     )  # fmt: skip
 
 
 def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: list[Prepared]) -> Checkpoints | None:
     """Folder and recipe of the checkpoints; None without a folder."""
-    root = settings["checkpoints"] or settings["store"]
+    root = settings["checkpoints"] or settings["cache"]
     if root is None:
         return None
     names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
         "matches": [data_set.recipe for data_set in sets], "scorer": recipe_of(scorer),
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
-        "filter_score": settings["fusion"]["filter_score"], "positives": data.judge.fingerprint,
-        "reported": dict(data.judge.reported_sets),
+        "retrieval_score": settings["fusion"]["retrieval_score"], "positives": data.protocol.fingerprint,
+        "reported": dict(data.protocol.reported_sets),
         "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
     name = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
@@ -156,7 +156,7 @@ def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report
     if report:
         teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))
         return f"{teach_names}: {system}; what was learned here is reported on {report_names}; {ground_truth}"
-    queries = sum(len(half.report) for half in data.judge.halves)
+    queries = sum(len(half.report) for half in data.protocol.halves)
     return (
         f"{data.name}: {system}; each of {queries} queries is reported on by what was learned on the other half of the "
         f"path; {ground_truth}"

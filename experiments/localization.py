@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from experiments import build, confidences, maps
-from experiments.answer_figures import AnswerFigures
 from experiments.console import tell
+from experiments.localization_figures import AnswerFigures
 from experiments.query_images import images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence
-from mfvpr.localization import Answer, Asked, Drive, Map, Route
+from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.storage.maps import Entry
 from mfvpr.utils import InputError
 from mfvpr.utils.files import printable
@@ -30,7 +30,7 @@ def localize(settings: dict[str, Any]) -> None:
     drive, figures, failed = _Drive(robot_map, settings), AnswerFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
-            tell(f"{len(robot_map):,} images in the map; the first answer takes seconds more: programs compile")
+            tell(f"{len(robot_map):,} images in the map; the top prediction takes seconds more: programs compile")
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
             localized, line = drive.localize(name, pixels)
@@ -54,15 +54,19 @@ class _Drive:
         self._map, self._settings = robot_map, settings
         self._route = None if settings["route"] is None else Route(Drive(advance=settings["route"]))
 
-    def localize(self, name: str, pixels: UInt8[np.ndarray, "height width channels"]) -> tuple[Asked, dict[str, Any]]:
+    def localize(
+        self, name: str, pixels: UInt8[np.ndarray, "height width channels"]
+    ) -> tuple[Localization, dict[str, Any]]:
         """Localize an image and return its line; an image that is in the map sees only the images before it."""
         start = time.perf_counter()
         row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
-        localized = self._map.ask(pixels, recent=recent, before=row)
-        line = localized.answer.as_json(self._settings["alternatives"]) | self.route_entry(localized.answer, row)
+        localized = self._map.localize_with_evidence(pixels, recent=recent, before=row)
+        line = localized.prediction.as_json(self._settings["alternatives"]) | self.route_entry(
+            localized.prediction, row
+        )
         return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
 
-    def add(self, name: str, localized: Asked) -> dict[str, Any]:
+    def add(self, name: str, localized: Localization) -> dict[str, Any]:
         """Add an image to the end of the map, unless it has one of this name, and return the entry in its line."""
         if not self._settings["add"]:
             return {}
@@ -72,13 +76,13 @@ class _Drive:
             self._map.add_described([Entry(name, name, vector)], [features])
         return {"added": is_new}
 
-    def route_entry(self, answer: Answer | None, row: int | None) -> dict[str, Any]:
-        """The route's entry in the line of an image, which may have no answer."""
+    def route_entry(self, prediction: Prediction | None, row: int | None) -> dict[str, Any]:
+        """The route's entry in the line of an image, which may have no prediction."""
         if self._route is None:
             return {}
         rows = self._map.there[:row]
         rows = rows[: max(0, len(rows) - self._settings["recent"])]
-        position = self._route(answer, rows)
+        position = self._route(prediction, rows)
         return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4)}}
 
 

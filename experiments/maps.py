@@ -98,7 +98,7 @@ def _check(settings: Mapping[str, Any]) -> None:
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     """The map in a folder, with these settings."""
     extractor: Any = build.extractor(settings["features"], None)  # `_check` excludes feature files
-    retrieval: Any = build.filter(settings["retrieval"], extractor, None)  # and retrieval without a describer
+    retrieval: Any = build.retriever(settings["retrieval"], extractor, None)  # and retrieval without a describer
     describer: Any = retrieval.describer
     describer = describer.fitting if isinstance(describer, Aggregated) else describer
     [scorer] = build.scorers(settings["scorer"]).values()

@@ -5,7 +5,7 @@ from hydra.errors import HydraException
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels", "map", "images"}
-PATHS |= {"store", "out", "checkpoints", "confidence", "also", "report"}
+PATHS |= {"cache", "out", "checkpoints", "confidence", "also", "report"}
 PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
 
 

@@ -22,12 +22,12 @@ def sweep(settings: dict[str, Any]) -> None:
     with run_folder.claimed(settings) as folder:
         axes, watch = searchable(settings), Stopwatch()
         tools, images = stages.begun(settings, watch)
-        judge = truth.judge(settings, images.dataset)
+        protocol = truth.evaluation_protocol(settings, images.dataset)
         matches, candidates = stages.match_data_set(settings, tools, images, watch)
         blocks = _block_folder(settings, tools, images, candidates)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
-            "filter_score": settings["fusion"]["filter_score"], "folder": blocks, "track": console.track,
+            "retrieval_score": settings["fusion"]["retrieval_score"], "folder": blocks, "track": console.track,
             "devices": tools.where["devices"],
             "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
         }  # fmt: skip
@@ -38,11 +38,11 @@ def sweep(settings: dict[str, Any]) -> None:
         with watch("sweep"):
             if settings["search"] == "grid":
                 axes.check(matches.image_sizes)
-                require_memory(settings, axes, 1 + len(judge.halves), matches)
-                outcome = sweeping.search_grid(axes, judge, matches, candidates, **options)
+                require_memory(settings, axes, 1 + len(protocol.halves), matches)
+                outcome = sweeping.search_grid(axes, protocol, matches, candidates, **options)
             else:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
-                outcome = sweeping.search_optuna(axes, judge, matches, candidates, **trials, **options)
+                outcome = sweeping.search_optuna(axes, protocol, matches, candidates, **trials, **options)
         heading = _heading(settings, images, outcome)
         text = f"{heading}\n\n{sweeps.sweep_summary(outcome)}"
 
@@ -61,14 +61,14 @@ def _block_folder(
     settings: dict[str, Any], tools: stages.Tools, images: stages.Images, candidates: Shortlist
 ) -> Path | None:
     """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
-    if settings["store"] is None:
+    if settings["cache"] is None:
         return None
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
     name = fingerprint({"matches": recipe, "sweep": sweep_settings, "versions": software})
-    return build.expand_user(settings["store"]) / f"{settings['dataset']['name']}_sweep-{name}"
+    return build.expand_user(settings["cache"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
@@ -76,7 +76,7 @@ def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) 
     ground_truth = truth.in_words(truth.description(settings, dataset))
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
     return (
-        f"{dataset.name}: {len(dataset.queries)} queries, {outcome.judge.views[0].shape[1]} candidates of "
+        f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
         f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
         f"{settings['scorer']['method']} score, {features['name']} features{size}; {ground_truth}"
     )
@@ -87,7 +87,7 @@ def _results(
 ) -> dict[str, Any]:
     return {
         "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,
-        "scorer": settings["scorer"], "features": settings["features"], "filter": settings["retrieval"],
+        "scorer": settings["scorer"], "features": settings["features"], "retrieval": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
         "final": settings["final"], "ground_truth": truth.description(settings, images.dataset),
         **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),

@@ -50,8 +50,8 @@ RULES: dict[str, Rule] = {
         "preprocessing": one_of("caffe", "torch"),
         "pooling": one_of("cls", "gem"),
         "cross_check": one_of("mutual", "opencv_legacy", "none", "candidate"),
-        "filter_score": one_of("cosine", "negative_euclidean"),
-        "ties": one_of("filter", "index"),
+        "retrieval_score": one_of("cosine", "negative_euclidean"),
+        "ties": one_of("retrieval", "index"),
         "final": one_of("score", "combined"),
         "on_bad_image": one_of("fail", "skip"),
         "search": one_of("grid", "optuna"),
@@ -61,7 +61,7 @@ RULES: dict[str, Rule] = {
         # paths and text
         "root cache database .map": _PATH,
         "queries .images": or_list(_PATH),
-        "index_file database_labels query_labels store out checkpoints .confidence .data .root": either(_PATH, None),
+        "index_file database_labels query_labels cache out checkpoints .confidence .data .root": either(_PATH, None),
         "dataset.name": pattern(r"[\w-][\w.-]*", "letters, digits, - and _"),
         "weights": _TEXT,
         "database_prefix query_prefix": either(_TEXT, ""),
@@ -99,7 +99,7 @@ RULES: dict[str, Rule] = {
         "depth_confidence .threshold": either(number(0, 1), None),
         "c": either(_NOT_NEGATIVE, "auto"),
         "fusion.c": either(_NOT_NEGATIVE, "auto", "zscore"),
-        "fusion.weights": any_of("weights by name, such as {filter: 0.5, anchor: 1}, or null", one_of(None)),
+        "fusion.weights": any_of("weights by name, such as {retrieval: 0.5, anchor: 1}, or null", one_of(None)),
         "route": either(number(-1000, 1000), None),
     }.items()
     for name in names.split()
@@ -107,7 +107,7 @@ RULES: dict[str, Rule] = {
 # Settings that take effect with another one only, and the words of the error.
 _NEEDS = (
     ("also", "report", "report=DATASET,... as well, to learn on several data sets and report on others"),
-    ("shard", "store", "store=DIR as well, the same of all shards"),
+    ("shard", "cache", "cache=DIR as well, the same of all shards"),
     ("threshold", "confidence", "confidence=FILE as well, the confidence.json of a run on other images with ground "
      "truth"),
 )  # fmt: skip

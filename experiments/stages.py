@@ -18,7 +18,7 @@ from mfvpr.evaluation import match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Extractor, Source
 from mfvpr.matching import Matcher, MatchSet, Scales
-from mfvpr.retrieval import Filter
+from mfvpr.retrieval import Retriever
 from mfvpr.scoring.weight_registry import provenance
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
@@ -51,7 +51,7 @@ class Tools:
     """Extractor, retrieval and matcher, and the cache of their results."""
 
     extractor: Extractor | Source
-    filter: Filter
+    retriever: Retriever
     matching: Matcher
     cache: FeatureCache
     where: Mapping[str, Any]  # memory and devices
@@ -72,7 +72,7 @@ def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
-    retrieval = build.filter(settings["retrieval"], extractor, dataset)
+    retrieval = build.retriever(settings["retrieval"], extractor, dataset)
     return Tools(extractor, retrieval, build.matching(settings["matching"]), cache, build.where(settings))
 
 
@@ -106,7 +106,7 @@ def match_data_set(
 ) -> tuple[MatchSet | Scales, Shortlist]:
     """Matches and shortlist of the only sequence, from their store if it has all of them."""
     result = match_sequence(
-        images.dataset, images.dataset.only, tools.extractor, tools.filter, settings["candidates"],
+        images.dataset, images.dataset.only, tools.extractor, tools.retriever, settings["candidates"],
         matching=tools.matching, cache=tools.cache, watch=watch, **tools.where,
     )  # fmt: skip
     return result.by_scale, result.candidates
@@ -115,7 +115,7 @@ def match_data_set(
 def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
     recipe = matches_recipe(
-        images.dataset, images.dataset.only, tools.extractor, tools.filter, num_candidates, tools.matching,
+        images.dataset, images.dataset.only, tools.extractor, tools.retriever, num_candidates, tools.matching,
         tools.cache,
     )  # fmt: skip
     scales = tools.extractor.scales
@@ -168,7 +168,7 @@ def _note_candidates(settings: dict[str, Any], available: int) -> None:
     deeper = [f"R@{k}" for k in settings["recall"]["ks"] if k > available]
     if deeper:
         verb = "is" if len(deeper) == 1 else "are"
-        tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of the filter too: no more candidates are looked at")
+        tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of retrieval too: no more candidates are looked at")
 
 
 def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
@@ -206,8 +206,8 @@ def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, same_im
         return
     without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
     if without == thresholds:
-        tell("warning: the ground truth gives no query a right answer; every recall will be 0")
+        tell("warning: the ground truth gives no query a correct prediction; every recall will be 0")
     elif without:
         words = ", ".join(threshold_words(ground_truth.unit, threshold).strip() for threshold in without)
         remedy = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
-        tell(f"warning: no query has a right answer within {words}, so that recall will be 0 there; use {remedy}")
+        tell(f"warning: no query has a correct prediction within {words}, so that recall will be 0 there; use {remedy}")

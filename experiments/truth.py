@@ -6,7 +6,7 @@ from typing import Any
 from experiments.settings import SettingsError
 from mfvpr import evaluation
 from mfvpr.datasets import Dataset, Truth
-from mfvpr.evaluation import Judge
+from mfvpr.evaluation import EvaluationProtocol
 from mfvpr.utils import fingerprints
 
 _FILES = ("index_file", "query_labels", "database_labels")
@@ -20,13 +20,13 @@ def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
     return [] if truth is None else truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
 
 
-def judge(settings: Mapping[str, Any], dataset: Dataset) -> Judge:
-    """The judge of rankings for sweeps and learning."""
+def evaluation_protocol(settings: Mapping[str, Any], dataset: Dataset) -> EvaluationProtocol:
+    """The protocol of rankings for sweeps and learning."""
     if dataset.truth is None:
         raise SettingsError(
             "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
         )
-    return evaluation.judge(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
+    return evaluation.evaluation_protocol(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
 
 
 def description(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:

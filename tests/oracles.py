@@ -335,9 +335,9 @@ def fuse_scales(scores, mask, weights, normalize):
     return fused
 
 
-def combine(filter_scores, rerank_scores, c):
+def combine(retrieval_scores, rerank_scores, c):
     """s = c * s_f + s_r (paper eq. 4)."""
-    pairs = zip(_values(filter_scores), _values(rerank_scores), strict=True)
+    pairs = zip(_values(retrieval_scores), _values(rerank_scores), strict=True)
     return np.array([float(c) * s_f + s_r for s_f, s_r in pairs], np.float64)
 
 

@@ -62,7 +62,7 @@ def small(root, *more):
     street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
     return folder(
         street, "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
-        f"candidates={CANDIDATES}", "recall.tolerances=[0,1]", "recall.ks=[1,5]", f"store={root}/store", *more,
+        f"candidates={CANDIDATES}", "recall.tolerances=[0,1]", "recall.ks=[1,5]", f"cache={root}/store", *more,
     )  # fmt: skip
 
 

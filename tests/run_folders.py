@@ -24,10 +24,10 @@ HOSTILE = (
     "-->]]>\u2028\u2029.png",
     "plain 0009.png",
 )
-SYSTEMS = ("filter", "histogram", "<script>alert(2)</script>")
+SYSTEMS = ("retrieval", "histogram", "<script>alert(2)</script>")
 HEADLINE = "histogram"
-RANKS = {  # of the first right candidate of three, 0 = none, of each query
-    "filter": [1, 2, 0, 2, 3, 1, 0, 0, 1, 2],
+RANKS = {  # of the first correct candidate of three, 0 = none, of each query
+    "retrieval": [1, 2, 0, 2, 3, 1, 0, 0, 1, 2],
     "histogram": [1, 1, 1, 2, 1, 1, 0, 1, 1, 1],
     "<script>alert(2)</script>": [0, 1, 1, 1, 1, 2, 3, 1, 0, 1],
 }
@@ -40,7 +40,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     known = {"kind": "order", "files": [], "exclude_neighbors": None}
     known |= {"unit": "frames", "thresholds": TOLERANCES} if truth else {}
     common = {
-        "filter": {"name": HOSTILE[0]}, "features": {"name": HOSTILE[1]}, "matching": {}, "candidates": CANDIDATES,
+        "retrieval": {"name": HOSTILE[0]}, "features": {"name": HOSTILE[1]}, "matching": {}, "candidates": CANDIDATES,
         "queries": len(HOSTILE) * len(sequences), "database": len(HOSTILE), "dataset": sequences[0],
         "data_fingerprint": {"database": "0"}, "ground_truth": known, "seconds": {HOSTILE[2]: 1.5, "scores": 2.0},
         "bytes_per_image": 1234, "versions": {"mfvpr": "</script>"}, **changes,
@@ -70,10 +70,10 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
 def _write_answers(folder, ranks, truth, places):
     files = file_names([*ranks])
     for system, first in ranks.items():
-        right = np.array(first)[:, None] == np.arange(1, CANDIDATES + 1)
+        correct = np.array(first)[:, None] == np.arange(1, CANDIDATES + 1)
         rows = (np.arange(len(HOSTILE))[:, None] + np.arange(CANDIDATES)) % len(HOSTILE)
         scores = np.arange(len(HOSTILE))[:, None] + 10.0 - np.arange(CANDIDATES)
-        rankings = Rankings(HOSTILE, HOSTILE[::-1], rows, scores, right if truth else None)
+        rankings = Rankings(HOSTILE, HOSTILE[::-1], rows, scores, correct if truth else None)
         write_predictions(folder / "predictions" / f"{files[system]}.csv", rankings)
         write_failures(folder / "failures" / f"{files[system]}.csv", rankings)
     if truth:

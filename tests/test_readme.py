@@ -125,7 +125,7 @@ def test_the_whole_way_in_one_call(small_street, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(compile(EXAMPLES[1], "README.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in printed if "[[" in line] == ["filter", "histogram"]
+    assert [line.split()[0] for line in printed if "[[" in line] == ["retrieval", "histogram"]
     assert (tmp_path / "features").is_dir()
 
 

@@ -22,5 +22,5 @@ def test_histogram_recognizes_real_places(name, histogram_at_2, tmp_path, monkey
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     recall = {row["system"]: row["recall_at"]["1"] for row in rows if row["tolerance"] == 2}
     assert recall["histogram"] >= histogram_at_2
-    assert recall["histogram"] > recall["sum"] > recall["filter"] - 0.01
+    assert recall["histogram"] > recall["sum"] > recall["retrieval"] - 0.01
     assert recall["histogram"] > 2 * recall["count"]

@@ -1,4 +1,4 @@
-"""Filter, extraction of shortlisted images and re-ranking among 100,000 images, with a forecast for 2.8 million."""
+"""Retriever, extraction of shortlisted images and re-ranking among 100,000 images, with a forecast for 2.8 million."""
 
 import os
 import tempfile
@@ -25,7 +25,7 @@ from mfvpr.storage.manifest import store_path
 from mfvpr.storage.rows import require_space
 from mfvpr.types import Shortlist
 
-DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that the filter often fails
+DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that retrieval often fails
 ROUNDS = 3
 WHOLE, ASKED, MACHINES = 2_800_000, 1000, (1, 8, 64)  # images of San Francisco XL, and queries of the forecast
 # Seconds per image on 2 cores from experiments/results.md: MixVPR one by one, and the local features of `localize`.
@@ -33,7 +33,7 @@ DESCRIBING, EXTRACTING = 0.102, {"SIFT": 0.021, "ALIKED n16": 0.070}
 ASSUMED = (
     "all machines and their disks are as fast as the measured ones",
     "global descriptors of the whole database are extracted once, before the queries; they stay in memory, in float32",
-    "the filter compares every query with every image in time proportional to their numbers; the database's rows are "
+    "retrieval compares every query with every image in time proportional to their numbers; the database's rows are "
     "divided evenly over the machines",
     "one machine sorts the candidates of all machines in time proportional to their number",
     "local features are extracted for shortlisted images alone, divided evenly; no two queries share an image, which "
@@ -80,7 +80,7 @@ def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
 
     `steps` has a `Step` by name, `reranking` the seconds of its parts. `made` is the number of images whose features
     were made, `written` their bytes on disk. A round reads `rows_read` rows of `read` bytes: just written, so they come
-    from the system's cache rather than the disk. `recall` is that of the filter, its shortlist, and the re-ranking.
+    from the system's cache rather than the disk. `recall` is that of retrieval, its shortlist, and the re-ranking.
     """
     queries = FeatureSet.of([data.query(row) for row in bar("queries", data.queries, range(data.queries))])
     query_vectors, vectors = data.global_descriptors()
@@ -89,22 +89,22 @@ def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
     def shortlist(images: int) -> Shortlist:
         return EXACT.shortlist(query_vectors, vectors[:images], CANDIDATES)
 
-    _, steps["filter, half"] = repeat("filter, half", rounds, lambda: shortlist(data.images // 2))
-    candidates, steps["filter"] = repeat("filter", rounds, lambda: shortlist(data.images))
+    _, steps["retrieval, half"] = repeat("retrieval, half", rounds, lambda: shortlist(data.images // 2))
+    candidates, steps["retrieval"] = repeat("retrieval", rounds, lambda: shortlist(data.images))
     _, steps["merging"] = repeat("merging", rounds, lambda: merge(candidates, max(MACHINES)))
     store, making = make_features(data, root, np.unique(candidates.indices[candidates.mask]))
     source = Counted(store)
     database = FeatureSet(source, {})
-    answers: list[Answer] = []
-    _, reranking = repeat("re-ranking", rounds, lambda: answers.append(rerank(queries, database, candidates)))
-    num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(answers)
+    predictions: list[Answer] = []
+    _, reranking = repeat("re-ranking", rounds, lambda: predictions.append(rerank(queries, database, candidates)))
+    num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(predictions)
     positives = Positives.from_rows(data.similar(), data.images)
-    of_filter, of_shortlist = recall_at_k(candidates.indices, positives, [1, CANDIDATES]).tolist()
-    [of_reranking] = recall_at_k(answers[0].rows, positives, [1]).tolist()
+    retrieval_scores, of_shortlist = recall_at_k(candidates.indices, positives, [1, CANDIDATES]).tolist()
+    [of_reranking] = recall_at_k(predictions[0].rows, positives, [1]).tolist()
     return {
-        "steps": steps | making | {"re-ranking": reranking}, "reranking": median_seconds(answers[1:]),
+        "steps": steps | making | {"re-ranking": reranking}, "reranking": median_seconds(predictions[1:]),
         "made": num_images, "written": written, "rows_read": rows_read, "read": rows_read * written / num_images,
-        "recall": {"filter": of_filter, "shortlist": of_shortlist, "re-ranking": of_reranking},
+        "recall": {"retrieval": retrieval_scores, "shortlist": of_shortlist, "re-ranking": of_reranking},
     }  # fmt: skip
 
 
@@ -154,7 +154,7 @@ def rates_of(data: MadeUp, measured: Mapping[str, Any], extracting: float) -> di
     steps = measured["steps"]
     return {
         "describing": DESCRIBING,  # the global descriptor of an image
-        "comparing": steps["filter"].seconds / (data.queries * data.images),  # a query with a database image
+        "comparing": steps["retrieval"].seconds / (data.queries * data.images),  # a query with a database image
         "merging": steps["merging"].seconds / (data.queries * CANDIDATES * max(MACHINES)),  # a candidate of a machine
         "extracting": extracting,
         "storing": steps["storing"].seconds / measured["made"],  # the local features of an image
@@ -170,14 +170,14 @@ def forecast(rates: Mapping[str, float], images: int, queries: int, candidates: 
     merging = rates["merging"] * queries * candidates * machines if machines > 1 else 0.0
     answering = {
         "asking": (rates["describing"] + rates["extracting"]) * queries / machines,
-        "filtering": rates["comparing"] * queries * images / machines + merging,
+        "retrieving": rates["comparing"] * queries * images / machines + merging,
         "extracting": (rates["extracting"] + rates["storing"]) * rows / machines,
         "reranking": rates["reranking"] * queries / machines,
     }
     return answering | {
         "answering": sum(answering.values()),  # from the queries' images to their rankings
         "describing": rates["describing"] * images / machines,  # the database, once
-        "merging": merging,  # included in `filtering`
+        "merging": merging,  # included in `retrieving`
         "memory": rates["vector_bytes"] * images / machines,
         "disk": rates["row_bytes"] * rows / machines,
     }
@@ -198,20 +198,21 @@ def _steps_table(data: MadeUp, measured: Mapping[str, Any]) -> Table:
 def _remarks(data: MadeUp, measured: Mapping[str, Any]) -> Iterator[str]:
     yield "re-ranking: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in measured["reranking"].items())
     recall = measured["recall"]
-    yield f"R@1: filter {recall['filter']:.3f}, re-ranking {recall['re-ranking']:.3f}; " + (
-        f"R@{CANDIDATES} of the filter: {recall['shortlist']:.3f}"
+    yield f"R@1: retrieval {recall['retrieval']:.3f}, re-ranking {recall['re-ranking']:.3f}; " + (
+        f"R@{CANDIDATES} of retrieval: {recall['shortlist']:.3f}"
     )
     pairs, share = data.queries * CANDIDATES, 100 * measured["made"] / data.images
     yield f"images in the shortlists: {measured['made']} of {pairs} pairs, {share:.1f} % of all"
-    ratio = measured["steps"]["filter"].seconds / measured["steps"]["filter, half"].seconds
-    yield f"filter, all / half of the images: {ratio:.2f} times as long"
+    ratio = measured["steps"]["retrieval"].seconds / measured["steps"]["retrieval, half"].seconds
+    yield f"retrieval, all / half of the images: {ratio:.2f} times as long"
     yield f"global descriptor: {1e3 * DESCRIBING:g} ms an image (MixVPR one by one, experiments/results.md)"
     yield "local features: " + ", ".join(f"{name} {1e3 * seconds:g} ms" for name, seconds in EXTRACTING.items())
 
 
 def _plans_table(plans: list[dict]) -> Table:
     columns = {  # header -> name, unit, digits
-        "database once, h": ("describing", 3600, 2), "queries, s": ("asking", 1, 2), "filter, s": ("filtering", 1, 2),
+        "database once, h": ("describing", 3600, 2), "queries, s": ("asking", 1, 2),
+        "retrieval, s": ("retrieving", 1, 2),
         "(merging)": ("merging", 1, 2), "extraction, s": ("extracting", 1, 1), "re-ranking, s": ("reranking", 1, 1),
         "in all, s": ("answering", 1, 1), "memory, GB": ("memory", 1e9, 2), "disk, GB": ("disk", 1e9, 2),
     }  # fmt: skip

@@ -105,7 +105,7 @@ def _start_task(folder: Path, street: Path, shard: str) -> subprocess.Popen[byte
         "dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
         "dataset.ground_truth=index", f"dataset.index_file={street}/ground_truth.csv", "dataset.widen_index=true",
         "features.max_keypoints=200", f"features.image_size=[{IMAGE_SIZE[0]},{IMAGE_SIZE[1]}]", "retrieval.num_words=8",
-        "candidates=20", "figures=2", f"store={folder}/store", f"out={folder}/out", f"shard={shard}",
+        "candidates=20", "figures=2", f"cache={folder}/store", f"out={folder}/out", f"shard={shard}",
     ]  # fmt: skip
     folder.mkdir(exist_ok=True)
     shutil.rmtree(folder / "out", ignore_errors=True)  # of a run that was killed
@@ -138,7 +138,7 @@ def _check_rows(states: FileStates, folder: Path) -> None:
 
 
 def _stage(folder: Path, shard: str) -> str:
-    """Stage under way, judged by the files in the stores."""
+    """Stage under way, evaluation by the files in the stores."""
     if shard == NO_SHARD:
         return "results and report"
     kinds = {path.relative_to(folder / "store").parts[0].partition("-")[0] for path in _row_files(folder).values()}

@@ -20,7 +20,7 @@ from mfvpr.features import Aggregated, AlikedFeatures, Extractor, Sift, VladFitt
 from mfvpr.report import Table
 from mfvpr.reranking import Matched
 from mfvpr.reranking.ranking import rank_shortlist
-from mfvpr.reranking.results import FILTER
+from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
 from mfvpr.storage import FeatureCache
@@ -43,7 +43,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
         for features, extractor in extractors().items():
             retrieval = Retrieval(Aggregated(extractor, VladFitting()))
             matched = match_sequence(dataset, dataset.only, extractor, retrieval, "all", cache=cache)
-            rows = [measure(matched, score, scorers, rounds or 1) for score in (FILTER, *scorers)]
+            rows = [measure(matched, score, scorers, rounds or 1) for score in (RETRIEVAL, *scorers)]
             tables.append({"matches": f"{name}, {features}", "rows": rows})
             parts += [f"{name}, {features}, {np.mean(matched.matches[0].counts):.0f} matches a pair", _table(rows)]
     write_report(out, "all images are candidates", parts, {"tables": tables})
@@ -63,11 +63,11 @@ def extractors() -> dict[str, Extractor]:
 
 
 def measure(matched: Matched, score: str, scorers: Mapping[str, Scorer], rounds: int) -> dict[str, Any]:
-    """Recall of a score with its interval at every tolerance, and milliseconds per query; None for the filter's."""
+    """Recall of a score with its interval at every tolerance, and milliseconds per query; None for retrieval's."""
     candidates, truth = matched.candidates, matched.sequence.truth
     assert truth is not None  # the ground truth is the order
     scores, milliseconds = candidates.scores, None
-    if score != FILTER:
+    if score != RETRIEVAL:
         scorer = {score: scorers[score]}
         [scores] = stages.score(scorer, matched.by_scale, candidates).values()
         seconds = [duration(lambda: stages.score(scorer, matched.by_scale, candidates)) for _ in range(rounds)]

@@ -34,7 +34,7 @@ CANDIDATES = 50
 MEMORY = 3.0  # GB that the evaluation may take
 IN_MEMORY = 2000  # images with 128 dimensions that fit into memory, where all features are ranked again for comparison
 ROUNDS = 3
-STEPS = ("filter", "matching", "scoring", "ranking")
+STEPS = ("retrieval", "matching", "scoring", "ranking")
 
 
 class Answer(NamedTuple):
@@ -104,23 +104,23 @@ def _measure(data: MadeUp, root: Path, rounds: int, start: float) -> Iterator[di
     database = FeatureSet(source, {})
     rank_queries(FeatureSet.of([queries[0]]), database, (vectors[0][:1], vectors[1]))
     first, source.rows, source.seconds = time.monotonic() - start, 0, 0.0
-    answers, cpu = list[Answer](), 0.0
+    predictions, cpu = list[Answer](), 0.0
     yield None
     for _ in range(rounds):
         before = time.process_time()
-        answers.append(rank_queries(queries, database, vectors))
+        predictions.append(rank_queries(queries, database, vectors))
         cpu += time.process_time() - before
         yield None
     peak, same = peak_bytes() / 1e9, None
     if data.images * data.dimension <= IN_MEMORY * 128:
         in_memory = FeatureSet(InMemory(dict(store.read()), data.images), {})
         expected = rank_queries(queries, in_memory, vectors, memory=None)
-        same = all(np.array_equal(*arrays) for arrays in zip(answers[0][:2], expected[:2], strict=True))
-    correct = [best in rows for best, rows in zip(answers[0].rows[:, 0], data.similar(), strict=True)]
-    count = len(answers) * data.queries
+        same = all(np.array_equal(*arrays) for arrays in zip(predictions[0][:2], expected[:2], strict=True))
+    correct = [best in rows for best, rows in zip(predictions[0].rows[:, 0], data.similar(), strict=True)]
+    count = len(predictions) * data.queries
     yield vars(data) | {
-        "total": [sum(answer.seconds.values()) / data.queries for answer in answers],
-        "steps": {name: seconds / data.queries for name, seconds in median_seconds(answers).items()},
+        "total": [sum(prediction.seconds.values()) / data.queries for prediction in predictions],
+        "steps": {name: seconds / data.queries for name, seconds in median_seconds(predictions).items()},
         "cpu": cpu / count,
         "reading": source.seconds / count,
         "rows": source.rows / count,
@@ -146,9 +146,9 @@ def rank_queries(
     """Retrieve by the global descriptors `vectors` of both sides, and re-rank."""
     start = time.perf_counter()
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
-    filtering = {"filter": time.perf_counter() - start}
-    answer = rerank(queries, database, candidates, memory=memory)
-    return answer._replace(seconds=filtering | answer.seconds)
+    retrieving = {"retrieval": time.perf_counter() - start}
+    prediction = rerank(queries, database, candidates, memory=memory)
+    return prediction._replace(seconds=retrieving | prediction.seconds)
 
 
 def rerank(
@@ -166,13 +166,26 @@ def rerank(
     return Answer(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
 
 
-def median_seconds(answers: list[Answer]) -> dict[str, float]:
+def median_seconds(predictions: list[Answer]) -> dict[str, float]:
     """Medians over the rounds, by step."""
-    return {name: float(np.median([answer.seconds[name] for answer in answers])) for name in answers[0].seconds}
+    return {
+        name: float(np.median([prediction.seconds[name] for prediction in predictions]))
+        for name in predictions[0].seconds
+    }
 
 
 def _table(results: dict[str, dict[str, Any]]) -> Table:
-    header = ["database", "ms / query", *STEPS, "(reading)", "rows read", "CPU ms", "peak GB", "first answer s", "R@1"]
+    header = [
+        "database",
+        "ms / query",
+        *STEPS,
+        "(reading)",
+        "rows read",
+        "CPU ms",
+        "peak GB",
+        "top prediction s",
+        "R@1",
+    ]
     lines = []
     for title, result in results.items():
         seconds = [np.median(result["total"]), *result["steps"].values(), result["reading"]]

@@ -22,7 +22,7 @@ from mfvpr.utils.files import clip_middle, printable, replacing
 _MIDDLE = 1  # of the tolerances: the paper's figure
 _OVER_PAPERS = "printed, over the paper's six"
 _OURS, _PRINTED = "#2f6fb0", "#c9a227"
-_STEPS = {"filter": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
+_STEPS = {"retrieval": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
 _SIDE = 300  # px of an image's longer side among the failures
 _NAME_LENGTH = 32  # characters
 _FAILURES = 2  # of each data set
@@ -128,14 +128,14 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
     for place, sequence in enumerate(dataset.sequences):
         file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
         failures += [(sequence, row) for row in read_csv(file)
-                     if row["right_answer"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
+                     if row["correct_image"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
     failures.sort(key=lambda failure: -float(failure[1]["margin"]))
     for sequence, row in failures[:_FAILURES]:
         where = " ".join(dict.fromkeys((dataset.name, sequence.name)))
         yield [
             _image(sequence.images, row["query"], f"{where} query"),
-            _image(dataset.database, row["answer"], "answer"),
-            _image(dataset.database, row["right_answer"], "right"),
+            _image(dataset.database, row["prediction"], "prediction"),
+            _image(dataset.database, row["correct_image"], "correct"),
         ]
 
 
@@ -143,8 +143,8 @@ def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, st
     """Whether a prediction is incorrect within the widest of the paper's tolerances, too; True for positions."""
     if sequence.truth is None or sequence.truth.unit != "frames":
         return True
-    right = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
-    return database.names.index(row["answer"]) not in right
+    correct = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
+    return database.names.index(row["prediction"]) not in correct
 
 
 def _copy(path: Path, source: Path) -> None:

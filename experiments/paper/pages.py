@@ -47,8 +47,9 @@ def write_pages(
                 [_averages(evaluations), *_by_sequence(evaluations)], recalls),
         Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
                 "intervals.", links=addresses),
-        Section("answers", "Answers", "Of each evaluation: query and first answer with their heaviest matches, and the "
-                "histogram of their shifts; below a wrong answer the right one.", gallery=_gallery(evaluations)),
+        Section("predictions", "Predictions", "For every evaluation: queries and top predictions with their heaviest "
+                "matches, and the histogram of shifts. An incorrect prediction has the correct image below it.",
+                gallery=_gallery(evaluations)),
         Section("costs", "Seconds and sizes", "", [*_costs(evaluations)], costs),
         Section("settings", "Data sets and settings", tables=about),
     ]  # fmt: skip

@@ -20,7 +20,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import differences
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
-from mfvpr.reranking.results import FILTER
+from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.utils import InputError
 
 
@@ -112,7 +112,7 @@ def evaluate_all(
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.contents(folder).fingerprint for side, folder in folders.items()}
-            right = truth.fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
+            correct = truth.fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue
@@ -121,7 +121,7 @@ def evaluate_all(
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names, start=number * len(names) + 1):
             chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place, settings)
-            inputs = runs.input_fingerprints(chosen, images, right)
+            inputs = runs.input_fingerprints(chosen, images, correct)
             if runs.is_finished_with(inputs, folder):
                 finished += 1
             else:
@@ -155,8 +155,8 @@ def _read_evaluations(
         for row in (row for row in rows if row.run == run):
             if result := row_result(row, content, candidates):
                 results[row.name, name] = result
-            if row.leads or row.ranking == FILTER:  # retrieval alone has no local features
-                sizes[row.name, name] = size["descriptor"] + (0 if row.ranking == FILTER else size["local"])
+            if row.leads or row.ranking == RETRIEVAL:  # retrieval alone has no local features
+                sizes[row.name, name] = size["descriptor"] + (0 if row.ranking == RETRIEVAL else size["local"])
     return Evaluations(rows, datasets, results, sizes=sizes, folders=folders)
 
 

@@ -25,8 +25,8 @@ from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
-_SHARED = ("store", "memory", "devices")  # settings of both programs
-_FREE = {"out", "store", "memory", "devices", "command"}  # settings that change no number
+_SHARED = ("cache", "memory", "devices")  # settings of both programs
+_FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change no number
 
 
 @contextmanager

@@ -27,6 +27,6 @@ def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
         counts = features.source.counts
         known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
         local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
-    describer: Any = fit_to_database(tools.filter, database, cache)  # all of the paper's have one
+    describer: Any = fit_to_database(tools.retriever, database, cache)  # all of the paper's have one
     vectors = cache.vectors(database, describer.describer, database).values
     return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}

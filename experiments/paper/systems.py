@@ -13,7 +13,7 @@ from experiments.settings import RULES, SettingsError
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
 from mfvpr.datasets.published import PUBLISHED
-from mfvpr.reranking.results import FILTER
+from mfvpr.reranking.results import RETRIEVAL
 
 DRAWN = "streets_seasons"
 REAL = {  # data sets of plain folders, and their folders
@@ -22,7 +22,7 @@ REAL = {  # data sets of plain folders, and their folders
 }
 _SIDES = ("database", "queries")
 _POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
-COMBINED = f"histogram + {FILTER}"
+COMBINED = f"histogram + {RETRIEVAL}"
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ _MIX = {"hist_10": "hist 10", "hist_50": "hist 50", "hist_comb_10": "hist-comb 1
 _PAPER = (
     Row("patch_netvlad_performance", "Patch-NV perf.", "patch_netvlad_performance"),
     Row("patch_netvlad_speed", "Patch-NV speed", "patch_netvlad_speed"),
-    Row("mixvpr", "MixVPR", "mix_hist_50", FILTER),
-    Row("selavpr_pitts_stage_1", "SelaVPR pits. stage 1", "selavpr_pitts", FILTER),
+    Row("mixvpr", "MixVPR", "mix_hist_50", RETRIEVAL),
+    Row("selavpr_pitts_stage_1", "SelaVPR pits. stage 1", "selavpr_pitts", RETRIEVAL),
     Row("selavpr_pitts", "SelaVPR pits.", "selavpr_pitts"),
-    Row("selavpr_msls_stage_1", "SelaVPR msls stage 1", "selavpr_msls", FILTER),
+    Row("selavpr_msls_stage_1", "SelaVPR msls stage 1", "selavpr_msls", RETRIEVAL),
     Row("selavpr_msls", "SelaVPR msls", "selavpr_msls"),
     Row("ssm_vpr", "SSM-VPR", "ssm_vpr"),
     *(Row(f"ssm_{name}", f"SSM-{title}", f"ssm_{name}") for name, title in _SSM.items()),
@@ -74,7 +74,7 @@ _NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran
 
 def _stand_ins(features: str, title: str) -> Iterator[Row]:
     """The methods with features whose weights are here, after VLAD of the same features."""
-    yield Row(f"{features}_vlad", f"VLAD of {title}", f"{features}_50", FILTER)
+    yield Row(f"{features}_vlad", f"VLAD of {title}", f"{features}_50", RETRIEVAL)
     for ranking, words in _SCORES.items():
         yield Row(f"{features}_{_NAMES.get(ranking, ranking)}", f"{title}-{words}", f"{features}_50", ranking)
     yield Row(f"{features}_hist_10", f"{title}-hist 10", f"{features}_10", "histogram")

@@ -173,14 +173,14 @@ def _settings(evaluations: Evaluations) -> Table:
     lines: dict[str, list[str]] = {}
     for (name, _), result in evaluations.results.items():
         about, theirs = result.about, printed_settings(name)
-        sides = [about[group].get("image_size") for group in ("filter", "features")]
+        sides = [about[group].get("image_size") for group in ("retrieval", "features")]
         ours = [" x ".join(map(str, side)) if side else _NONE for side in sides]
         ours.append(str(result.candidates or about["candidates"]))
-        values = [theirs.get(column) for column in ("filter", "re_ranking", "candidates")]
+        values = [theirs.get(column) for column in ("retrieval", "re_ranking", "candidates")]
         cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, values, strict=True)]
-        lines[name] = [about["filter"]["name"], cells[0], about["features"]["name"], *cells[1:]]
+        lines[name] = [about["retrieval"]["name"], cells[0], about["features"]["name"], *cells[1:]]
     rows = [[row.title, *lines[row.name]] for row in evaluations.rows if row.name in lines]
-    return Table(["system", "filter", "its images", "features", "their images", "candidates"], rows, text_columns=5)
+    return Table(["system", "retrieval", "its images", "features", "their images", "candidates"], rows, text_columns=5)
 
 
 def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) -> Table:
@@ -251,8 +251,8 @@ def _seconds(evaluations: Evaluations) -> Table:
     for row in evaluations.rows:
         theirs = printed_tables()["seconds"].get(row.name, [None] * 4)
         if steps := evaluations.seconds.get(row.name):
-            ours = [steps["filter"], steps["features"], steps["matching"] + steps["scores"]]
+            ours = [steps["retrieval"], steps["features"], steps["matching"] + steps["scores"]]
             pairs = zip([*ours, sum(ours)], theirs, strict=True)
             cells = [f"{value:.3f}" + ("" if known is None else f" ({known:.2f})") for value, known in pairs]
             rows.append([row.title, *cells])
-    return Table(["system", "filter", "features", "matching and score", "in all"], rows)
+    return Table(["system", "retrieval", "features", "matching and score", "in all"], rows)

@@ -20,7 +20,7 @@ from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
-STEPS = ("filter", "features", "matching", "scores")
+STEPS = ("retrieval", "features", "matching", "scores")
 _FLOAT = 4  # bytes of a number
 _MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
 _DATABASES = (100, 1000, 10_000, 100_000)  # images
@@ -40,7 +40,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
     extractor = build.extractor(settings["features"], None)
-    filter, matching = build.filter(settings["retrieval"], extractor, None), build.matching(settings["matching"])
+    retriever, matching = build.retriever(settings["retrieval"], extractor, None), build.matching(settings["matching"])
     scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
@@ -50,7 +50,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
             images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
             part = replace(sequence, images=images, truth=None, excluded=None)
             evaluation.evaluate(
-                Dataset(dataset.name, database, (part,)), extractor, filter, {main: scorers[main]},
+                Dataset(dataset.name, database, (part,)), extractor, retriever, {main: scorers[main]},
                 candidates=candidates, matching=matching, cache=cache, watch=watch,
             )  # fmt: skip
     return {step: watch.seconds.get(step, 0.0) / number for step in STEPS}

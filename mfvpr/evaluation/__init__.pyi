@@ -1,7 +1,7 @@
 __all__ = [
     "Confidence",
+    "EvaluationProtocol",
     "Half",
-    "Judge",
     "Recall",
     "Result",
     "Split",
@@ -10,10 +10,10 @@ __all__ = [
     "confidence_inputs",
     "estimate",
     "evaluate",
+    "evaluation_protocol",
     "fit_confidence",
     "halves",
     "hits",
-    "judge",
     "match_sequence",
     "mcnemar",
     "neighbors",
@@ -28,7 +28,7 @@ __all__ = [
 from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
 from .evaluation import evaluate
 from .precision import precision_recall, reliability
-from .protocol import Judge, Split, judge
+from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .recall import Tally, hits, recall_at_k
 from .results import Recall, Result
 from .selection import Half, best_setting, halves, neighbors, separate

@@ -18,7 +18,7 @@ from mfvpr.reranking.results import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
 
-Input = Literal["margin", "height", "filter", "score"]
+Input = Literal["margin", "height", "retrieval", "score"]
 INPUTS: tuple[Input, ...] = ("margin", "height")  # by default
 APART = 5  # rows of the database, by default
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
@@ -28,7 +28,7 @@ _FORMAT = "mfvpr confidence 2"
 
 
 def confidence_inputs(
-    ranked: Ranked, filtered: Ranked, *, inputs: Sequence[Input] = INPUTS, apart: int = APART
+    ranked: Ranked, by_retrieval: Ranked, *, inputs: Sequence[Input] = INPUTS, apart: int = APART
 ) -> Float[np.ndarray, "queries inputs"]:
     """Inputs of the confidence in the top predictions; NaN without a prediction.
 
@@ -36,14 +36,14 @@ def confidence_inputs(
         divided by the standard deviation of the scores of candidates of other places. If there are few of them, that is
         drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
     height: the same, with the mean score of candidates of other places instead of the best.
-    filter: minus the log of the best rank, from 1, that the retrieval gives to a candidate of the predicted place.
+    retrieval: minus the log of the best rank, from 1, that the retrieval gives to a candidate of the predicted place.
     score: inverse hyperbolic sine of the first score itself, which depends on the scale of scores.
 
     A larger input means a more confident prediction.
 
     Args:
         ranked: of a system.
-        filtered: the ranking of the same candidates by retrieval.
+        by_retrieval: the ranking of the same candidates by retrieval.
         inputs: their names.
         apart: database images within this many rows of the prediction count as its place.
     """
@@ -54,11 +54,11 @@ def confidence_inputs(
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
     second = np.max(scores, axis=1, where=elsewhere, initial=-np.inf)
-    near = np.abs(filtered.rows - first) <= apart  # the prediction is among them; -1, no candidate, comes last
+    near = np.abs(by_retrieval.rows - first) <= apart  # the prediction is among them; -1, no candidate, comes last
     above = {"margin": scores[:, 0] - second, "height": scores[:, 0] - mean}
     columns = {name: np.where(elsewhere.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
                for name, value in above.items()}  # fmt: skip
-    columns |= {"filter": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
+    columns |= {"retrieval": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
     return np.where(there[:, :1], np.stack([columns[name] for name in inputs], axis=1), np.nan)
 
 
@@ -90,9 +90,9 @@ class Confidence:
     weights: tuple[float, ...]
     bias: float
 
-    def __call__(self, ranked: Ranked, filtered: Ranked) -> Float[np.ndarray, " queries"]:
+    def __call__(self, ranked: Ranked, by_retrieval: Ranked) -> Float[np.ndarray, " queries"]:
         """Probabilities, NaN without a prediction; for the arguments see `confidence_inputs`."""
-        return self.probability(confidence_inputs(ranked, filtered, inputs=self.inputs, apart=self.apart))
+        return self.probability(confidence_inputs(ranked, by_retrieval, inputs=self.inputs, apart=self.apart))
 
     def probability(self, inputs: Float[np.ndarray, "queries inputs"]) -> Float[np.ndarray, " queries"]:
         """Probabilities from inputs; an infinite input counts as its center."""
@@ -101,7 +101,7 @@ class Confidence:
 
 
 def fit_confidence(
-    values: Float[np.ndarray, "queries inputs"], right: Bool[np.ndarray, " queries"], *,
+    values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *,
     inputs: Sequence[Input] = INPUTS, apart: int = APART, ridge: float = 1.0,
 ) -> Confidence:  # fmt: skip
     """Fit a logistic model with weights of at least 0 by maximum likelihood.
@@ -112,7 +112,7 @@ def fit_confidence(
     Args:
         values: of `confidence_inputs`; rows that are not finite, without a prediction or without candidates of other
             places, are left out.
-        right: whether the top prediction is correct; False for queries without a place in the database.
+        correct: whether the top prediction is correct; False for queries without a place in the database.
         inputs: names of the values.
         apart: with which the values were computed.
         ridge: penalty on weights: half of it times the sum of their squares is added to the negative log likelihood.
@@ -121,7 +121,7 @@ def fit_confidence(
         InputError: no predictions.
     """
     there = np.isfinite(values).all(axis=1)
-    values, right = values[there], np.asarray(right, bool)[there]
+    values, correct = values[there], np.asarray(correct, bool)[there]
     if not len(values):
         raise InputError("confidence: expected predictions to fit it on, with candidates of other places, got none")
     center, scale = values.mean(axis=0), values.std(axis=0)
@@ -131,8 +131,8 @@ def fit_confidence(
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         odds, bias = columns @ weights, weights[0]
-        value = np.logaddexp(0, odds).sum() - odds[right].sum() + penalty @ weights**2 / 2
-        gradient = columns.T @ (special.expit(odds) - right) + penalty * weights
+        value = np.logaddexp(0, odds).sum() - odds[correct].sum() + penalty @ weights**2 / 2
+        gradient = columns.T @ (special.expit(odds) - correct) + penalty * weights
         gradient[0] += special.expit(bias) - 0.5
         return value + np.logaddexp(0, bias) - bias / 2, gradient
 
@@ -178,7 +178,7 @@ def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list
     center, scale, weights = (tuple(array.astype(float).tolist()) for array in arrays)
     numbers = [bias, *center, *scale, *weights]
     same = len(inputs) == len(center) == len(scale) == len(weights)
-    known = set(inputs) <= {"margin", "height", "filter", "score"}
+    known = set(inputs) <= {"margin", "height", "retrieval", "score"}
     once = len({*inputs}) == len(inputs) and type(apart) is int and apart >= 0
     fitted = np.isfinite(numbers).all() and min(scale, default=0) > 0 and min(weights) >= 0
     if vectors or not (same and known and once and fitted):

@@ -27,7 +27,7 @@ from mfvpr.reranking.frame_correlation import FrameCorrelation
 from mfvpr.reranking.fusion import Fusion, rank_sequence
 from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import COHORT, Matched
-from mfvpr.retrieval.retriever import Filter
+from mfvpr.retrieval.retriever import Retriever
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.shards import together
@@ -38,10 +38,10 @@ Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q,
 
 
 def evaluate(
-    dataset: Dataset, extractor: Extractor | Source, filter: Filter, scorers: Mapping[str, Scorer], *,
+    dataset: Dataset, extractor: Extractor | Source, retriever: Retriever, scorers: Mapping[str, Scorer], *,
     candidates: int | Literal["all"] = 50, matching: Matcher = NEIGHBORS,
     fused: Mapping[str, Fusion] | None = None, correlated: Mapping[str, FrameCorrelation] | None = None,
-    cohort: int | None = None, ties: Ties = "filter", cache: FeatureCache | None = None, memory: float | None = None,
+    cohort: int | None = None, ties: Ties = "retrieval", cache: FeatureCache | None = None, memory: float | None = None,
     devices: Sequence[Device] | None = None, watch: Stopwatch | None = None,
 ) -> Result:  # fmt: skip
     """Rank every query's candidates by every scorer.
@@ -49,17 +49,17 @@ def evaluate(
     Args:
         dataset: one database, one or more query sequences.
         extractor: extracts local features, or reads them, see `mfvpr.retrieval.precomputed`.
-        filter: the retrieval, which finds candidates.
+        retriever: the retrieval, which finds candidates.
         scorers: by name.
         candidates: number of candidates of each query.
         matching: matches a pair, see `mfvpr.Matcher`.
-        fused: by name of a scorer, how its score is combined with the retrieval's (system `name + filter`), or with
-            other scorers' and the retrieval's (`name + other + filter`).
+        fused: by name of a scorer, how its score is combined with the retrieval's (system `name + retrieval`), or with
+            other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused system, how its scores are correlated with those of the queries
             before (`name + frames`).
         cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
             sides of a database image that show its place, and are left out; None = no cohort.
-        ties: equal scores keep the order of the retrieval, or go by the row of the database: "filter", "index".
+        ties: equal scores keep the order of the retrieval, or go by the row of the database: "retrieval", "index".
         cache: where features and matches are kept; None = in memory.
         memory: GB that features of the database may take on the devices, and matches that are kept in memory; None = a
             third of what is free.
@@ -75,7 +75,7 @@ def evaluate(
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     cache = replace(cache or FeatureCache(), watch=watch)
     where = {"memory": memory, "devices": devices}
-    scoring = _Scoring(dataset, (extractor, filter, candidates), scorers, matching, cache, where)
+    scoring = _Scoring(dataset, (extractor, retriever, candidates), scorers, matching, cache, where)
     calls = [partial(scoring.score, sequence, watch) for sequence in dataset.sequences]
     of_cohort = [] if cohort is None else [partial(scoring.score_cohort, cohort, watch)]
     scored: list[Scored] = together(*of_cohort, *calls)
@@ -93,7 +93,7 @@ class _Scoring:
     """Arguments of `evaluate` that determine matches and scores."""
 
     dataset: Dataset
-    tools: tuple[Extractor | Source, Filter, int | Literal["all"]]  # the number of candidates last
+    tools: tuple[Extractor | Source, Retriever, int | Literal["all"]]  # the number of candidates last
     scorers: Mapping[str, Scorer]
     matching: Matcher
     cache: FeatureCache

@@ -37,12 +37,12 @@ class Reliability(NamedTuple):
     """Predictions in bins of equal width of their probabilities, from 0 to 1.
 
     probability: mean, NaN in an empty bin.
-    right: fraction of correct predictions, NaN in an empty bin.
+    correct: fraction of correct predictions, NaN in an empty bin.
     count: of predictions.
     """
 
     probability: Float[np.ndarray, " bins"]
-    right: Float[np.ndarray, " bins"]
+    correct: Float[np.ndarray, " bins"]
     count: Int[np.ndarray, " bins"]
 
     @property
@@ -50,46 +50,46 @@ class Reliability(NamedTuple):
         """Expected calibration error: mean of |probability - fraction of correct ones| over all predictions, or NaN."""
         if not self.count.any():
             return float("nan")
-        return float(np.nansum(self.count * np.abs(self.probability - self.right)) / self.count.sum())
+        return float(np.nansum(self.count * np.abs(self.probability - self.correct)) / self.count.sum())
 
 
 def precision_recall(
-    confidence: Float[np.ndarray, " queries"], right: Bool[np.ndarray, " queries"],
-    has_answer: Bool[np.ndarray, " queries"] | None = None,
+    confidence: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"],
+    has_positives: Bool[np.ndarray, " queries"] | None = None,
 ) -> PrecisionRecall:  # fmt: skip
     """Precision and recall of top predictions at every threshold.
 
     Args:
         confidence: any number that is larger for more confident predictions; NaN without a prediction.
-        right: whether the top prediction is correct.
-        has_answer: queries with positives in the database; None = all. A prediction for another query is incorrect and
-            lowers the precision.
+        correct: whether the top prediction is correct.
+        has_positives: queries with positives in the database; None = all. A prediction for another query is incorrect
+            and lowers the precision.
 
     Raises:
         InputError: a correct prediction for a query without positives.
     """
-    confidence, right = np.asarray(confidence, np.float64), np.asarray(right, bool)
-    has_answer = np.ones(len(right), bool) if has_answer is None else np.asarray(has_answer, bool)
-    if np.any(right & ~has_answer):
-        raise InputError("right: expected no correct predictions for queries without positives. Take both from one "
+    confidence, correct = np.asarray(confidence, np.float64), np.asarray(correct, bool)
+    has_positives = np.ones(len(correct), bool) if has_positives is None else np.asarray(has_positives, bool)
+    if np.any(correct & ~has_positives):
+        raise InputError("correct: expected no correct predictions for queries without positives. Take both from one "
                          "ground truth.")  # fmt: skip
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
-    thresholds, hits = confidence[order], np.cumsum(right[order])
+    thresholds, hits = confidence[order], np.cumsum(correct[order])
     # Equal confidences, also infinite ones, share a threshold.
     last = np.flatnonzero(np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1)))
-    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(has_answer.sum(), 1))
+    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(has_positives.sum(), 1))
 
 
 def reliability(
-    probability: Float[np.ndarray, " queries"], right: Bool[np.ndarray, " queries"], *, bins: int = BINS
+    probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"], *, bins: int = BINS
 ) -> Reliability:
     """Compare probabilities with the fractions of correct predictions; NaN probabilities are left out."""
     there = ~np.isnan(probability)
-    probability, right = probability[there], np.asarray(right, bool)[there]
+    probability, correct = probability[there], np.asarray(correct, bool)[there]
     place = np.clip((probability * bins).astype(int), 0, bins - 1)
     count = np.bincount(place, minlength=bins)
     divisor = np.where(count > 0, count, np.nan)
-    mean, share = (np.bincount(place, weights=values, minlength=bins) / divisor for values in (probability, right))
+    mean, share = (np.bincount(place, weights=values, minlength=bins) / divisor for values in (probability, correct))
     return Reliability(mean, share, count)
 
 
@@ -97,4 +97,4 @@ def chance_calibration_error(probability: Float[np.ndarray, " queries"], *, bins
     """Mean `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries."""
     rng = np.random.default_rng(seed)
     draws = (rng.random(len(probability)) < probability for _ in range(_DRAWS))
-    return float(np.mean([reliability(probability, right, bins=bins).calibration_error for right in draws]))
+    return float(np.mean([reliability(probability, correct, bins=bins).calibration_error for correct in draws]))

@@ -22,7 +22,7 @@ _HALVES = ("first_half", "second_half")
 
 
 @dataclass(frozen=True)
-class Judge:
+class EvaluationProtocol:
     """Ground truth at several thresholds, and a split into queries to choose on and queries to report on.
 
     Attributes:
@@ -61,8 +61,8 @@ class Judge:
         """Hash of the positives at each threshold."""
         return content_hash([(positives.offsets, positives.rows) for positives in self.positives])
 
-    def of(self, candidates: Shortlist) -> "Judge":
-        """This judge with the views of a shortlist."""
+    def of(self, candidates: Shortlist) -> "EvaluationProtocol":
+        """This protocol with the views of a shortlist."""
         allowed = [half.allowed[np.maximum(candidates.indices, 0)] for half in self.halves]
         return replace(self, views=[candidates.mask, *(candidates.mask & rows for rows in allowed)])
 
@@ -123,8 +123,8 @@ class Judge:
         return np.lexsort((places, part))
 
 
-def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> Judge:
-    """Prepare a `Judge` before anything is ranked, so that errors of the ground truth are raised early.
+def evaluation_protocol(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> EvaluationProtocol:
+    """Prepare a `EvaluationProtocol` before anything is ranked, so that errors of the ground truth are raised early.
 
     Args:
         truth: of the queries, in the order of their path.
@@ -147,4 +147,4 @@ def judge(truth: Truth, thresholds: Iterable[float], split: Split | None = None)
         if not positives[-1].take(half.tune).any():
             raise InputError(f"split={split}: no query of one half has a place far enough from the other half; "
                              "use more queries, or smaller tolerances or radius")  # fmt: skip
-    return Judge(thresholds, truth.unit, positives, places, chosen, split=split)
+    return EvaluationProtocol(thresholds, truth.unit, positives, places, chosen, split=split)

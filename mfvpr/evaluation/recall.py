@@ -16,11 +16,11 @@ class Tally:
     """Recall@K as counts, which can be added over shards, sequences and the parts of an interrupted run.
 
     Attributes:
-        right: number of queries with a positive among their first k.
+        correct: number of queries with a positive among their first k.
         queries: number of all queries.
     """
 
-    right: Int[np.ndarray, " ks"]
+    correct: Int[np.ndarray, " ks"]
     queries: int
 
     @classmethod
@@ -29,19 +29,19 @@ class Tally:
         order = np.asarray(order)
         if order.size == 0:
             return cls(np.zeros(len(ks), int), len(order))
-        right = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
-        return cls(np.array([right[:, :k].any(axis=1).sum() for k in ks], int), len(order))
+        correct = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
+        return cls(np.array([correct[:, :k].any(axis=1).sum() for k in ks], int), len(order))
 
     def merged(self, other: "Tally") -> "Tally":
         """Add the counts of other queries."""
-        if len(self.right) != len(other.right):
-            raise ValueError(f"expected tallies of the same depths, got {len(self.right)} and {len(other.right)}")
-        return Tally(self.right + other.right, self.queries + other.queries)
+        if len(self.correct) != len(other.correct):
+            raise ValueError(f"expected tallies of the same depths, got {len(self.correct)} and {len(other.correct)}")
+        return Tally(self.correct + other.correct, self.queries + other.queries)
 
     @property
     def recall(self) -> Float[np.ndarray, " ks"]:
         """Fractions of all queries; 0 without queries."""
-        return self.right / max(self.queries, 1)
+        return self.correct / max(self.queries, 1)
 
 
 def hits(

@@ -18,7 +18,7 @@ from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.cohort_normalization import cohort_sequence
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import Filter, Filtered
+from mfvpr.retrieval.retriever import RetrievalResult, Retriever
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.matches import MatchStore
 from mfvpr.storage.shards import NotYet, together
@@ -34,7 +34,7 @@ _COMPLETE = "its images and queries are done"
 
 
 def match_sequence(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
     candidates: int | Literal["all"] = 50, *, matching: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
     watch: Stopwatch | None = None, **where: Any,
 ) -> Matched:  # fmt: skip
@@ -58,35 +58,35 @@ def match_sequence(
     cache = cache if cache.watch else replace(cache, watch=watch)
     with watch("features"):
         extractor = fit_to_database(extractor, database, cache)
-    with watch("filter"):
-        filter = fit_to_database(filter, database, cache)
+    with watch("retrieval"):
+        retriever = fit_to_database(retriever, database, cache)
     with ExitStack() as stack:
         stores = []
         if cache.root is not None:
-            recipe = matches_recipe(dataset, sequence, extractor, filter, candidates, matching, cache)
+            recipe = matches_recipe(dataset, sequence, extractor, retriever, candidates, matching, cache)
             stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, cache)]
         if cache.shard is not None and all(store.done.all() for store in stores):
             raise NotYet(_COMPLETE)
         matched = _read_matches(sequence, stores, cache, watch, where.get("memory"))
         if matched is None:
-            with watch("filter"):
-                filtered = _find_candidates(sequence, database, filter, candidates, cache, stores)
+            with watch("retrieval"):
+                retrieved = _find_candidates(sequence, database, retriever, candidates, cache, stores)
             options = {"matcher": matching, "track": cache.track("matching"), **where}
-            matched = _match(dataset, sequence, extractor, filtered, stores, cache, watch, **options)
+            matched = _match(dataset, sequence, extractor, retrieved, stores, cache, watch, **options)
     _warn_of_queries_without_candidates(matched, cache)
     return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
 
 
 def _find_candidates(
-    sequence: QuerySequence, database: ImageFolder, filter: Filter, candidates: int | Literal["all"],
+    sequence: QuerySequence, database: ImageFolder, retriever: Retriever, candidates: int | Literal["all"],
     cache: FeatureCache, stores: Sequence[MatchStore],
-) -> Filtered:  # fmt: skip
+) -> RetrievalResult:  # fmt: skip
     """The shortlist; all runs use that of the first shard, since near ties may come out differently elsewhere."""
 
-    def retrieve() -> Filtered:
+    def retrieve() -> RetrievalResult:
         number = _number(candidates, database)
-        filtered = filter.shortlist(sequence, database, number, cache)
-        return validate_candidates(filtered, type(filter).__name__, len(sequence.images), len(database), number)
+        retrieved = retriever.shortlist(sequence, database, number, cache)
+        return validate_candidates(retrieved, type(retriever).__name__, len(sequence.images), len(database), number)
 
     path = stores[0].folder / _SHORTLIST if stores else None
     if path is None or (cache.shard is None and not path.exists()):
@@ -100,21 +100,21 @@ def _find_candidates(
     arrays = read_arrays(path, key)
     bad_queries, bad_database = map(_by_row, json.loads(str(arrays["bad"])))
     shortlist = Shortlist(arrays["indices"], arrays["scores"], arrays["indices"] >= 0)
-    return Filtered(shortlist, bad_queries, bad_database)
+    return RetrievalResult(shortlist, bad_queries, bad_database)
 
 
 def _match(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered,
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retrieved: RetrievalResult,
     stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, **options: Any,
 ) -> Matched:  # fmt: skip
     """Extract features and match all scales; a shard matches its queries, and ends with `NotYet`."""
     with watch("features"):
-        sides, remarks = _extract(dataset, sequence, extractor, filtered, cache)
+        sides, remarks = _extract(dataset, sequence, extractor, retrieved, cache)
     for store in stores[:1]:  # for later runs, which read the matches and nothing else
         write_text(store.folder / _REMARKS, json.dumps(remarks))
     for line in remarks["warnings"]:
         cache.warn(line)
-    shortlist, shard = filtered.candidates, cache.shard
+    shortlist, shard = retrieved.candidates, cache.shard
     rows = None if shard is None else shard.rows(sequence.images.names)
     with watch("matching"):
         matches = tuple(
@@ -127,7 +127,7 @@ def _match(
 
 
 def match_cohort(
-    dataset: Dataset, neighbors: int, extractor: Extractor | Source, filter: Filter,
+    dataset: Dataset, neighbors: int, extractor: Extractor | Source, retriever: Retriever,
     candidates: int | Literal["all"] = 50, *, cache: FeatureCache | None = None, **how: Any,
 ) -> Matched:  # fmt: skip
     """Match the database images among each other, once for all sequences.
@@ -141,21 +141,25 @@ def match_cohort(
     cache = cache or FeatureCache()
     sequence = cohort_sequence(cache.contents(dataset.database), neighbors)
     how = {"track": cache.track("cohort matching")} | how
-    return match_sequence(dataset, sequence, extractor, filter, candidates, cache=cache, **how)
+    return match_sequence(dataset, sequence, extractor, retriever, candidates, cache=cache, **how)
 
 
 def _extract(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filtered: Filtered, cache: FeatureCache
+    dataset: Dataset,
+    sequence: QuerySequence,
+    extractor: Extractor | Source,
+    retrieved: RetrievalResult,
+    cache: FeatureCache,
 ) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
     """Features of the queries and of all candidates by scale, and remarks on bad images of both sides."""
-    rows = np.unique(filtered.candidates.indices[filtered.candidates.mask])
+    rows = np.unique(retrieved.candidates.indices[retrieved.candidates.mask])
     database, queries = together(
         partial(cache.local, dataset.database, extractor, rows.tolist(), label="database"),
         partial(cache.local, sequence.images, extractor, label=f"query {sequence.name}"),
     )
     bad = {
-        "queries": _by_row(filtered.bad_queries, queries[0].bad),
-        "database": _by_row(filtered.bad_database, database[0].bad),
+        "queries": _by_row(retrieved.bad_queries, queries[0].bad),
+        "database": _by_row(retrieved.bad_database, database[0].bad),
     }
     warnings = [
         *image_warnings(dataset.database, database[0], bad["database"]),
@@ -202,16 +206,16 @@ def _read_matches(
 
 
 def matches_recipe(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, filter: Filter,
+    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
     candidates: int | Literal["all"], matching: Matcher, cache: FeatureCache,
 ) -> dict[str, Any]:  # fmt: skip
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matching."""
     excluded, database = sequence.excluded, dataset.database
-    extractor, filter = fit_to_database(extractor, database, cache), fit_to_database(filter, database, cache)
+    extractor, retriever = fit_to_database(extractor, database, cache), fit_to_database(retriever, database, cache)
     return {
         "database": cache.recipe(database, extractor),
         "query": cache.recipe(sequence.images, extractor),
-        "filter": cache.recipe_of(filter),
+        "filter": cache.recipe_of(retriever),
         "candidates": _number(candidates, database),
         "matching": cache.recipe_of(matching),
         "skip_bad": cache.skip_bad,

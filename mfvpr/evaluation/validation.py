@@ -15,8 +15,8 @@ from mfvpr.matching.matcher import Matcher, Matching
 from mfvpr.matching.nearest_neighbors import CrossCheck
 from mfvpr.reranking.fusion import Fusion
 from mfvpr.reranking.ranking import Ties
-from mfvpr.reranking.results import COHORT, FILTER, FRAMES, Matched, Ranked
-from mfvpr.retrieval.retriever import Filtered
+from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Matched, Ranked
+from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.scoring.fields import check_bounds
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.types import Shortlist
@@ -44,7 +44,7 @@ def check_request(
     if unknown := [name for name in correlated if name not in several]:
         raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
                          f"{unknown[0]}")  # fmt: skip
-    reserved = {FILTER, *with_cohort, *combined, *(f"{system} + {FRAMES}" for system in correlated)}
+    reserved = {RETRIEVAL, *with_cohort, *combined, *(f"{system} + {FRAMES}" for system in correlated)}
     for name, scorer in scorers.items():
         if name in reserved:
             raise InputError(f"scorers: {name} is the name of another system; choose another one")
@@ -83,19 +83,23 @@ def check_matching(candidates: Any, extractor: Extractor | Source, matching: Mat
                              "extract these, or match nearest neighbors")  # fmt: skip
 
 
-def validate_candidates(filtered: Any, name: str, num_queries: int, num_database: int, num_candidates: int) -> Filtered:
+def validate_candidates(
+    retrieved: Any, name: str, num_queries: int, num_database: int, num_candidates: int
+) -> RetrievalResult:
     """Check the candidates of a retrieval, which may be user-defined; return them padded with -1 and 0.
 
     Raises:
-        InputError: no Filtered, or no Shortlist of the expected shape in it, rows that the database lacks, or a row
-            twice for one query. The error has the `name` of the retrieval.
+        InputError: no RetrievalResult, or no Shortlist of the expected shape in it, rows that the database lacks, or a
+            row twice for one query. The error has the `name` of the retrieval.
     """
-    if not isinstance(filtered, Filtered):
-        raise InputError(f"{name}: expected a Filtered, got {type(filtered).__name__}; return "
-                         "Filtered(shortlist, {}, {})")  # fmt: skip
-    shortlist = filtered.candidates
+    if not isinstance(retrieved, RetrievalResult):
+        raise InputError(f"{name}: expected a RetrievalResult, got {type(retrieved).__name__}; return "
+                         "RetrievalResult(shortlist, {}, {})")  # fmt: skip
+    shortlist = retrieved.candidates
     if not isinstance(shortlist, Shortlist):
-        raise InputError(f"{name}: expected a Shortlist as the candidates of Filtered, got {type(shortlist).__name__}")
+        raise InputError(
+            f"{name}: expected a Shortlist as the candidates of RetrievalResult, got {type(shortlist).__name__}"
+        )
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     expected = (num_queries, num_candidates)
     if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
@@ -113,7 +117,7 @@ def validate_candidates(filtered: Any, name: str, num_queries: int, num_database
     if not np.isfinite(scores[mask]).all():
         raise InputError(f"{name}: expected finite scores")
     indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
-    return filtered._replace(candidates=Shortlist(indices, scores, mask))
+    return retrieved._replace(candidates=Shortlist(indices, scores, mask))
 
 
 def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:

@@ -2,21 +2,21 @@
 
     known = Map("map", Sift(), VladFitting())
     known.build(folder, places)            # or, image by image: known.add(image, place)
-    answer = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
+    prediction = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
     route = Route(Drive(advance=1))        # if the map and the queries are in the order of a drive:
-    located = route(answer, known.there)   # the row that is most probable given all images so far and the motion
+    located = route(prediction, known.there)   # the row that is most probable given all images so far and the motion
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map (localize one image), images (the images of a map, and how they are added), answers. Then their parts:
-vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or matches),
-route (a drive through a map).
+Read first: map (localize one image), images (the images of a map, and how they are added), predictions. Then their
+parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
+matches), route (a drive through a map).
 
 Imports datasets, evaluation, features, matching, reranking, scoring, storage, types, utils.
 """
 
-from mfvpr.localization.answers import Alternative, Answer, Asked
 from mfvpr.localization.map import Map
+from mfvpr.localization.predictions import Alternative, Localization, Prediction
 from mfvpr.localization.route import Drive, Located, Route
 
-__all__ = ["Alternative", "Answer", "Asked", "Drive", "Located", "Map", "Route"]
+__all__ = ["Alternative", "Drive", "Localization", "Located", "Map", "Prediction", "Route"]

@@ -12,11 +12,11 @@ import numpy as np
 from mfvpr.evaluation.calibration import Confidence
 from mfvpr.features.extractor import Aggregation, Extractor
 from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.answers import Alternative, Answer, Asked, refusal
 from mfvpr.localization.describing import Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
+from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.results import Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
@@ -78,16 +78,16 @@ class Map(MapImages):
         self.matcher, self.confidence, self.threshold = matcher, confidence, threshold
         super().__init__(folder, extractor, describer, candidates=candidates, memory=memory)
 
-    def localize(self, image: Image, *, recent: int = 0) -> Answer:
-        """Find where an image was taken; see `ask`."""
-        return self.ask(image, recent=recent).answer
+    def localize(self, image: Image, *, recent: int = 0) -> Prediction:
+        """Find where an image was taken; see `localize_with_evidence`."""
+        return self.localize_with_evidence(image, recent=recent).prediction
 
     @exclusive
-    def ask(self, image: Image, *, recent: int = 0, before: int | None = None) -> Asked:
+    def localize_with_evidence(self, image: Image, *, recent: int = 0, before: int | None = None) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
         There is no place, and `reason` says why, for a query with too few features or matches
-        (`mfvpr.localization.evidence`), without candidates, or with p below the threshold.
+        (`mfvpr.localization.evidence`), without candidates, or with a confidence below the threshold.
 
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
@@ -122,10 +122,14 @@ class Map(MapImages):
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
             for row, score in zip(rows[order].tolist(), scores[order].tolist(), strict=True)
         )
-        answer = Answer(alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(self.scorer, best))
+        prediction = Prediction(
+            alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(self.scorer, best)
+        )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
-            answer = replace(answer, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence")
-        return Asked(answer, description, jax.tree.map(lambda leaf: leaf[0], best))
+            prediction = replace(
+                prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
+            )
+        return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _probability(self, ranking: Ranked, retrieval: Ranked) -> float | None:
         """Probability that the top prediction is correct; None without a confidence or a finite score."""

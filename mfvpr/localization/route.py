@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.localization.answers import Answer
+from mfvpr.localization.predictions import Prediction
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import compiled
@@ -37,14 +37,14 @@ class Drive:
         advance: mean motion from one image to the next, rows; below 0 = against the order of the map.
         spread: standard deviation of the motion, rows.
         kidnapped: probability at each image that the robot may be anywhere.
-        p_right: probability that the top prediction is correct, for answers without their own.
+        confidence: probability that the top prediction is correct, for predictions without their own.
         sharpness: exponent of a candidate's share, which is its score above the mean to this power.
     """
 
     advance: float = 1.0
     spread: float = 1.0
     kidnapped: float = 0.03
-    p_right: float = 0.35
+    confidence: float = 0.35
     sharpness: float = 2.0
 
     def __post_init__(self) -> None:
@@ -54,8 +54,8 @@ class Drive:
         if abs(self.advance) > MOST or not MOST**-1 <= self.spread <= MOST:
             raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected up to {MOST} rows an "
                              f"image, and a spread of {MOST**-1:g} at least")  # fmt: skip
-        if not (0 <= self.kidnapped <= 1 and 0 <= self.p_right <= 1):
-            raise InputError(f"Drive(kidnapped={self.kidnapped}, p_right={self.p_right}): expected from 0 to 1")
+        if not (0 <= self.kidnapped <= 1 and 0 <= self.confidence <= 1):
+            raise InputError(f"Drive(kidnapped={self.kidnapped}, confidence={self.confidence}): expected from 0 to 1")
 
 
 class Located(NamedTuple):
@@ -76,16 +76,16 @@ class Route:
         self._drive, self.belief = drive, np.zeros(FIRST_ROWS, np.float32)
         self._motion = motion(drive.advance, drive.spread)
 
-    def __call__(self, answer: Answer | None, there: Bool[np.ndarray, " rows"]) -> Located | None:
+    def __call__(self, prediction: Prediction | None, there: Bool[np.ndarray, " rows"]) -> Located | None:
         """Update the belief with the next image; return the position, or None if there is no row.
 
         Args:
-            answer: of the next image; None = the image gives no evidence, but the robot has moved.
+            prediction: of the next image; None = the image gives no evidence, but the robot has moved.
             there: rows where the robot may be.
         """
         if not there.any():
             return None
-        alternatives = () if answer is None else answer.alternatives
+        alternatives = () if prediction is None else prediction.alternatives
         if (last := max((alternative.row for alternative in alternatives), default=-1)) >= len(there):
             raise InputError(f"there: expected the rows of the map that answered, up to {last} at least, got "
                              f"{len(there)}")  # fmt: skip
@@ -97,7 +97,7 @@ class Route:
         if alternatives:
             rows, scores = map(np.array, zip(*((each.row, each.score) for each in alternatives), strict=True))
             share[rows] = shares(scores, drive.sharpness)
-        p = drive.p_right if answer is None or answer.p_right is None else answer.p_right
+        p = drive.confidence if prediction is None or prediction.confidence is None else prediction.confidence
         belief = step(self.belief, allowed, self._motion, np.float32(drive.kidnapped), share, np.float32(p))
         self.belief = np.asarray(belief)
         row = int(np.argmax(self.belief))
@@ -130,7 +130,7 @@ def shares(scores: Float[np.ndarray, " candidates"], sharpness: float) -> Float[
 @compiled
 def step(
     belief: Float[Array, " rows"], there: Bool[Array, " rows"], motion: Float[Array, " steps"],
-    kidnapped: Float[Array, ""], share: Float[Array, " rows"], p_right: Float[Array, ""],
+    kidnapped: Float[Array, ""], share: Float[Array, " rows"], confidence: Float[Array, ""],
 ) -> Float[Array, " rows"]:  # fmt: skip
     """The belief after the next image.
 
@@ -139,8 +139,8 @@ def step(
         there: rows where the robot may be.
         motion: probabilities of -R .. R rows, 2 R + 1 steps. Belief that leaves the map is shared by the rest.
         kidnapped: probability that the robot may be anywhere.
-        share: shares of the rows if the image's answer is correct; all 0 = no evidence.
-        p_right: probability that the answer is correct.
+        share: shares of the rows if the image's prediction is correct; all 0 = no evidence.
+        confidence: probability that the prediction is correct.
 
     Returns:
         Belief with the sum 1, if there is any row. If image and motion exclude each other, the motion decides.
@@ -151,7 +151,7 @@ def step(
     moved = jnp.convolve(belief, motion, precision=jax.lax.Precision.HIGHEST)[reach : reach + len(belief)]
     before = (1 - kidnapped) * _normalize(jnp.where(there, moved, 0), anywhere) + kidnapped * anywhere
     image = _normalize(jnp.where(there, share, 0), anywhere)
-    likelihood = p_right * image + (1 - p_right) * anywhere
+    likelihood = confidence * image + (1 - confidence) * anywhere
     return _normalize(before * likelihood, before)
 
 

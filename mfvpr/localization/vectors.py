@@ -62,7 +62,7 @@ class Vectors:
 
 
 def _products(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """`vectors @ query` on own threads: those of BLAS spin while they wait, which costs a third of an answer's time."""
+    """`vectors @ query` on own threads: BLAS threads spin while they wait, which costs a third of the time."""
     workers = available_cpus()
     parts = np.array_split(vectors, workers)
     return np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])

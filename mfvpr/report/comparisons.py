@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from mfvpr.datasets.truth import threshold_words
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
@@ -29,33 +29,33 @@ def comparison_table(comparison: Comparison) -> Table:
 
     p is McNemar's, which takes queries for independent, and that of blocks of the path.
     """
-    judge = comparison.judge
+    protocol = comparison.protocol
     lines, first = [], None
     for name, hits, _ in comparison.rows():
         first = hits if first is None else first
-        low, high = estimate(hits[judge.main]).interval
+        low, high = estimate(hits[protocol.main]).interval
         differences = [""] * 3
         if hits is not first:
-            pair = hits[judge.main], first[judge.main]
-            test, flips = mcnemar(*pair), _flips(judge, *pair)
+            pair = hits[protocol.main], first[protocol.main]
+            test, flips = mcnemar(*pair), _flips(protocol, *pair)
             differences = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{flips.p_value:.2g}"]
-        recalls = [f"{100 * values.mean():.1f}" for values in (*hits, *_by_set(judge, hits[judge.main]).values())]
+        recalls = [f"{100 * values.mean():.1f}" for values in (*hits, *_by_set(protocol, hits[protocol.main]).values())]
         lines.append([name, *recalls, f"[{100 * low:.1f}, {100 * high:.1f}]", *differences])
-    words = threshold_words(judge.unit, judge.thresholds[judge.main])
-    header = [judge.label(1, threshold) for threshold in judge.thresholds]
-    header += [f"{name}{words}" for name in judge.reported_sets]
+    words = threshold_words(protocol.unit, protocol.thresholds[protocol.main])
+    header = [protocol.label(1, threshold) for threshold in protocol.thresholds]
+    header += [f"{name}{words}" for name in protocol.reported_sets]
     header += [f"95 % at{words}" if words else "95 %", f"against {lines[0][0]}", "p", "p by blocks"]
     return Table(["score", *header], lines)
 
 
-def _by_set(judge: Judge, hits: np.ndarray) -> dict[str, np.ndarray]:
+def _by_set(protocol: EvaluationProtocol, hits: np.ndarray) -> dict[str, np.ndarray]:
     """Hits `[R]` of each data set, where several are reported on."""
-    ends = np.cumsum([*judge.reported_sets.values()])
-    return dict(zip(judge.reported_sets, np.split(hits, ends[:-1]), strict=False)) if len(ends) else {}
+    ends = np.cumsum([*protocol.reported_sets.values()])
+    return dict(zip(protocol.reported_sets, np.split(hits, ends[:-1]), strict=False)) if len(ends) else {}
 
 
-def _flips(judge: Judge, hits: np.ndarray, first: np.ndarray) -> SignFlips:
-    return block_sign_flips(hits, first, sequences=[*judge.reported_sets.values()] or None)
+def _flips(protocol: EvaluationProtocol, hits: np.ndarray, first: np.ndarray) -> SignFlips:
+    return block_sign_flips(hits, first, sequences=[*protocol.reported_sets.values()] or None)
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -71,11 +71,11 @@ def comparison_text(comparison: Comparison) -> str:
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON values."""
-    judge = comparison.judge
+    protocol = comparison.protocol
     first = next(comparison.rows())[1]
 
     def by_threshold(values: Iterable[Any]) -> dict[str, Any]:
-        return dict(zip([f"{threshold:g}" for threshold in judge.thresholds], values, strict=True))
+        return dict(zip([f"{threshold:g}" for threshold in protocol.thresholds], values, strict=True))
 
     rows = [
         {
@@ -83,19 +83,19 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
             "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
             "interval": by_threshold(map(recall_interval, hits)),
             "against_first": by_threshold(
-                {"mcnemar": mcnemar(*pair)._asdict(), "sign_flips": _flips(judge, *pair)._asdict()}
+                {"mcnemar": mcnemar(*pair)._asdict(), "sign_flips": _flips(protocol, *pair)._asdict()}
                 for pair in zip(hits, first, strict=True)
             ),
             "by_set": {set_name: by_threshold(set_hits.mean(axis=0).tolist())
-                       for set_name, set_hits in _by_set(judge, hits.T).items()},
+                       for set_name, set_hits in _by_set(protocol, hits.T).items()},
             "halves": {row.half: _half(row) for row in halves},
         }
         for name, hits, halves in comparison.rows()
     ]  # fmt: skip
     return {
-        "unit": judge.unit, "thresholds": list(judge.thresholds),
-        "queries": {"reported": [half.report.tolist() for half in judge.halves],
-                    "chosen_on": [half.tune.tolist() for half in judge.halves]},
+        "unit": protocol.unit, "thresholds": list(protocol.thresholds),
+        "queries": {"reported": [half.report.tolist() for half in protocol.halves],
+                    "chosen_on": [half.tune.tolist() for half in protocol.halves]},
         "rows": rows,
     }  # fmt: skip
 
@@ -131,16 +131,16 @@ def _half(row: Row) -> dict[str, Any]:
 
 def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, LearnedWeight]) -> None:
     """Draw the weights of the matches of some queries that are reported on."""
-    judge, queries = comparison.judge, np.concatenate([half.report for half in comparison.judge.halves])
+    protocol, queries = comparison.protocol, np.concatenate([half.report for half in comparison.protocol.halves])
     shown = queries[np.linspace(0, len(queries) - 1, min(SHOWN_QUERIES, len(queries))).astype(int)]
-    positives = judge.positives[judge.main].take(shown).contains(comparison.candidates.indices[shown])
+    positives = protocol.positives[protocol.main].take(shown).contains(comparison.candidates.indices[shown])
     first = next(iter(weights.values()))
-    pairs = [(comparison.match_set[query], right) for query, right in zip(shown, positives, strict=True)]
+    pairs = [(comparison.match_set[query], correct) for query, correct in zip(shown, positives, strict=True)]
     inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches, _ in pairs])
-    right = np.concatenate([np.repeat(right, matches.mask.sum(axis=1)) for matches, right in pairs])
+    correct = np.concatenate([np.repeat(correct, matches.mask.sum(axis=1)) for matches, correct in pairs])
     by_training = {name: np.concatenate([np.asarray(_weigh(weight, matches))[matches.mask] for matches, _ in pairs])
                    for name, weight in weights.items()}  # fmt: skip
-    weights_figure(path, first.names, inputs, by_training, right)
+    weights_figure(path, first.names, inputs, by_training, correct)
 
 
 _weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))

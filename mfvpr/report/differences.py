@@ -25,11 +25,11 @@ class Difference(NamedTuple):
     sign_flips: SignFlips
 
 
-def differences(judged: EvaluationReport) -> list[Difference]:
+def differences(evaluation: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order; none without ground truth."""
-    if not judged.thresholds:
+    if not evaluation.thresholds:
         return []
-    hits, places = {name: judged.hits(name) for name in judged.result.systems}, _places(judged)
+    hits, places = {name: evaluation.hits(name) for name in evaluation.result.systems}, _places(evaluation)
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
                    block_sign_flips(hits[first], hits[second], places=places))
@@ -37,16 +37,19 @@ def differences(judged: EvaluationReport) -> list[Difference]:
     ]  # fmt: skip
 
 
-def _places(judged: EvaluationReport) -> np.ndarray | None:
+def _places(evaluation: EvaluationReport) -> np.ndarray | None:
     """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
-    truth, known = judged.sequences[0].truth, [positives for positives in judged.positives if positives is not None]
-    if truth is None or (len(judged.sequences) == 1 and truth.unit != "m"):
+    truth, known = (
+        evaluation.sequences[0].truth,
+        [positives for positives in evaluation.positives if positives is not None],
+    )
+    if truth is None or (len(evaluation.sequences) == 1 and truth.unit != "m"):
         return None
     return places_along_path(stack_positives(known), truth.unit)
 
 
 def _table(names: Sequence[str], tests: Sequence[Difference]) -> Table:
-    """Table system x system: queries that only the system of the row gets right, and p by blocks of the path.
+    """Table system x system: queries that only the system of the row predicts correctly, and p by blocks of the path.
 
     Blocks of several sequences are blocks of the database's places.
     """
@@ -55,29 +58,31 @@ def _table(names: Sequence[str], tests: Sequence[Difference]) -> Table:
         cells[first, second] = f"{counts.only_first} (p {flips.p_value:.2g})"
         cells[second, first] = f"{counts.only_second} (p {flips.p_value:.2g})"
     rows = [[name, *(cells.get((name, other), "") for other in names)] for name in names]
-    return Table(["only this is right, not", *names], rows)
+    return Table(["only this is correct, not", *names], rows)
 
 
-def write_gains(folder: Path, judged: EvaluationReport) -> None:
+def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
     """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`; nothing without ground truth.
 
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
     one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need. It is
     the row of the query where that is the order of the path.
     """
-    if not judged.thresholds:
+    if not evaluation.thresholds:
         return
-    systems, places = [*judged.result.systems], _places(judged)
-    places = np.arange(sum(len(sequence.images) for sequence in judged.sequences)) if places is None else places
+    systems, places = [*evaluation.result.systems], _places(evaluation)
+    places = np.arange(sum(len(sequence.images) for sequence in evaluation.sequences)) if places is None else places
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
-    for part, (sequence, part_places) in enumerate(zip(judged.sequences, judged.by_sequence(places), strict=True)):
-        rights = [np.asarray(judged.is_right(system, part), bool) for system in systems]
+    for part, (sequence, part_places) in enumerate(
+        zip(evaluation.sequences, evaluation.by_sequence(places), strict=True)
+    ):
+        correct_by_system = [np.asarray(evaluation.is_correct(system, part), bool) for system in systems]
         lines = []
         for query, name in enumerate(sequence.images.names):
-            cells = [cell for right in rights for cell in _hit_and_rank(right[query])]
+            cells = [cell for correct in correct_by_system for cell in _hit_and_rank(correct[query])]
             lines.append([name, int(part_places[query]), *cells])
-        write_csv(judged.folder(folder, part) / "gains.csv", header, lines)
-    tests = differences(judged)
+        write_csv(evaluation.folder(folder, part) / "gains.csv", header, lines)
+    tests = differences(evaluation)
     write_csv(
         folder / "differences.csv",
         ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
@@ -88,5 +93,5 @@ def write_gains(folder: Path, judged: EvaluationReport) -> None:
     write_text(folder / "differences.md", _table(systems, tests).markdown())
 
 
-def _hit_and_rank(right: np.ndarray) -> tuple[int, int | str]:
-    return int(right[0]), int(np.argmax(right)) + 1 if right.any() else ""
+def _hit_and_rank(correct: np.ndarray) -> tuple[int, int | str]:
+    return int(correct[0]), int(np.argmax(correct)) + 1 if correct.any() else ""

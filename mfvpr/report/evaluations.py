@@ -25,7 +25,7 @@ from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.files import clip_middle, printable, write_text
 
-ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "answer")  # keywords in the file of a figure
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _NAME_LENGTH = 40  # characters in the title of a figure
 _SEQUENCES = "sequences"  # the folder of a run in which each of several sequences has its own
 
@@ -73,7 +73,7 @@ class EvaluationReport:
         """Positives of each sequence, within `threshold`."""
         return self.result.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
 
-    def is_right(self, system: str, place: int) -> Bool[np.ndarray, "queries candidates"] | None:
+    def is_correct(self, system: str, place: int) -> Bool[np.ndarray, "queries candidates"] | None:
         """Whether candidates are correct, in the order of a system's ranking of the sequence at a place."""
         positives = self.positives[place]
         return None if positives is None else positives.contains(self.result.systems[system][place].rows)
@@ -81,7 +81,7 @@ class EvaluationReport:
     def hits(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the first prediction is correct, for the queries of all sequences, with ground truth."""
         places = range(len(self.sequences))
-        return np.concatenate([np.asarray(self.is_right(system, place), bool)[:, 0] for place in places])
+        return np.concatenate([np.asarray(self.is_correct(system, place), bool)[:, 0] for place in places])
 
     def by_sequence(self, values: Shaped[np.ndarray, " _"]) -> list[Shaped[np.ndarray, " _"]]:
         """Split values of the queries of all sequences into those of each sequence."""
@@ -97,37 +97,37 @@ def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
     return run / _SEQUENCES / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
-def recall_table(judged: EvaluationReport) -> Table:
+def recall_table(evaluation: EvaluationReport) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
-    truth, ks, main = judged.sequences[0].truth, judged.ks, len(judged.thresholds) // 2
-    cells = [(place, 0) for place in range(len(judged.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
+    truth, ks, main = evaluation.sequences[0].truth, evaluation.ks, len(evaluation.thresholds) // 2
+    cells = [(place, 0) for place in range(len(evaluation.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
     unit = "exact" if truth is None else truth.unit
-    labels = [f"R@{ks[depth]}{threshold_words(unit, judged.thresholds[place])}" for place, depth in cells]
-    several = len(judged.sequences) > 1
+    labels = [f"R@{ks[depth]}{threshold_words(unit, evaluation.thresholds[place])}" for place, depth in cells]
+    several = len(evaluation.sequences) > 1
     lines = [
         [system, *([name] if several else []), *(f"{100 * recall[cell]:.1f}" for cell in cells)]
-        for system in judged.result.systems
-        for name, recall in judged.parts(system)
+        for system in evaluation.result.systems
+        for name, recall in evaluation.parts(system)
     ]
     return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
 
 
 def write_rankings(
-    folder: Path, judged: EvaluationReport, refused: Sequence[Bool[np.ndarray, " _"]] | None = None
+    folder: Path, evaluation: EvaluationReport, refused: Sequence[Bool[np.ndarray, " _"]] | None = None
 ) -> None:
     """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
     `refused` are queries of each sequence that the headline's predictions refuse; None = no query is refused.
     """
-    database, files = judged.result.dataset.database.names, file_names([*judged.result.systems])
-    for place, sequence in enumerate(judged.sequences):
-        target = judged.folder(folder, place)
-        for name, parts in judged.result.systems.items():
-            ranked, right = parts[place], judged.is_right(name, place)
-            rankings = Rankings(sequence.images.names, database, ranked.rows, ranked.scores, right)
+    database, files = evaluation.result.dataset.database.names, file_names([*evaluation.result.systems])
+    for place, sequence in enumerate(evaluation.sequences):
+        target = evaluation.folder(folder, place)
+        for name, parts in evaluation.result.systems.items():
+            ranked, correct = parts[place], evaluation.is_correct(name, place)
+            rankings = Rankings(sequence.images.names, database, ranked.rows, ranked.scores, correct)
             write_predictions(target / "predictions" / f"{files[name]}.csv", rankings)
             write_failures(target / "failures" / f"{files[name]}.csv", rankings)
-            if name == judged.headline:
+            if name == evaluation.headline:
                 write_failures(target / "failures.csv", rankings)
                 rankings = rankings if refused is None else replace(rankings, refused=refused[place])
                 write_predictions(target / "predictions.csv", rankings)
@@ -146,7 +146,7 @@ def write_skipped(folder: Path, result: Result) -> None:
 
 
 def query_figures(
-    judged: EvaluationReport,
+    evaluation: EvaluationReport,
     extractor: Extractor | Source,
     shown: int | Sequence[int],
     refused: Sequence[Bool[np.ndarray, " _"]],
@@ -157,10 +157,10 @@ def query_figures(
     The extractor resizes the images. `shown` is a number of queries, or their rows. `refused` are queries of each
     sequence whose confidence is below the threshold. `histogram` = None is the paper's.
     """
-    several, folders = len(judged.sequences) > 1, file_names([sequence.name for sequence in judged.sequences])
+    several, folders = len(evaluation.sequences) > 1, file_names([sequence.name for sequence in evaluation.sequences])
     figures: list[Figure] = []
-    for place, sequence in enumerate(judged.sequences):
-        drawings = SequenceFigures(judged, place, extractor, histogram or HistogramOfShifts(), refused[place])
+    for place, sequence in enumerate(evaluation.sequences):
+        drawings = SequenceFigures(evaluation, place, extractor, histogram or HistogramOfShifts(), refused[place])
         folder = f"{folders[sequence.name]}/" if several else ""
         figures += [
             (f"{folder}{verdict}_{query:04d}.png", partial(drawings.draw, query=query, verdict=verdict))
@@ -173,7 +173,7 @@ def query_figures(
 class SequenceFigures:
     """The figures of one sequence; arguments as of `query_figures`."""
 
-    judged: EvaluationReport
+    evaluation: EvaluationReport
     place: int
     extractor: Extractor | Source
     histogram: HistogramOfShifts
@@ -181,44 +181,48 @@ class SequenceFigures:
 
     @property
     def _sequence(self) -> QuerySequence:
-        return self.judged.sequences[self.place]
+        return self.evaluation.sequences[self.place]
 
     @property
     def _matched(self) -> Matched:
-        return self.judged.result.matched[self.place]
+        return self.evaluation.result.matched[self.place]
 
     @property
     def _ranked(self) -> Ranked:
-        return self.judged.result.systems[self.judged.headline][self.place]
+        return self.evaluation.result.systems[self.evaluation.headline][self.place]
 
     @property
     def _database(self) -> ImageFolder:
-        return self.judged.result.dataset.database
+        return self.evaluation.result.dataset.database
 
     def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
-        right = self.judged.is_right(self.judged.headline, self.place)
+        correct = self.evaluation.is_correct(self.evaluation.headline, self.place)
         has_prediction = self._ranked.rows[:, 0] >= 0
-        verdicts = np.full(len(has_prediction), "best") if right is None else np.where(right[:, 0], "right", "wrong")
+        verdicts = (
+            np.full(len(has_prediction), "best") if correct is None else np.where(correct[:, 0], "correct", "incorrect")
+        )
         if not isinstance(selection, int):
             return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
-        numbers = {"best": selection} if right is None else {"right": (selection + 1) // 2, "wrong": selection // 2}
+        numbers = (
+            {"best": selection} if correct is None else {"correct": (selection + 1) // 2, "incorrect": selection // 2}
+        )
         return {query: verdict for verdict, number in numbers.items()
                 for query in _pick_evenly(np.flatnonzero(has_prediction & (verdicts == verdict)), number)}  # fmt: skip
 
     def title(self, query: int, verdict: str) -> str:
         """The score, whether the prediction is correct within the threshold, and both names."""
         truth = self._sequence.truth
-        within = "" if truth is None else " at" + threshold_words(truth.unit, self.judged.threshold)
+        within = "" if truth is None else " at" + threshold_words(truth.unit, self.evaluation.threshold)
         names = f"{_short(self._sequence.images.names[query])} -> {_short(self._prediction(query))}"
         note = " (no place: confidence below the threshold)" if self.refused[query] else ""
-        return f"{self.judged.headline}, {verdict}{within}: {names}{note}"
+        return f"{self.evaluation.headline}, {verdict}{within}: {names}{note}"
 
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """Draw the prediction, and below an incorrect one a correct one."""
         candidates = [self._candidate(query, 0, verdict)]
-        candidates += self.correct_candidates(query) if verdict == "wrong" else []
-        values = self.judged.headline, self._sequence.name, verdict, self._sequence.images.names[query]
+        candidates += self.correct_candidates(query) if verdict == "incorrect" else []
+        values = self.evaluation.headline, self._sequence.name, verdict, self._sequence.images.names[query]
         about = dict(zip(ABOUT, (*values, self._prediction(query)), strict=True))
         original = self._sequence.images.read(query)
         image = self._resize(original)
@@ -238,16 +242,16 @@ class SequenceFigures:
 
     def correct_candidates(self, query: int) -> list[Candidate]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
-        right = self.judged.is_right(self.judged.headline, self.place)
-        positives, truth = self.judged.positives[self.place], self._sequence.truth
-        if right is None or positives is None or truth is None or not positives.counts[query]:
+        correct = self.evaluation.is_correct(self.evaluation.headline, self.place)
+        positives, truth = self.evaluation.positives[self.place], self._sequence.truth
+        if correct is None or positives is None or truth is None or not positives.counts[query]:
             return []
-        if right[query].any():
-            return [self._candidate(query, int(np.argmax(right[query])), "right")]
+        if correct[query].any():
+            return [self._candidate(query, int(np.argmax(correct[query])), "correct")]
         nearest, rows = truth.place(query), positives.of(query)
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         num_candidates = self._matched.candidates.indices.shape[1]
-        caption = f"right: {_short(self._database.names[row])}, not among the {num_candidates} candidates"
+        caption = f"correct: {_short(self._database.names[row])}, not among the {num_candidates} candidates"
         return [Candidate(self._resize(self._database.read(row)), caption)]
 
     def _resize(self, image: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -
 
 
 def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:
-    """Draw a panel for each confidence ("score", "p"), in it the curve of each system; `curves[system][confidence]`."""
+    """Draw a panel by "score" and one by "confidence", each with a curve per system; `curves[system][by]`."""
     kinds = list(dict.fromkeys(kind for by_kind in curves.values() for kind in by_kind))
     figure, axes = panels(len(kinds), 5.0, 5.0)
     for panel, kind in zip(axes, kinds, strict=True):
@@ -55,7 +55,7 @@ def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, Precis
                 label = f"{_short(name)}: AP {100 * curve.average_precision:.1f}"
                 panel.plot(curve.recall, curve.precision, label=label, **_line(place))
         panel.set_title(f"by {kind}", fontsize=9)
-        _label(panel, "recall of the queries that have an answer", "precision of the answers")
+        _label(panel, "recall of the queries that have a prediction", "precision of the predictions")
         panel.legend(fontsize=7, loc="lower left")
     save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel
 
@@ -66,14 +66,14 @@ def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> 
     for place, (panel, (name, bins)) in enumerate(zip(axes, reliabilities.items(), strict=True)):
         panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
         sizes = 200 * bins.count / max(bins.count.sum(), 1) + 4
-        panel.scatter(bins.probability, bins.right, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
+        panel.scatter(bins.probability, bins.correct, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
         panel.set_title(f"{_short(name)}\nECE {100 * bins.calibration_error:.1f} %", fontsize=8, parse_math=False)
-        _label(panel, "p(right)", "right")
+        _label(panel, "confidence", "correct")
     save_figure(figure, path, bbox_inches="tight")
 
 
 def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, Float[np.ndarray, " shares"]]) -> None:
-    """Draw recall at 1 (by system, without the filter) over the share of queries that are re-ranked."""
+    """Draw recall at 1 (by system, without retrieval) over the share of queries that are re-ranked."""
     figure, [panel] = panels(1, 5.0, 5.0)
     for place, (name, values) in enumerate(recall.items(), start=1):
         panel.plot(shares, values, label=_short(name), **_line(place))
@@ -155,12 +155,12 @@ def weights_figure(
     names: Sequence[str],
     inputs: Float[np.ndarray, "matches inputs"],
     weights: Mapping[str, Float[np.ndarray, " matches"]],
-    right: Bool[np.ndarray, " matches"],
+    correct: Bool[np.ndarray, " matches"],
 ) -> None:
     """Draw the mean match weight over each input, and the share of matches that belong to a correct candidate.
 
-    `inputs` are of real matches, in their own units; each bin holds as many matches. `weights` are by training. `right`
-    says whether a match belongs to a correct candidate.
+    `inputs` are of real matches, in their own units; each bin holds as many matches. `weights` are by training.
+    `correct` says whether a match belongs to a correct candidate.
     """
     figure, axes = panels(len(names), 3.2, 2.6)
     for panel, name, values in zip(axes, names, inputs.T, strict=True):
@@ -173,9 +173,9 @@ def weights_figure(
         panel.set_title(name, fontsize=9)
         panel.grid(alpha=0.3)
         share = panel.twinx()
-        share.plot(centers, [100 * right[member].mean() for member in members], color=_SHARE, linestyle=":")
+        share.plot(centers, [100 * correct[member].mean() for member in members], color=_SHARE, linestyle=":")
         share.tick_params(labelsize=7, labelcolor=_SHARE)
     axes[0].legend(fontsize=7)
     axes[0].set_ylabel("weight / mean weight", fontsize=8)
-    figure.suptitle("dotted: % of these matches that belong to a right candidate", fontsize=9)
+    figure.suptitle("dotted: % of these matches that belong to a correct candidate", fontsize=9)
     save_figure(figure, path)

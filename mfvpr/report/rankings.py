@@ -23,7 +23,7 @@ class Rankings:
         database: names of N images.
         rows: of the database, best first, -1 = none.
         scores: in that order.
-        right: in that order; None = unknown.
+        correct: in that order; None = unknown.
         refused: queries with the prediction `NO_PLACE`; None = none.
     """
 
@@ -31,45 +31,45 @@ class Rankings:
     database: Sequence[str]
     rows: Int[np.ndarray, "queries candidates"]
     scores: Float[np.ndarray, "queries candidates"]
-    right: Bool[np.ndarray, "queries candidates"] | None
+    correct: Bool[np.ndarray, "queries candidates"] | None
     refused: Bool[np.ndarray, " queries"] | None = None
 
 
 def write_predictions(path: Path, rankings: Rankings) -> None:
-    """Write a CSV line per query and candidate, best first: `query,rank,database,score,right`.
+    """Write a CSV line per query and candidate, best first: `query,rank,database,score,correct`.
 
-    `right` is 1 or 0, or empty where it is unknown. A query that is refused has one line, `NO_PLACE`, with score and
-    `right` of its first candidate.
+    `correct` is 1 or 0, or empty where it is unknown. A query that is refused has one line, `NO_PLACE`, with score and
+    `correct` of its first candidate.
     """
     refused = np.zeros(len(rankings.rows), bool) if rankings.refused is None else rankings.refused
     lines = (
         [rankings.queries[query], rank + 1, NO_PLACE if refused[query] else rankings.database[row],
          number(rankings.scores[query, rank]) if row >= 0 else "",
-         "" if rankings.right is None else int(rankings.right[query, rank])]
+         "" if rankings.correct is None else int(rankings.correct[query, rank])]
         for (query, rank), row in np.ndenumerate(rankings.rows)
         if (rank == 0 if refused[query] else row >= 0)
     )  # fmt: skip
-    write_csv(path, ("query", "rank", "database", "score", "right"), lines)
+    write_csv(path, ("query", "rank", "database", "score", "correct"), lines)
 
 
 def write_failures(path: Path, rankings: Rankings) -> None:
-    """Write a CSV line per query whose first prediction is incorrect: `query,answer,rank,right_answer,score,margin`.
+    """Write `query,prediction,rank,correct_image,score,margin` of the queries whose top prediction is incorrect.
 
-    `rank`, `right_answer` and `score` are of the first correct candidate, empty where there is none; `margin` is how
+    `rank`, `correct_image` and `score` are of the first correct candidate, empty where there is none; `margin` is how
     much higher the first prediction scores, refused or not. Nothing is written without ground truth.
     """
-    if rankings.right is None:
+    if rankings.correct is None:
         return
     lines = []
-    for query in map(int, np.flatnonzero(~rankings.right[:, 0])):
+    for query in map(int, np.flatnonzero(~rankings.correct[:, 0])):
         names = [rankings.database[row] if row >= 0 else "" for row in rankings.rows[query]]
-        right, scores = rankings.right[query], rankings.scores[query]
-        rank = int(np.argmax(right))
+        correct, scores = rankings.correct[query], rankings.scores[query]
+        rank = int(np.argmax(correct))
         with np.errstate(invalid="ignore"):  # of two infinite scores
             margin = scores[0] - scores[rank]
-        first_right = [rank + 1, names[rank], number(scores[rank]), number(margin)] if right.any() else [""] * 4
-        lines.append([rankings.queries[query], names[0], *first_right])
-    write_csv(path, ("query", "answer", "rank", "right_answer", "score", "margin"), lines)
+        first_correct = [rank + 1, names[rank], number(scores[rank]), number(margin)] if correct.any() else [""] * 4
+        lines.append([rankings.queries[query], names[0], *first_correct])
+    write_csv(path, ("query", "prediction", "rank", "correct_image", "score", "margin"), lines)
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:

@@ -11,12 +11,12 @@ from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.rankings import number, write_csv
 from mfvpr.scoring.histogram import HistogramOfShifts
 
-HEADER = ("query", "answer", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale")
+HEADER = ("query", "prediction", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale")
 
 
 def write_shifts(
     folder: Path,
-    judged: EvaluationReport,
+    evaluation: EvaluationReport,
     scorer: HistogramOfShifts,
     refused: Sequence[Bool[np.ndarray, " _"]] | None = None,
 ) -> None:
@@ -26,21 +26,21 @@ def write_shifts(
     and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
     `refused` are queries of each sequence, which have no line; None = no query is refused.
     """
-    names = judged.result.dataset.database.names
-    sequences = zip(judged.result.matched, judged.result.systems[judged.headline], strict=True)
+    names = evaluation.result.dataset.database.names
+    sequences = zip(evaluation.result.matched, evaluation.result.systems[evaluation.headline], strict=True)
     for place, (matched, ranked) in enumerate(sequences):
         match_set = matched.by_scale
         if isinstance(match_set, Scales):
             continue
-        answers = ranked.rows[:, 0]
-        has_prediction = answers >= 0
+        predictions = ranked.rows[:, 0]
+        has_prediction = predictions >= 0
         queries = np.flatnonzero(has_prediction if refused is None else has_prediction & ~refused[place])
-        places = np.argmax(matched.candidates.indices[queries] == answers[queries, None], axis=1)
+        places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
         shifts, intervals, scales = dominant_shifts(scorer, match_set, queries, places)
         numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None]], axis=1)
         lines = [
-            [matched.sequence.images.names[query], names[answers[query]],
+            [matched.sequence.images.names[query], names[predictions[query]],
              *("" if np.isnan(value) else number(value) for value in row)]
             for query, row in zip(queries, numbers, strict=True)
         ]  # fmt: skip
-        write_csv(judged.folder(folder, place) / "shifts.csv", HEADER, lines)
+        write_csv(evaluation.folder(folder, place) / "shifts.csv", HEADER, lines)

@@ -25,12 +25,14 @@ def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Ta
 
     `numbers` choose settings; None = all.
     """
-    judge, (first, *deeper) = outcome.judge, outcome.ks
+    protocol, (first, *deeper) = outcome.protocol, outcome.ks
     numbers = range(len(outcome.settings)) if numbers is None else numbers
-    header = [judge.label(first, threshold) for threshold in judge.thresholds]
-    header += [judge.label(k, judge.thresholds[judge.main]) for k in deeper]
+    header = [protocol.label(first, threshold) for threshold in protocol.thresholds]
+    header += [protocol.label(k, protocol.thresholds[protocol.main]) for k in deeper]
     rows = outcome.rows[0][list(numbers)]
-    recalls = np.column_stack([judge.recall(rows, first), *(judge.recall(rows, k)[:, judge.main] for k in deeper)])
+    recalls = np.column_stack(
+        [protocol.recall(rows, first), *(protocol.recall(rows, k)[:, protocol.main] for k in deeper)]
+    )
     lines = [
         [*(format_value(outcome.settings[number][name]) for name in outcome.axes.values),
          *(f"{100 * value:.1f}" for value in recall)]
@@ -41,12 +43,12 @@ def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Ta
 
 def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
-    judge, ks = outcome.judge, outcome.ks
-    recall = np.stack([judge.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
+    protocol, ks = outcome.protocol, outcome.ks
+    recall = np.stack([protocol.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
     return {
         "axes": dict(outcome.axes.values), "own": dict(outcome.axes.own),
         "search": "grid" if outcome.is_grid else "optuna",
-        "unit": judge.unit, "thresholds": list(judge.thresholds), "ks": list(ks), "split": judge.split,
+        "unit": protocol.unit, "thresholds": list(protocol.thresholds), "ks": list(ks), "split": protocol.split,
         "chosen": [outcome.settings[number] for number in outcome.chosen],
         "report": [
             {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
@@ -57,7 +59,7 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
         "settings": [
             {"parameters": setting, "recall_at": {
                 f"{threshold:g}": {str(k): round(float(recall[number, place, depth]), 6) for depth, k in enumerate(ks)}
-                for place, threshold in enumerate(judge.thresholds)}}
+                for place, threshold in enumerate(protocol.thresholds)}}
             for number, setting in enumerate(outcome.settings)
         ],
     }  # fmt: skip
@@ -65,15 +67,15 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
 
 def sweep_summary(outcome: Outcome) -> str:
     """The best settings, the chosen ones, and their recall on the queries to report on."""
-    judge, defaults = outcome.judge, outcome.own
-    best = np.argsort(-outcome.recall[:, judge.main], kind="stable")[:TOP].tolist()
+    protocol, defaults = outcome.protocol, outcome.own
+    best = np.argsort(-outcome.recall[:, protocol.main], kind="stable")[:TOP].tolist()
     note = "" if defaults in best else "; last: the scorer's own values"
     shown = list(dict.fromkeys([*best, defaults]))
     parts = [
-        f"Best settings by {judge.label(1, judge.thresholds[judge.main])}, all queries{note}.",
+        f"Best settings by {protocol.label(1, protocol.thresholds[protocol.main])}, all queries{note}.",
         settings_table(outcome, shown).text(),
     ]
-    if outcome.is_grid and not judge.halves and len(shown) < len(outcome.settings):
+    if outcome.is_grid and not protocol.halves and len(shown) < len(outcome.settings):
         around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
         table = settings_table(outcome, [outcome.chosen[0], *around])
         parts += ["The best, and its neighbors in the grid:", table.text()] if around else []
@@ -81,24 +83,24 @@ def sweep_summary(outcome: Outcome) -> str:
 
 
 def _verdicts(outcome: Outcome) -> Iterator[str]:
-    judge = outcome.judge
+    protocol = outcome.protocol
     words = [", ".join(f"{name} = {format_value(value)}" for name, value in outcome.settings[number].items())
              for number in outcome.chosen]  # fmt: skip
-    for name, half, setting in zip(judge.names, judge.halves, words, strict=False):
+    for name, half, setting in zip(protocol.names, protocol.halves, words, strict=False):
         yield (f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half: "
                f"{setting}")  # fmt: skip
-    if not judge.halves:
+    if not protocol.halves:
         yield f"chosen: {words[0]}"
     yield "Recall at 1 in %, with 95 % intervals in brackets:"
     for verdict in outcome.report:
         yield (
-            f"{judge.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
-            f"{_with_interval(verdict.own)}; only one of them right: {verdict.mcnemar.only_first} and "
+            f"{protocol.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
+            f"{_with_interval(verdict.own)}; only one of them correct: {verdict.mcnemar.only_first} and "
             f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}, by "
             f"{verdict.sign_flips.blocks} blocks of {verdict.sign_flips.block} queries "
             f"p = {verdict.sign_flips.p_value:.2g}"
         )
-    if not judge.halves:
+    if not protocol.halves:
         yield (
             "Chosen and reported on the same queries, so this flatters; split=both chooses on one half of the path "
             "and reports on the other."
@@ -115,13 +117,13 @@ def heat_maps(outcome: Outcome) -> list[Figure]:
 
     A space that was not searched completely has none.
     """
-    axes, judge = outcome.axes, outcome.judge
+    axes, protocol = outcome.axes, outcome.protocol
     values = {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
     names = [name for name, axis in values.items() if len(axis) > 1] if outcome.is_grid else []
     pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
     if not pairs:
         return []
-    recall = outcome.recall[: axes.size, judge.main].reshape(*map(len, values.values()))
+    recall = outcome.recall[: axes.size, protocol.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
     defaults = {name: values[name].index(format_value(value)) if format_value(value) in values[name] else None
@@ -140,7 +142,7 @@ def heat_maps(outcome: Outcome) -> list[Figure]:
             columns=(second, _short(values[second])),
             best=(0 if single else best[first], best[second]),
             defaults=None if row is None or column is None else (row, column),
-            title="; ".join([f"{judge.label(1, judge.thresholds[judge.main])} in %", *fixed]),
+            title="; ".join([f"{protocol.label(1, protocol.thresholds[protocol.main])} in %", *fixed]),
         )
         figures.append((f"{file}.png", draw))
     return figures

@@ -2,7 +2,7 @@
 
 Hubs are database images that score high with any query.
 
-    cohort = match_cohort(dataset, 5, extractor, filter)
+    cohort = match_cohort(dataset, 5, extractor, retriever)
     scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
     strengths = hubness(cohort.candidates, scores, len(dataset.database))
     normalized = by_hubness(candidates, query_scores, strengths)

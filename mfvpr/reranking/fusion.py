@@ -10,15 +10,15 @@ from jaxtyping import Float
 from mfvpr.reranking.cohort_normalization import by_hubness
 from mfvpr.reranking.frame_correlation import FrameCorrelation
 from mfvpr.reranking.ranking import (
-    FilterScore,
+    RetrievalScore,
     Scores,
     Ties,
-    filter_scores,
     fuse_scales,
     fuse_shortlist,
     rank_shortlist,
+    retrieval_scores,
 )  # fmt: skip
-from mfvpr.reranking.results import COHORT, FILTER, FRAMES, Matched, Ranked
+from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Matched, Ranked
 from mfvpr.scoring.fields import POSITIVE
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError, require_word
@@ -33,26 +33,26 @@ class Fusion:
             sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
             equal). With retrieval and main score only, "zscore" ranks as None does, but its values have the same unit
             for every query. A score that is not finite affects only its own candidate.
-        filter_score: kind of retrieval score, see `mfvpr.reranking.ranking.filter_scores`.
-        weights: for "zscore" only, above 0, by name: of the retrieval (`filter`) and of the main scorer, by default 1;
+        retrieval_score: kind of retrieval score, see `mfvpr.reranking.ranking.retrieval_scores`.
+        weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
             and of further scorers, which take part only if they are named here.
     """
 
     c: float | Literal["zscore"] | None = None
-    filter_score: FilterScore = "cosine"
+    retrieval_score: RetrievalScore = "cosine"
     weights: Mapping[str, float] = field(default_factory=dict)
 
     def members(self, main: str) -> list[str]:
         """Names of the scorers that take part, the main scorer first."""
-        return [main, *(name for name in self.weights if name not in (main, FILTER))]
+        return [main, *(name for name in self.weights if name not in (main, RETRIEVAL))]
 
     def renamed(self, main: str, name: str) -> "Fusion":
         """This fusion for a main scorer with another name, such as one with a cohort."""
         return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
 
     def system(self, main: str) -> str:
-        """Name of the fused system, such as `histogram + filter`."""
-        return " + ".join([*self.members(main), FILTER])
+        """Name of the fused system, such as `histogram + retrieval`."""
+        return " + ".join([*self.members(main), RETRIEVAL])
 
     def check(self, main: str, scorers: Collection[str]) -> None:
         """Check the settings and the names of scorers.
@@ -64,7 +64,7 @@ class Fusion:
         Raises:
             InputError: a setting is out of bounds, or a name is not among the scorers.
         """
-        require_word("filter_score", self.filter_score, FilterScore)
+        require_word("retrieval_score", self.retrieval_score, RetrievalScore)
         known = ", ".join(scorers) or "there are none"
         if main not in scorers:
             raise InputError(f"fused: expected names of scorers ({known}), got {main}")
@@ -73,8 +73,8 @@ class Fusion:
         if self.weights and self.c != "zscore":
             raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
         for name, weight in self.weights.items():
-            if name not in {FILTER, *scorers}:
-                raise InputError(f"weights: expected {FILTER} or names of scorers ({known}), got {name}; score by it "
+            if name not in {RETRIEVAL, *scorers}:
+                raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it "
                                  "as well")  # fmt: skip
             if not _between(weight, *POSITIVE):
                 raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
@@ -83,8 +83,8 @@ class Fusion:
     def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
         """Combined scores, from scores by name of the scorer."""
         if self.c != "zscore":
-            return fuse_shortlist(candidates, scores[main], self.c, filter_score=self.filter_score)
-        parts = {FILTER: filter_scores(candidates, self.filter_score)}
+            return fuse_shortlist(candidates, scores[main], self.c, retrieval_score=self.retrieval_score)
+        parts = {RETRIEVAL: retrieval_scores(candidates, self.retrieval_score)}
         parts |= {name: scores[name] for name in self.members(main)}
         weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
         return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
@@ -108,7 +108,7 @@ def rank_sequence(
         scores[f"{name} + {COHORT}"] = by_hubness(candidates, scores[name], strengths, name=name)
     scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}
     scores |= {f"{name} + {FRAMES}": correlate(candidates, scores[name]) for name, correlate in correlated.items()}
-    scores = {FILTER: candidates.scores} | scores
+    scores = {RETRIEVAL: candidates.scores} | scores
     return {name: _rank(candidates, values, ties) for name, values in scores.items()}
 
 

@@ -17,8 +17,8 @@ from mfvpr.types import Array, Matches, Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
 
-Ties = Literal["filter", "index"]
-FilterScore = Literal["cosine", "negative_euclidean"]
+Ties = Literal["retrieval", "index"]
+RetrievalScore = Literal["cosine", "negative_euclidean"]
 
 Scores = Float[np.ndarray, "queries candidates"]
 
@@ -63,7 +63,7 @@ def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array,
 
 
 def combine(
-    filter_scores: Num[Array, "*batch candidates"],
+    retrieval_scores: Num[Array, "*batch candidates"],
     rerank_scores: Num[Array, "*batch candidates"],
     *,
     c: float | Array = 1e6,
@@ -71,15 +71,17 @@ def combine(
     """Combined score s = c s_f + s_r, equation 4 (paper, section IV-E).
 
     Args:
-        filter_scores: s_f, retrieval scores.
+        retrieval_scores: s_f, retrieval scores.
         rerank_scores: s_r, re-ranking scores.
         c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
-    return c * filter_scores + rerank_scores
+    return c * retrieval_scores + rerank_scores
 
 
 def balancing_c(
-    filter_scores: Num[Array, " candidates"], rerank_scores: Num[Array, " candidates"], mask: Bool[Array, " candidates"]
+    retrieval_scores: Num[Array, " candidates"],
+    rerank_scores: Num[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
 ) -> Float[jax.Array, ""]:
     """The c with which both scores of one query's candidates have the same standard deviation.
 
@@ -90,27 +92,27 @@ def balancing_c(
     def deviation(scores: Array) -> Array:
         return masked_std(scores, mask & jnp.isfinite(scores))
 
-    filter_deviation = deviation(filter_scores)
-    c = deviation(rerank_scores) / jnp.where(filter_deviation > 0, filter_deviation, 1.0)
-    return jnp.where((filter_deviation > 0) & jnp.isfinite(c), c, 0.0)
+    retrieval_deviation = deviation(retrieval_scores)
+    c = deviation(rerank_scores) / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
+    return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
 
 
 @compiled
 def fuse(
-    filter_scores: Num[Array, "queries candidates"],
+    retrieval_scores: Num[Array, "queries candidates"],
     scores: Num[Array, "queries candidates"],
     mask: Bool[Array, "queries candidates"],
     c: float | Array | None,
 ) -> Float[jax.Array, "queries candidates"]:
     """Combined scores of several queries; None as `c` is `balancing_c` of each query."""
     if c is None:
-        c = jax.vmap(balancing_c)(filter_scores, scores, mask)[:, None]
-    filter_scores, scores = masked(filter_scores, mask), masked(scores, mask)
-    return combine(filter_scores, scores, c=c)
+        c = jax.vmap(balancing_c)(retrieval_scores, scores, mask)[:, None]
+    retrieval_scores, scores = masked(retrieval_scores, mask), masked(scores, mask)
+    return combine(retrieval_scores, scores, c=c)
 
 
 def fuse_shortlist(
-    candidates: Shortlist, scores: Scores, c: float | None, *, filter_score: FilterScore = "cosine"
+    candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
 ) -> Scores:
     """Combined scores of retrieval and re-ranking; NaN without a candidate.
 
@@ -118,24 +120,24 @@ def fuse_shortlist(
         candidates: shortlist with cosine similarities.
         scores: re-ranking scores.
         c: weight of the retrieval score; None is `balancing_c` of each query.
-        filter_score: kind of retrieval score, see `filter_scores`.
+        retrieval_score: kind of retrieval score, see `retrieval_scores`.
     """
-    fused = fuse(filter_scores(candidates, filter_score), scores, candidates.mask, c)
+    fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
     return np.asarray(or_nan(fused, candidates.mask))
 
 
-def filter_scores(candidates: Shortlist, kind: FilterScore = "cosine") -> Scores:
+def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
     """Retrieval scores: cosine similarity, or minus the Euclidean distance.
 
     Raises:
         InputError: `kind` is unknown, or `negative_euclidean` of scores above 1.
     """
-    require_word("filter_score", kind, FilterScore)
+    require_word("retrieval_score", kind, RetrievalScore)
     cosine = candidates.scores
     if kind == "cosine":
         return cosine
     if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
-        raise InputError(f"filter_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; "
+        raise InputError(f"retrieval_score=negative_euclidean: expected cosine similarities, got {largest:.4g}; "
                          "use cosine, which takes any score")  # fmt: skip
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
@@ -200,7 +202,7 @@ def breaks_ties_by_row(ties: Ties) -> bool:
 
 
 def rank_shortlist(
-    candidates: Shortlist, scores: Scores, *, ties: Ties = "filter"
+    candidates: Shortlist, scores: Scores, *, ties: Ties = "retrieval"
 ) -> Int[np.ndarray, "queries candidates"]:
     """Positions into the shortlist, best first, missing candidates last.
 

@@ -11,7 +11,7 @@ from mfvpr.matching.match_set import MatchSet, Scales
 from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 
-FILTER = "filter"  # name of the retrieval's own ranking
+RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
 FRAMES = "frames"  # in names of rankings by frame correlation, which uses the queries before
 COHORT = "cohort"  # in names of rankings by scores that are normalized with a cohort
 

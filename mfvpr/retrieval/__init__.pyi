@@ -2,9 +2,9 @@ __all__ = [
     "DescriptorFiles",
     "ExactSearch",
     "FeatureFiles",
-    "Filter",
-    "Filtered",
     "Retrieval",
+    "RetrievalResult",
+    "Retriever",
     "ShortlistFiles",
     "SsmVoting",
     "WhitenedSearch",
@@ -14,6 +14,6 @@ __all__ = [
 
 from .fitting import fit_to_database
 from .precomputed import DescriptorFiles, FeatureFiles, ShortlistFiles
-from .retriever import Filter, Filtered, Retrieval
+from .retriever import Retrieval, RetrievalResult, Retriever
 from .search import ExactSearch, WhitenedSearch, retrieve
 from .ssm_voting import SsmVoting

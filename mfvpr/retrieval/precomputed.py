@@ -18,7 +18,7 @@ from mfvpr.io.descriptors import read_with_entries as read_descriptors
 from mfvpr.io.features import ImportedFeatures, open_features
 from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
-from mfvpr.retrieval.retriever import Filtered
+from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
@@ -95,13 +95,13 @@ class DescriptorFiles:
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
-    ) -> Filtered:
-        """See `mfvpr.retrieval.retriever.Filter`."""
+    ) -> RetrievalResult:
+        """See `mfvpr.retrieval.retriever.Retriever`."""
         database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
         search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
-        return Filtered(shortlist, {}, {})
+        return RetrievalResult(shortlist, {}, {})
 
     def _read(self, folder: ImageFolder) -> Float[np.ndarray, "images dimensions"]:
         file = _file_of(self.files, folder)
@@ -124,8 +124,8 @@ class ShortlistFiles:
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
-    ) -> Filtered:
-        """See `mfvpr.retrieval.retriever.Filter`; candidates that the sequence excludes are removed."""
+    ) -> RetrievalResult:
+        """See `mfvpr.retrieval.retriever.Retriever`; candidates that the sequence excludes are removed."""
         file = _file_of(self.files, sequence.images)
         names = [self.database_prefix + name for name in database.names]
         shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
@@ -134,7 +134,7 @@ class ShortlistFiles:
         require_one_image(file.path, sequence.images.paths, query_entries, images)
         if sequence.excluded is not None:
             shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
-        return Filtered(_cut(shortlist, num_candidates), {}, {})
+        return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:

@@ -15,7 +15,7 @@ from mfvpr.storage.shards import together
 from mfvpr.types import Shortlist
 
 
-class Filtered(NamedTuple):
+class RetrievalResult(NamedTuple):
     """Candidates `[Q, C]` of a sequence's queries, and images that could not be used: row -> reason."""
 
     candidates: Shortlist
@@ -23,7 +23,7 @@ class Filtered(NamedTuple):
     bad_database: Mapping[int, str]
 
 
-class Filter(Protocol):
+class Retriever(Protocol):
     """Interface of a retrieval.
 
     A cache of matches needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
@@ -31,7 +31,7 @@ class Filter(Protocol):
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
-    ) -> Filtered:
+    ) -> RetrievalResult:
         """Best candidates of each query, without database images that the sequence excludes.
 
         Args:
@@ -57,8 +57,8 @@ class Retrieval:
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
-    ) -> Filtered:
-        """See `Filter`."""
+    ) -> RetrievalResult:
+        """See `Retriever`."""
         database_vectors, query_vectors = together(
             partial(cache.vectors, database, self.describer, database, label="database"),
             partial(cache.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
@@ -72,4 +72,4 @@ class Retrieval:
             num_candidates,
             excluded=sequence.excluded,
         )
-        return Filtered(candidates, query_vectors.bad, database_vectors.bad)
+        return RetrievalResult(candidates, query_vectors.bad, database_vectors.bad)

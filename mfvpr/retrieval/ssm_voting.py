@@ -9,7 +9,7 @@ from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.ssm import SsmWindows
 from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import Filtered
+from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
@@ -34,15 +34,15 @@ class SsmVoting:
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
-    ) -> Filtered:
-        """See `mfvpr.retrieval.retriever.Filter`; scores are votes."""
+    ) -> RetrievalResult:
+        """See `mfvpr.retrieval.retriever.Retriever`; scores are votes."""
         describer = fit_to_database(self.describer, database, cache)
         database_vectors = cache.vectors(database, describer, database, label="database")
         query_vectors = cache.vectors(sequence.images, describer, database, label=f"query {sequence.name}")
         shape = (-1, describer.windows.count, describer.whitening.dimension)
         queries, windows = query_vectors.values.reshape(shape), database_vectors.values.reshape(shape)
         candidates = vote(queries, windows, num_candidates, excluded=sequence.excluded, search=self.search)
-        return Filtered(candidates, query_vectors.bad, database_vectors.bad)
+        return RetrievalResult(candidates, query_vectors.bad, database_vectors.bad)
 
 
 def vote(

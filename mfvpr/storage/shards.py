@@ -2,7 +2,7 @@
 
     try:
         cache = FeatureCache(root, shard=Shard(2, 8))
-        mfvpr.evaluate(dataset, extractor, filter, scorers, cache=cache)
+        mfvpr.evaluate(dataset, extractor, retriever, scorers, cache=cache)
     except NotYet as progress:
         print(progress, progress.is_complete)
 

@@ -14,7 +14,7 @@ from mfvpr import InputError, frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth, folder_dataset
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.datasets.truth_files import truth_from_labels
-from mfvpr.evaluation import judge
+from mfvpr.evaluation import evaluation_protocol
 from mfvpr.utils.files import write_text
 from tests import oracles
 from tests.builders import fill
@@ -161,7 +161,7 @@ def test_nordland_takes_a_few_megabytes():
     frames = np.arange(number)[:, None]
     rankings = np.stack([frames, frames - tolerance, frames - tolerance - 1])
     with memory_below(60e6):
-        protocol = judge(truth, [tolerance], "both")
+        protocol = evaluation_protocol(truth, [tolerance], "both")
         recall, difference = protocol.recall(rankings), protocol.positives[0] - protocol.places
     [positives] = protocol.positives
     assert positives.counts.sum() == number * (2 * tolerance + 1) - tolerance * (tolerance + 1)

@@ -239,7 +239,7 @@ def write_lists(root, name, truth):
 
 
 @pytest.mark.parametrize("folder", ["datasets/", ""])
-def test_pittsburgh_is_right_within_25_m(pittsburgh, folder):
+def test_pittsburgh_is_correct_within_25_m(pittsburgh, folder):
     write_structure(pittsburgh / f"{folder}pitts30k_val.mat")
     dataset = published_dataset("pitts30k_val", pittsburgh)
     assert dataset.database.names == tuple(DATABASE)

@@ -1,4 +1,4 @@
-"""p(right) of first answers: its inputs against explicit loops, its fit, its file."""
+"""confidence of top predictions: its inputs against explicit loops, its fit, its file."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from mfvpr.report.confidences import CalibratedPredictions, recall_by_share
 from mfvpr.reranking import Ranked
 from mfvpr.utils import InputError
 
-NAMES = ("margin", "height", "filter", "score")
+NAMES = ("margin", "height", "retrieval", "score")
 
 
 def rank_by_scores(scores, rows):
@@ -74,14 +74,16 @@ def test_few_candidates_of_other_places_make_no_answer_certain(num_others):
     """Fitted on many candidates; a little above one other image, whose score has no spread, is not far above it."""
     rng = np.random.default_rng(0)
     scores = -np.sort(-rng.normal(2.0, 0.2, (200, 50)), axis=1)
-    right = rng.random(200) < 0.5
-    scores[:, 0] = np.where(right, 3.0, scores[:, 0])
+    correct = rng.random(200) < 0.5
+    scores[:, 0] = np.where(correct, 3.0, scores[:, 0])
     rows = np.concatenate([np.zeros((200, 1)), 10 * np.arange(1, 50) + np.zeros((200, 1))], axis=1).astype(int)
     many = Ranked(rows, scores)
-    model = fit_confidence(confidence_inputs(many, many), right)
+    model = fit_confidence(confidence_inputs(many, many), correct)
     few = Ranked(np.array([[0, 100, 200][: 1 + num_others]]), np.array([[2.2, 2.0, 1.8][: 1 + num_others]]))
     assert 0.02 < model(few, few)[0] < 0.7
-    place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other place: what is known of all answers
+    place = Ranked(
+        np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]])
+    )  # no other place: what is known of all predictions
     assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
 
 
@@ -92,8 +94,8 @@ def draw_answers(weights, bias, queries=4000, seed=1):
 
 
 def test_the_model_that_answers_were_drawn_from_is_found():
-    values, right = draw_answers([2.0, 0.7], -1.5)
-    model = fit_confidence(values, right)
+    values, correct = draw_answers([2.0, 0.7], -1.5)
+    model = fit_confidence(values, correct)
     weights = np.array(model.weights) / np.array(model.scale)
     np.testing.assert_allclose(weights, [2.0, 0.7], atol=0.25)
     assert model.bias - weights @ np.array(model.center) == pytest.approx(-1.5, abs=0.25)
@@ -103,13 +105,13 @@ def test_the_model_that_answers_were_drawn_from_is_found():
 
 
 def test_no_weights_around_the_fitted_ones_are_more_probable():
-    values, right = draw_answers([1.0, 0.5], -1.0, queries=60)
-    model = fit_confidence(values, right)
+    values, correct = draw_answers([1.0, 0.5], -1.0, queries=60)
+    model = fit_confidence(values, correct)
     columns = (values - values.mean(axis=0)) / values.std(axis=0)
 
     def loss(bias, *weights):
         odds = [bias + sum(w * x for w, x in zip(weights, row, strict=True)) for row in columns]
-        total = sum(math.log1p(math.exp(-z if hit else z)) for z, hit in zip(odds, right, strict=True))
+        total = sum(math.log1p(math.exp(-z if hit else z)) for z, hit in zip(odds, correct, strict=True))
         half = (math.log1p(math.exp(bias)) + math.log1p(math.exp(-bias))) / 2
         return total + half + sum(w**2 for w in weights) / 2
 
@@ -120,16 +122,16 @@ def test_no_weights_around_the_fitted_ones_are_more_probable():
 
 
 def test_a_surer_input_never_makes_an_answer_less_probable():
-    values, right = draw_answers([-2.0, 1.0], 0.0)
-    weights = fit_confidence(values, right).weights
+    values, correct = draw_answers([-2.0, 1.0], 0.0)
+    weights = fit_confidence(values, correct).weights
     assert weights[0] == 0 < weights[1]
 
 
-@pytest.mark.parametrize("right", [True, False])
-def test_where_all_answers_are_right_or_wrong_p_is_not_certain(right):
+@pytest.mark.parametrize("correct", [True, False])
+def test_where_all_answers_are_right_or_wrong_p_is_not_certain(correct):
     values, _ = draw_answers([1.0, 1.0], 0.0, queries=50)
-    probability = fit_confidence(np.vstack([values, [[np.nan, np.nan]]]), np.full(51, right)).probability(values)
-    probability = probability if right else 1 - probability
+    probability = fit_confidence(np.vstack([values, [[np.nan, np.nan]]]), np.full(51, correct)).probability(values)
+    probability = probability if correct else 1 - probability
     np.testing.assert_allclose(probability, 50.5 / 51, rtol=1e-3)
     with pytest.raises(InputError, match="expected predictions to fit it on"):
         fit_confidence(np.full((2, 2), np.nan), np.zeros(2, bool))
@@ -139,10 +141,10 @@ def test_what_is_written_is_read(rankings, tmp_path):
     values = confidence_inputs(*rankings, inputs=NAMES, apart=3)
     model = fit_confidence(values, values[:, 0] > 0.3, inputs=NAMES, apart=3)
     assert np.isnan(model(*rankings)).sum() == 1
-    write_confidences(tmp_path / "confidence.json", {"histogram + filter": model}, {"dataset": "ä"})
+    write_confidences(tmp_path / "confidence.json", {"histogram + retrieval": model}, {"dataset": "ä"})
     systems, recipe = read_confidences(tmp_path / "confidence.json")
-    assert (systems, recipe) == ({"histogram + filter": model}, {"dataset": "ä"})
-    np.testing.assert_array_equal(systems["histogram + filter"](*rankings), model(*rankings))
+    assert (systems, recipe) == ({"histogram + retrieval": model}, {"dataset": "ä"})
+    np.testing.assert_array_equal(systems["histogram + retrieval"](*rankings), model(*rankings))
 
 
 def broken(**changes):
@@ -171,11 +173,11 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
 
 def test_queries_without_an_answer_are_reranked_first():
     """Then those that the filter is the least sure of."""
-    probabilities, right = np.linspace(0.99, 0.01, 20), {"filter": np.zeros(20, bool), "it": np.zeros(20, bool)}
+    probabilities, correct = np.linspace(0.99, 0.01, 20), {"retrieval": np.zeros(20, bool), "it": np.zeros(20, bool)}
     probabilities[3] = np.nan
-    right["it"][3] = right["filter"][19] = True
-    assured: Any = SimpleNamespace(probabilities={"filter": probabilities}, right=right.__getitem__)
-    np.testing.assert_allclose(recall_by_share(assured, "it")[:4], [0.05, 0.1, 0.05, 0.05])
+    correct["it"][3] = correct["retrieval"][19] = True
+    calibrated: Any = SimpleNamespace(probabilities={"retrieval": probabilities}, correct=correct.__getitem__)
+    np.testing.assert_allclose(recall_by_share(calibrated, "it")[:4], [0.05, 0.1, 0.05, 0.05])
 
 
 def test_halves_of_drives_there_and_back_share_no_place():
@@ -184,9 +186,9 @@ def test_halves_of_drives_there_and_back_share_no_place():
     places = [Positives.from_rows(list(map(list, drive)), 20) for drive in (rows[:20], rows[20:])]
     sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, drive=drive: drive, unit="frames"))
                  for drive in places]  # fmt: skip
-    judged: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
+    evaluation: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
     reported = []
-    for half in CalibratedPredictions(judged).path_halves():
+    for half in CalibratedPredictions(evaluation).path_halves():
         places = [{place for row in part for place in rows[row]} for part in (half.tune, half.report)]
         assert not places[0] & places[1]
         assert min(map(len, places)) >= 9

@@ -51,7 +51,7 @@ def result(dataset):
 
 
 def test_systems_and_their_recall(dataset, result):
-    assert list(result.systems) == ["filter", "histogram", "count", "histogram + filter"]
+    assert list(result.systems) == ["retrieval", "histogram", "count", "histogram + retrieval"]
     [matched] = result.matched
     for ranked in (ranked for [ranked] in result.systems.values()):
         assert ranked.rows.shape == (10, 5)
@@ -69,10 +69,10 @@ def test_systems_and_their_recall(dataset, result):
 def test_frame_correlation_is_a_ranking_more(result):
     """It ranks by a scorer, or by a fused one, and changes no other system."""
     [matched] = result.matched
-    correlated = {"histogram": FrameCorrelation(1), "histogram + filter": FrameCorrelation()}
+    correlated = {"histogram": FrameCorrelation(1), "histogram + retrieval": FrameCorrelation()}
     scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
-    systems = rank_sequence(matched, scores, {"histogram": Fusion(c=10.0)}, correlated, "filter")
-    assert [*systems] == [*result.systems, "histogram + frames", "histogram + filter + frames"]
+    systems = rank_sequence(matched, scores, {"histogram": Fusion(c=10.0)}, correlated, "retrieval")
+    assert [*systems] == [*result.systems, "histogram + frames", "histogram + retrieval + frames"]
     for name, [ranked] in result.systems.items():
         np.testing.assert_array_equal(systems[name].rows, ranked.rows)
         np.testing.assert_array_equal(systems[name].scores, ranked.scores)
@@ -100,16 +100,20 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     assert recall.queries.tolist() == [3, 7]
-    judged = EvaluationReport(parts, [0, 1], [1], "count")
-    table = recall_table(judged)
-    assert [line[:2] for line in table.rows[:4]] == [["filter", name] for name in ("first", "second", "mean", "pooled")]
-    write_gains(tmp_path, judged)
+    evaluation = EvaluationReport(parts, [0, 1], [1], "count")
+    table = recall_table(evaluation)
+    assert [line[:2] for line in table.rows[:4]] == [
+        ["retrieval", name] for name in ("first", "second", "mean", "pooled")
+    ]
+    write_gains(tmp_path, evaluation)
     gains = [(tmp_path / "sequences" / name / "gains.csv").read_text().splitlines() for name in ("first", "second")]
     assert list(map(len, gains)) == [4, 8]
     places = [line.split(",")[1] for lines in gains for line in lines[1:]]
     assert places == list(map(str, range(10)))  # the two ends of one path, so that tests know what is next to what
-    hits = {name: np.concatenate([judged.is_right(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems}
-    for first, second, counts, flips in differences(judged):
+    hits = {
+        name: np.concatenate([evaluation.is_correct(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems
+    }
+    for first, second, counts, flips in differences(evaluation):
         assert counts.only_first == (hits[first] > hits[second]).sum()
         assert flips == block_sign_flips(hits[first], hits[second], places=np.arange(10))
     with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
@@ -121,16 +125,16 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
 def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
     result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
-    assured = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
-    answers, filtered = result.systems["count"], result.systems["filter"]
-    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(answers, filtered, strict=True)])
-    right, halved = assured.right("count"), halves(dataset.truth.positives(1))
+    calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
+    predictions, filtered = result.systems["count"], result.systems["retrieval"]
+    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, filtered, strict=True)])
+    correct, halved = calibrated.correct("count"), halves(dataset.truth.positives(1))
     for half in halved:
-        fitted = fit_confidence(inputs[half.tune], right[half.tune])
+        fitted = fit_confidence(inputs[half.tune], correct[half.tune])
         expected = fitted.probability(inputs[half.report])
         assert np.isfinite(expected).all()
-        np.testing.assert_allclose(assured.probabilities["count"][half.report], expected)
-    assert [len(part) for part in assured.judged.by_sequence(assured.scores("count"))] == [3, 7]
+        np.testing.assert_allclose(calibrated.probabilities["count"][half.report], expected)
+    assert [len(part) for part in calibrated.evaluation.by_sequence(calibrated.scores("count"))] == [3, 7]
 
 
 class Vectors:
@@ -217,7 +221,7 @@ def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result
     }
     for name, chosen in filters.items():
         imported_result = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
-        for system in ("filter", "histogram", "count"):
+        for system in ("retrieval", "histogram", "count"):
             [got], [expected] = imported_result.systems[system], result.systems[system]
             np.testing.assert_array_equal(got.rows, expected.rows, err_msg=name)
             np.testing.assert_allclose(got.scores, expected.scores, rtol=1e-5)
@@ -304,7 +308,7 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
 @pytest.fixture
 def imported(small_street, files):
     """Settings of programs that read the features of other programs."""
-    return (f"dataset.database={small_street}/database", "candidates=5", "store=null", "features=import",
+    return (f"dataset.database={small_street}/database", "candidates=5", "cache=null", "features=import",
             f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
             "features.database_prefix=database/", "features.query_prefix=queries/")  # fmt: skip
 
@@ -319,7 +323,7 @@ def test_programs_take_sequences_and_files(split, imported, tmp_path, monkeypatc
     assert code == 0, stderr
     assert "sequences: 10 queries in 2 sequences, 10 database images, 5 candidates (vlad), import features" in stdout
     names = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.csv")}
-    assert {"sequences/first/predictions.csv", "sequences/second/predictions/count_filter.csv", "table.csv"} <= names
+    assert {"sequences/first/predictions.csv", "sequences/second/predictions/count_retrieval.csv", "table.csv"} <= names
     table = (tmp_path / "out" / "table.csv").read_text().splitlines()
     assert [line.split(",")[1] for line in table[1:5]] == ["first", "second", "mean", "pooled"]
     code, _, stderr = typed(monkeypatch, capsys, "sweep", *common[:-3], "scorer=histogram", "grid.sigma=[10,20]",
@@ -354,7 +358,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
 
 
 def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
-    names = ["count_filter", "count + filter", "../../up", "count"]
+    names = ["count_filter", "count + retrieval", "../../up", "count"]
     systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
     write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1], "count"))
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

@@ -11,26 +11,26 @@ from mfvpr.utils import InputError
 
 
 def made_up(seed=0, queries=40):
-    """Confidences with equal ones and some without an answer, hits, and queries that have an answer."""
+    """Confidences with equal ones and some without a prediction, hits, and queries that have a prediction."""
     rng = np.random.default_rng(seed)
     confidence = rng.integers(0, 12, queries) / 11
-    right, has_answer = rng.random(queries) < confidence, rng.random(queries) < 0.9
+    correct, has_positives = rng.random(queries) < confidence, rng.random(queries) < 0.9
     confidence[rng.random(queries) < 0.1] = np.nan
-    return confidence, right & has_answer & ~np.isnan(confidence), has_answer
+    return confidence, correct & has_positives & ~np.isnan(confidence), has_positives
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_curve_is_that_of_counting_answers_at_every_threshold(seed):
-    confidence, right, has_answer = made_up(seed)
-    curve = precision_recall(confidence, right, has_answer)
+    confidence, correct, has_positives = made_up(seed)
+    curve = precision_recall(confidence, correct, has_positives)
     thresholds = sorted({value for value in confidence.tolist() if not math.isnan(value)}, reverse=True)
     assert curve.thresholds.tolist() == thresholds
     area, before = 0.0, 0.0
     for threshold, precision, recall in zip(*curve, strict=True):
         answered = [query for query in range(40) if confidence[query] >= threshold]
-        hits = sum(right[query] for query in answered)
+        hits = sum(correct[query] for query in answered)
         assert precision == pytest.approx(hits / len(answered))
-        assert recall == pytest.approx(hits / sum(has_answer))
+        assert recall == pytest.approx(hits / sum(has_positives))
         area, before = area + (recall - before) * precision, recall
     assert curve.average_precision == pytest.approx(area)
     for wanted in (1.0, 0.9, 0.5):
@@ -39,26 +39,26 @@ def test_curve_is_that_of_counting_answers_at_every_threshold(seed):
 
 
 def test_perfect_and_hopeless_confidences():
-    right = np.arange(10) < 6
-    perfect = precision_recall(-np.arange(10.0), right, right)
+    correct = np.arange(10) < 6
+    perfect = precision_recall(-np.arange(10.0), correct, correct)
     assert (perfect.average_precision, perfect.recall_at(1.0)) == (1.0, 1.0)
-    assert precision_recall(np.arange(10.0), right).recall_at(1.0) == 0
-    assert precision_recall(-np.arange(10.0), right).recall_at(1.0) == 0.6
-    for has_answer in (np.zeros(10, bool), None):
-        none = precision_recall(np.full(10, np.nan), np.zeros(10, bool), has_answer)
+    assert precision_recall(np.arange(10.0), correct).recall_at(1.0) == 0
+    assert precision_recall(-np.arange(10.0), correct).recall_at(1.0) == 0.6
+    for has_positives in (np.zeros(10, bool), None):
+        none = precision_recall(np.full(10, np.nan), np.zeros(10, bool), has_positives)
         assert (none.average_precision, none.recall_at(0.5), len(none.thresholds)) == (0.0, 0.0, 0)
 
 
 def test_correct_predictions_for_queries_without_positives_are_refused():
-    right = np.array([False, True])
+    correct = np.array([False, True])
     with pytest.raises(InputError, match="no correct predictions for queries without positives"):
-        precision_recall(np.array([0.9, 0.8]), right, ~right)
+        precision_recall(np.array([0.9, 0.8]), correct, ~correct)
 
 
 @pytest.mark.parametrize("bins", [1, 4, 10])
 def test_reliability_is_that_of_loops_over_bins(bins):
-    confidence, right, _ = made_up(5)
-    curve = reliability(confidence, right, bins=bins)
+    confidence, correct, _ = made_up(5)
+    curve = reliability(confidence, correct, bins=bins)
     error, total = 0.0, 0
     for number in range(bins):
         last = number == bins - 1
@@ -66,12 +66,12 @@ def test_reliability_is_that_of_loops_over_bins(bins):
                   or (last and confidence[query] == 1)]  # fmt: skip
         assert curve.count[number] == len(inside)
         if inside:
-            mean, share = (sum(values[query] for query in inside) / len(inside) for values in (confidence, right))
+            mean, share = (sum(values[query] for query in inside) / len(inside) for values in (confidence, correct))
             assert curve.probability[number] == pytest.approx(mean)
-            assert curve.right[number] == pytest.approx(share)
+            assert curve.correct[number] == pytest.approx(share)
             error, total = error + len(inside) * abs(mean - share), total + len(inside)
         else:
-            assert np.isnan([curve.probability[number], curve.right[number]]).all()
+            assert np.isnan([curve.probability[number], curve.correct[number]]).all()
     assert curve.calibration_error == pytest.approx(error / total)
 
 
@@ -83,7 +83,7 @@ def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
 
 
 @pytest.mark.parametrize("value", [5.0, np.inf, -np.inf])
-@pytest.mark.parametrize("right", [[True, False], [False, True]])
-def test_equal_confidences_are_answered_together_however_large(value, right):
-    curve = precision_recall(np.array([value, value]), np.array(right))
+@pytest.mark.parametrize("correct", [[True, False], [False, True]])
+def test_equal_confidences_are_answered_together_however_large(value, correct):
+    curve = precision_recall(np.array([value, value]), np.array(correct))
     assert (curve.precision.tolist(), curve.recall.tolist(), curve.average_precision) == ([0.5], [0.5], 0.25)

@@ -6,7 +6,7 @@ import pytest
 from mfvpr import InputError, Shortlist
 from mfvpr.datasets import FrameTruth, RadiusTruth
 from mfvpr.datasets.truth import middle
-from mfvpr.evaluation import judge
+from mfvpr.evaluation import evaluation_protocol
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
@@ -22,12 +22,12 @@ def rows():
 
 def recall_of(rows, queries, tolerance, k=1):
     """Recall of one ranking `[Q, depth]`, by a loop."""
-    right = [any(row >= 0 and abs(row - query) <= tolerance for row in rows[query][:k]) for query in queries]
-    return sum(right) / len(right)
+    correct = [any(row >= 0 and abs(row - query) <= tolerance for row in rows[query][:k]) for query in queries]
+    return sum(correct) / len(correct)
 
 
 def test_recall_is_of_all_queries(rows):
-    protocol = judge(TRUTH, TOLERANCES)
+    protocol = evaluation_protocol(TRUTH, TOLERANCES)
     assert protocol.names == []
     for k in (1, 2):
         expected = [[recall_of(ranking, range(QUERIES), width, k) for width in TOLERANCES] for ranking in rows[0]]
@@ -38,7 +38,7 @@ def test_recall_is_of_all_queries(rows):
 
 @pytest.mark.parametrize(("split", "numbers"), [("both", [0, 1]), ("first_half", [0]), ("second_half", [1])])
 def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows, split, numbers):
-    protocol, half = judge(TRUTH, TOLERANCES, split), QUERIES // 2
+    protocol, half = evaluation_protocol(TRUTH, TOLERANCES, split), QUERIES // 2
     assert protocol.names == [("first_half", "second_half")[number] for number in numbers]
     blocks = [range(half), range(half, QUERIES)]
     inner = [range(half - 2 * TOLERANCES[-1]), range(half + 2 * TOLERANCES[-1], QUERIES)]
@@ -60,19 +60,19 @@ def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows,
 def test_choosing_sees_no_candidate_of_a_reported_place():
     indices = np.tile(np.arange(-1, QUERIES, dtype=np.int32), (QUERIES, 1))
     shortlist = Shortlist(indices=indices, scores=np.zeros(indices.shape, np.float32), mask=indices >= 0)
-    all_candidates, first, second = judge(TRUTH, TOLERANCES, "both").of(shortlist).views
+    all_candidates, first, second = evaluation_protocol(TRUTH, TOLERANCES, "both").of(shortlist).views
     np.testing.assert_array_equal(all_candidates, indices >= 0)
     np.testing.assert_array_equal(first, (indices >= 0) & (indices < QUERIES // 2 - TOLERANCES[-1]))
     np.testing.assert_array_equal(second, indices >= QUERIES // 2 + TOLERANCES[-1])
 
 
 def test_thresholds_ascend_and_the_middle_one_decides():
-    protocol = judge(TRUTH, [3, 0, 1, 3])
+    protocol = evaluation_protocol(TRUTH, [3, 0, 1, 3])
     assert (protocol.thresholds, protocol.main, protocol.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")
     np.testing.assert_array_equal(protocol.places.dense(), TRUTH.positives(3).dense())
     for thresholds, main in (([1], 0), ([0, 1], 1), ([0, 1, 2, 3], 2)):  # of two in the middle the larger
-        assert (judge(TRUTH, thresholds).main, middle(thresholds)) == (main, thresholds[main])
-    meters = judge(RadiusTruth(np.zeros((2, 2)), np.zeros((2, 2))), [25.0])
+        assert (evaluation_protocol(TRUTH, thresholds).main, middle(thresholds)) == (main, thresholds[main])
+    meters = evaluation_protocol(RadiusTruth(np.zeros((2, 2)), np.zeros((2, 2))), [25.0])
     assert meters.label(1, 25.0) == "R@1 25 m"
 
 
@@ -86,14 +86,19 @@ def test_thresholds_ascend_and_the_middle_one_decides():
 )
 def test_what_cannot_be_judged_is_said_before_anything_is_ranked(thresholds, split, words):
     with pytest.raises(InputError, match=words):
-        judge(TRUTH, thresholds, split)
+        evaluation_protocol(TRUTH, thresholds, split)
 
 
 def test_fingerprints_tell_what_is_right_apart():
     shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
-    protocols = [judge(TRUTH, TOLERANCES), judge(TRUTH, (0, 1, 2)), judge(shifted, TOLERANCES), judge(TRUTH, (1, 3))]
+    protocols = [
+        evaluation_protocol(TRUTH, TOLERANCES),
+        evaluation_protocol(TRUTH, (0, 1, 2)),
+        evaluation_protocol(shifted, TOLERANCES),
+        evaluation_protocol(TRUTH, (1, 3)),
+    ]
     assert len({protocol.fingerprint for protocol in protocols}) == 4
-    assert judge(TRUTH, TOLERANCES, "both").fingerprint == protocols[0].fingerprint
+    assert evaluation_protocol(TRUTH, TOLERANCES, "both").fingerprint == protocols[0].fingerprint
 
 
 @pytest.mark.parametrize("split", [None, "both"])
@@ -102,7 +107,7 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     rng = np.random.default_rng(0)
     north = rng.permutation(40).astype(float)
     positions = np.stack([rng.normal(0, 0.1, 40), 10 * north], axis=1)
-    protocol = judge(RadiusTruth(positions, positions), [12.0], split)
+    protocol = evaluation_protocol(RadiusTruth(positions, positions), [12.0], split)
     rows = np.where(north < 25, np.arange(40), -1).astype(np.int32)[None, None, :, None].repeat(3, axis=0)
     hits = protocol.reported_hits(rows, [0, 0] if split else [0])[0]
     changes = np.flatnonzero(np.diff(hits.astype(int)))

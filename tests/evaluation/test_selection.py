@@ -79,7 +79,7 @@ def test_equals_are_told_apart_by_their_neighbors():
 
 
 def test_a_query_that_is_a_database_image_is_seen_where_it_is_reported():
-    """A place that is passed twice, in one sequence: what may not answer a query still shows its place."""
+    """A place that is passed twice, in one sequence: what may not prediction a query still shows its place."""
     labels = np.r_[np.arange(50), np.arange(50)]
     itself = FrameTruth(tuple((row,) for row in range(100)), 100)
     truth = AllowedTruth(LabelTruth(labels, labels), itself.positives(3))

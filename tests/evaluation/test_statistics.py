@@ -67,10 +67,10 @@ def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth(le
     for hits in paths(0.8, 0.5, 60, count=10, seed=2):
         worth = 60 / design_effect(hits)
         worth *= (stats.t(59).ppf((1 + level) / 2) / stats.t(worth - 1).ppf((1 + level) / 2)) ** 2
-        right, tail = hits.mean() * worth, (1 - level) / 2
+        correct, tail = hits.mean() * worth, (1 - level) / 2
         low, high = recall_interval(hits, level=level)
-        assert stats.beta(right, worth - right + 1).cdf(low) == pytest.approx(tail)
-        assert stats.beta(right + 1, worth - right).sf(high) == pytest.approx(tail)
+        assert stats.beta(correct, worth - correct + 1).cdf(low) == pytest.approx(tail)
+        assert stats.beta(correct + 1, worth - correct).sf(high) == pytest.approx(tail)
 
 
 @pytest.mark.parametrize("recall", [0.5, 0.8, 0.95])

@@ -14,7 +14,7 @@ from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
 from mfvpr.matching import Matching
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.retrieval import Filtered, Retrieval, WhitenedSearch
+from mfvpr.retrieval import Retrieval, RetrievalResult, WhitenedSearch
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
@@ -30,14 +30,16 @@ HISTOGRAM = {"histogram": mfvpr.HistogramOfShifts()}
 
 @dataclass(frozen=True)
 class Fixed:
-    """A filter that gives what it is told to."""
+    """A retriever that gives what it is told to."""
 
     indices: tuple
     scores: float = 0.5
 
     def shortlist(self, sequence, database, num_candidates, cache):
         indices = np.tile(np.array(self.indices, np.int32), (len(sequence.images), 1))
-        return Filtered(Shortlist(indices, np.full(indices.shape, self.scores, np.float32), indices != -1), {}, {})
+        return RetrievalResult(
+            Shortlist(indices, np.full(indices.shape, self.scores, np.float32), indices != -1), {}, {}
+        )
 
 
 @dataclass(frozen=True)
@@ -80,38 +82,40 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"candidates": 0}, r"candidates=0: expected .*'all'"),
         ({"candidates": "some"}, "candidates='some': expected"),
         ({"candidates": 2.5}, "candidates=2.5: expected"),
-        ({"ties": "indx"}, "ties='indx': expected one of filter, index"),
+        ({"ties": "indx"}, "ties='indx': expected one of retriever, index"),
         ({"memory": -1}, "memory=-1: expected GB above 0, or None"),
         ({"memory": np.nan}, "memory=nan: expected GB"),
         ({"fused": {"nope": Fusion()}}, r"fused: .*\(histogram\), got nope"),
-        ({"correlated": {"filter": FRAMES}}, r"correlated: .*\(histogram\), got filter"),
+        ({"correlated": {"retrieval": FRAMES}}, r"correlated: .*\(histogram\), got filter"),
         ({"scorers": HISTOGRAM | {"histogram + frames": mfvpr.MatchCount()}, "correlated": {"histogram": FRAMES}},
          r"histogram \+ frames .*system"),
-        ({"scorers": {"filter": mfvpr.MatchCount()}}, r"filter .*system"),
-        ({"scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
-         r"histogram \+ filter .*system"),
+        ({"scorers": {"retrieval": mfvpr.MatchCount()}}, r"retriever .*system"),
+        ({"scorers": HISTOGRAM | {"histogram + retrieval": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
+         r"histogram \+ retrieval .*system"),
         ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*the class MatchCount"),
         ({"scorers": {"h": 5}}, r"scorers: .*h .*got 5"),
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each pair"),
         ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "scorer: expected real number"),
         ({"matching": Matching(cross_check="x")}, "cross_check='x': expected one of"),
-        ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "filter_score='euclidean': expected one of"),
+        ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "retrieval_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
          r"cosine .*1, got 3"),
         ({"fused": {"histogram": Fusion("auto")}}, "c='auto': expected a number from 0 to .*, 'zscore', or None"),
         ({"fused": {"histogram": Fusion(np.nan)}}, "c=nan: expected a number from 0"),
         ({"fused": {"histogram": Fusion(-1.0)}}, "c=-1.0: expected a number from 0"),
-        ({"fused": {"histogram": Fusion(weights={"filter": 2.0})}}, r"weights: .*c='zscore'.* got c=None"),
+        ({"fused": {"histogram": Fusion(weights={"retrieval": 2.0})}}, r"weights: .*c='zscore'.* got c=None"),
         ({"fused": {"histogram": Fusion("zscore", weights={"anchor": 1})}},
-         r"weights: .*filter .*\(histogram\), got anchor"),
-        *(({"fused": {"histogram": Fusion("zscore", weights={"filter": wrong})}},
-           rf"weights: .*1e-06 .*1e\+12, got filter={wrong!r}")
+         r"weights: .*retrieval .*\(histogram\), got anchor"),
+        *(({"fused": {"histogram": Fusion("zscore", weights={"retrieval": wrong})}},
+           rf"weights: .*1e-06 .*1e\+12, got retrieval={wrong!r}")
           for wrong in (0, -1.0, np.nan, np.inf, "1", None)),
-        ({"fused": {"histogram": Fusion("zscore")}, "scorers": HISTOGRAM | {"histogram + filter": mfvpr.MatchCount()}},
-         r"histogram \+ filter .*system"),
-        ({"fused": {"histogram": Fusion("zscore", weights={"count": 1})}, "correlated": {"histogram + filter": FRAMES},
-          "scorers": HISTOGRAM | {"count": mfvpr.MatchCount()}}, "correlated: expected .* got histogram [+] filter"),
+        ({"fused": {"histogram": Fusion("zscore")},
+          "scorers": HISTOGRAM | {"histogram + retrieval": mfvpr.MatchCount()}},
+         r"histogram \+ retrieval .*system"),
+        ({"fused": {"histogram": Fusion("zscore", weights={"count": 1})},
+          "correlated": {"histogram + retrieval": FRAMES}, "scorers": HISTOGRAM | {"count": mfvpr.MatchCount()}},
+         "correlated: expected .* got histogram [+] retrieval"),
         ({"chosen": Fixed((0, 1, 99))}, r"Fixed: .*0 to 9, got 0 to 99"),
         ({"chosen": Fixed((0, 1, 1))}, r"Fixed: .*got 1 twice .*query 0"),
         ({"chosen": Fixed((0, 1))}, r"Fixed: .*indices .*scores .*mask .*\[10, 3\]"),
@@ -141,9 +145,9 @@ def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
 
 def test_no_scorer_is_the_filter_alone(dataset):
     result = evaluate(dataset, scorers={}, candidates=np.int64(3))
-    assert list(result.systems) == ["filter"]
-    assert repr(result) == "Result(folder: folder (10 queries); filter)"
-    [ranked] = result.systems["filter"]
+    assert list(result.systems) == ["retrieval"]
+    assert repr(result) == "Result(folder: folder (10 queries); retriever)"
+    [ranked] = result.systems["retrieval"]
     np.testing.assert_array_equal(ranked.shortlist.indices, ranked.rows)
 
 
@@ -178,7 +182,7 @@ def test_scores_that_are_nan_are_told(dataset):
     lines.clear()  # of a single candidate every z-score is 0
     options = {"chosen": Fixed((4,)), "candidates": 1, "fused": {"n": Fusion("zscore")}}
     evaluate(dataset, scorers=scorers, cache=FeatureCache(tell=lines.append), **options)
-    assert any("of n + filter are NaN" in line for line in lines)
+    assert any("of n + retrieval are NaN" in line for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def test_all_scores_are_measured_on_the_same_matches(small_street, tmp_path, mon
     assert [table["matches"] for table in tables] == ["grief_season, SIFT", "corridor, SIFT"]
     for table in tables:
         by_score = {row["score"]: row for row in table["rows"]}
-        assert by_score["filter"]["ms_per_query"] is None
+        assert by_score["retrieval"]["ms_per_query"] is None
         assert by_score["count"]["ms_per_query"] > 0
         for row in by_score.values():
             recalls = [row["recall"][str(tolerance)]["recall"] for tolerance in real.TOLERANCES]

@@ -68,7 +68,7 @@ def test_a_small_city_is_measured(tmp_path, monkeypatch, capsys):
     measured = content["found"]
     assert measured["made"] == len(np.unique(candidates)) < 400
     assert measured["rows_read"] == pytest.approx(measured["made"], abs=1)
-    assert measured["recall"]["filter"] == pytest.approx(correct[:, 0].mean())
+    assert measured["recall"]["retrieval"] == pytest.approx(correct[:, 0].mean())
     assert measured["recall"]["shortlist"] == pytest.approx(correct.any(axis=1).mean())
     assert measured["recall"]["re-ranking"] <= measured["recall"]["shortlist"]
     for step in measured["steps"].values():

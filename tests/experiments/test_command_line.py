@@ -93,7 +93,7 @@ def test_version(succeed, program):
     ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
     ("learn", ["fusion.c=zscore"], "fusion.c=auto fusion.weights=null"),
     ("evaluate", ["fusion.c=zscores"], "(at most 1e12), or auto, zscore"),
-    ("evaluate", ["fusion.weights={filter: 2}"], "{'filter': 2}: expected fusion.c=zscore"),
+    ("evaluate", ["fusion.weights={retrieval: 2}"], "{'retrieval': 2}: expected fusion.c=zscore"),
     ("evaluate", ["system=mfvpr", "fusion.c=auto"], "1}: expected fusion.c=zscore"),
     *(
         ("evaluate", ["system=mfvpr", f"fusion.weights.filter={wrong}"], f".filter={wrong}: expected a number")
@@ -117,7 +117,7 @@ def test_version(succeed, program):
     ("evaluate", ["candidates=range(1,3)"], "requires --multirun"),
     ("evaluate", ["candidates=${nope}"], "candidates: Interpolation key 'nope' not found"),
     ("evaluate", ["store=${oc.env:NOPE}"], "store=${oc.env:NOPE}: expected a path"),
-    ("evaluate", ["store='${x}'"], "store: Interpolation key 'x' not found"),
+    ("evaluate", ["cache='${x}'"], "store: Interpolation key 'x' not found"),
     ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
     ("evaluate", ["scorer.histogram.max_bins=100000"], "a whole number from 1 to 1024"),
     ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least retrieval.num_words=64"),

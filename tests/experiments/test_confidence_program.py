@@ -14,7 +14,7 @@ from tests.programs import QUERIES, csv_rows, small
 
 pytestmark = pytest.mark.thorough
 
-SYSTEMS = ("filter", "histogram", "histogram + filter")
+SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
 LINES = ("scorer=histogram", "figures=0")
 LEARNED = Path(mfvpr.__file__).parent / "scoring" / "learned" / "learned_aliked.json"
 
@@ -53,13 +53,13 @@ def content(confidence):
 def test_a_run_says_how_sure_its_answers_are(evaluate):
     out, _, stdout = evaluate("first", "figures=1")
     assert "ECE" not in stdout  # said in files, until it is asked for
-    gains, answers = csv_rows(out / "gains.csv"), csv_rows(out / "answers.csv")
+    gains, predictions = csv_rows(out / "gains.csv"), csv_rows(out / "top_predictions.csv")
     hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
     predictions = [line for line in csv_rows(out / "predictions.csv") if line["rank"] == "1"]
-    assert [(line["query"], line["answer"], line["score"], line["right"]) for line in answers] == [
-        (line["query"], line["database"], line["score"], line["right"]) for line in predictions
+    assert [(line["query"], line["prediction"], line["score"], line["correct"]) for line in predictions] == [
+        (line["query"], line["database"], line["score"], line["correct"]) for line in predictions
     ]
-    probability = np.array([float(line["p"]) for line in answers])
+    probability = np.array([float(line["p"]) for line in predictions])
     assert len(np.unique(probability)) > QUERIES / 2
     table = {line["system"]: line for line in csv_rows(out / "confidence.csv")}
     assert tuple(table) == SYSTEMS
@@ -78,7 +78,7 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
     average_precision = precision_recall(probability, hits["histogram"]).average_precision
     assert table["histogram"]["AP by p"] == f"{100 * average_precision:.1f}"
     shares = csv_rows(out / "rerank_share.csv")
-    for line, system in ((shares[0], "filter"), (shares[-1], "histogram")):
+    for line, system in ((shares[0], "retrieval"), (shares[-1], "histogram")):
         assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
     for name in ("precision_recall", "reliability", "rerank_share"):
         picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
@@ -89,33 +89,35 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
 def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     systems, origin = read_confidences(confidence)
     assert tuple(systems) == SYSTEMS
-    assert (origin["queries"], origin["right_within"]) == (QUERIES, [1, "frames"])
+    assert (origin["queries"], origin["correct_within"]) == (QUERIES, [1, "frames"])
     assert origin["ground_truth"]["thresholds"] == [0, 1]
     threshold = (f"confidence={confidence}", "threshold=0.4")
     out, stderr, stdout = evaluate("second", *threshold)
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
-    assert header.endswith("right  wrong  refused  of these right")
-    answers = csv_rows(out / "answers.csv")
-    probability, score = (np.array([float(line[name]) for line in answers]) for name in ("p", "score"))
+    assert header.endswith("correct  incorrect  refused  of these correct")
+    predictions = csv_rows(out / "top_predictions.csv")
+    probability, score = (np.array([float(line[name]) for line in predictions]) for name in ("p", "score"))
     refused = probability < 0.4
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
-    assert [line["answer"] == "no place" for line in answers] == refused.tolist()
-    assert [line["reason"] for line in answers] == np.where(refused, "low confidence", "").tolist()
-    assert {line["in_database"] for line in answers} == {"1"}
-    right = np.array([line["histogram"] == "1" for line in csv_rows(out / "gains.csv")])
-    assert [line["right"] for line in answers] == right.astype(int).astype(str).tolist()
+    assert [line["prediction"] == "no place" for line in predictions] == refused.tolist()
+    assert [line["reason"] for line in predictions] == np.where(refused, "low confidence", "").tolist()
+    assert {line["in_database"] for line in predictions} == {"1"}
+    correct = np.array([line["histogram"] == "1" for line in csv_rows(out / "gains.csv")])
+    assert [line["correct"] for line in predictions] == correct.astype(int).astype(str).tolist()
     line = next(line for line in csv_rows(out / "confidence.csv") if line["system"] == "histogram")
-    counts = [int(line[name]) for name in ("right", "wrong", "refused", "of these right")]
-    assert counts == [(right & ~refused).sum(), (~right & ~refused).sum(), refused.sum(), (right & refused).sum()]
-    assert line["ECE of p"] == f"{100 * reliability(probability, right).calibration_error:.1f}"
+    counts = [int(line[name]) for name in ("correct", "incorrect", "refused", "of these correct")]
+    assert counts == [(correct & ~refused).sum(), (~correct & ~refused).sum(), refused.sum(), (correct & refused).sum()]
+    assert line["ECE of p"] == f"{100 * reliability(probability, correct).calibration_error:.1f}"
     predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
-    assert [line["query"] for line in none] == [line["query"] for line in answers if line["answer"] == "no place"]
-    assert [(line["rank"], line["score"], line["right"]) for line in none] == [
-        ("1", line["score"], line["right"]) for line in answers if line["answer"] == "no place"
+    assert [line["query"] for line in none] == [
+        line["query"] for line in predictions if line["prediction"] == "no place"
+    ]
+    assert [(line["rank"], line["score"], line["correct"]) for line in none] == [
+        ("1", line["score"], line["correct"]) for line in predictions if line["prediction"] == "no place"
     ]
     every = csv_rows(out / "predictions" / "histogram.csv")
     refusing = {line["query"] for line in none}
@@ -123,22 +125,24 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
         line for line in every if line["query"] not in refusing
     ]
     unknown, *_ = evaluate("third", *threshold, "dataset.ground_truth=none", "dataset.index_file=null")
-    assert [{**line, "right": "", "in_database": ""} for line in answers] == csv_rows(unknown / "answers.csv")
+    assert [{**line, "correct": "", "in_database": ""} for line in predictions] == csv_rows(
+        unknown / "top_predictions.csv"
+    )
     assert not (unknown / "confidence.csv").exists()
 
 
 def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confidence, root, tmp_path):
-    """Ground truth without the first query's place: it is a negative, and its refusal is right."""
+    """Ground truth without the first query's place: it is a negative, and its refusal is correct."""
     index = next(setting for setting in small(root) if setting.startswith("dataset.index_file=")).partition("=")[2]
     header, line, *lines = Path(index).read_text().splitlines()
     (tmp_path / "index.csv").write_text("\n".join([header, f"{line.partition(',')[0]},", *lines]))
     index = f"dataset.index_file={tmp_path}/index.csv"
     out, *_ = evaluate("second", f"confidence={confidence}", "threshold=1", index)
-    answers = csv_rows(out / "answers.csv")
-    assert {line["answer"] for line in answers} == {"no place"}
-    assert [line["in_database"] for line in answers] == ["0"] + ["1"] * (QUERIES - 1)
+    predictions = csv_rows(out / "top_predictions.csv")
+    assert {line["prediction"] for line in predictions} == {"no place"}
+    assert [line["in_database"] for line in predictions] == ["0"] + ["1"] * (QUERIES - 1)
     hits = [str(int(line["histogram"] == "1")) for line in csv_rows(out / "gains.csv")]
-    assert [line["right"] for line in answers] == hits
+    assert [line["correct"] for line in predictions] == hits
     assert hits[0] == "0"
     last = [line for line in csv_rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
     assert float(last["recall"]) == pytest.approx(hits.count("1") / (QUERIES - 1))
@@ -157,7 +161,7 @@ def test_what_cannot_say_how_sure_answers_are_is_refused(refused, settings, word
 def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
     del content["systems"]["histogram"]
     (tmp_path / "other.json").write_text(json.dumps(content))
-    assert "got filter, histogram + filter; " in refused(f"confidence={tmp_path}/other.json")
+    assert "got filter, histogram + retrieval; " in refused(f"confidence={tmp_path}/other.json")
 
 
 @pytest.mark.slow
@@ -231,4 +235,4 @@ def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_pa
     content["systems"]["histogram"]["weights"] = [0.0, 0.0]
     (tmp_path / "flat.json").write_text(json.dumps(content))
     _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json")
-    assert "flat.json cannot tell right answers from wrong ones" in stderr
+    assert "flat.json cannot tell correct predictions from incorrect ones" in stderr

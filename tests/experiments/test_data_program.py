@@ -56,7 +56,7 @@ def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n3,1\n")
     stdout, stderr = program("check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png", code=2)
     assert ["database", "4", "85", "0"] in [line.split() for line in stdout.splitlines()]
-    assert "berlin_a100: right images of a query (±5): 4 to 4, median 4; 0 queries have none" in stdout
+    assert "berlin_a100: correct images of a query (±5): 4 to 4, median 4; 0 queries have none" in stdout
     assert "2 queries are images of the database" in stdout
     assert "4 database images where 85 are published" in stderr
     with Image.open(tmp_path / "sheet.png") as sheet:

@@ -17,7 +17,7 @@ from tests.programs import composed, csv_rows, folder, matches_path
 pytestmark = pytest.mark.thorough
 
 QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
-         "scorer=sum", "candidates=4", "store=null")  # fmt: skip
+         "scorer=sum", "candidates=4", "cache=null")  # fmt: skip
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_nothing_right_is_told_beforehand(small_street, run):
 
 
 def test_matches_are_kept_apart_by_what_is_left_out(small_street, tmp_path):
-    store = f"store={tmp_path}"
+    store = f"cache={tmp_path}"
     paths = {
         matches_path(composed(*same(small_street, "dataset.ground_truth=order", "candidates=4", store, *more)))[0]
         for more in ([], ["dataset.exclude_neighbors=0"], ["dataset.exclude_neighbors=1"])
@@ -95,8 +95,8 @@ def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
     rows, printed, place = run(*folder(small_street)[:3], "dataset.ground_truth=label", *files)
     assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1,R@5,R@10"
     assert all("tolerance" not in row and "radius" not in row for row in rows)
-    right = [int(query[:4]) // 5 == int(names[0][:4]) // 5 for query, names in ranked(place).items()]
-    assert recall(rows)["sum"] == np.mean(right)
+    correct = [int(query[:4]) // 5 == int(names[0][:4]) // 5 for query, names in ranked(place).items()]
+    assert recall(rows)["sum"] == np.mean(correct)
     assert "recall in %" in printed.out
     assert "±" not in printed.out
 
@@ -125,7 +125,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
         Image.fromarray(gray).save(plain / path.name)
         Image.fromarray(gray.astype(np.uint16) * 257).save(deep / path.name)
 
-    store = f"store={tmp_path}/store"
+    store = f"cache={tmp_path}/store"
     common = ("dataset=folder", "dataset.ground_truth=order", store)
     usual = run(*common, f"dataset.database={small_street}/database", f"dataset.queries={plain}", name="usual")
     other = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", name="other")
@@ -148,7 +148,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
 
 
 def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path):
-    settings = composed(*folder(small_street, f"store={tmp_path}/store"))
+    settings = composed(*folder(small_street, f"cache={tmp_path}/store"))
     first, second = (stages.begun(settings, stages.Stopwatch())[1] for _ in range(2))
     assert first.fingerprints == second.fingerprints
     assert first.reading == second.reading

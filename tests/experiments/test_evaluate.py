@@ -159,13 +159,13 @@ def test_demo_ranks_histogram_above_count_above_filter(demo):
     for tolerance in (1, 2, 5):
         assert recall["histogram", tolerance] > recall["count", tolerance]
     for tolerance in (1, 2):  # within 5 frames the filter alone finds as many
-        assert recall["count", tolerance] > recall["filter", tolerance]
+        assert recall["count", tolerance] > recall["retrieval", tolerance]
 
 
 @pytest.mark.slow
 def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     done, folder = demo
-    systems = ["filter", *PAPER, "histogram_ratio", "histogram + filter"]
+    systems = ["retrieval", *PAPER, "histogram_ratio", "histogram + retrieval"]
     header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
     assert [line[:20].strip() for line in lines] == systems
     assert header.split("  ")[0] == "system"
@@ -177,7 +177,13 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
     assert files <= {path.name for path in folder.iterdir()}
     figures = [*(folder / "figures").iterdir()]
-    assert {path.stem.split("_")[0] for path in figures} == {"right", "wrong", "precision", "reliability", "rerank"}
+    assert {path.stem.split("_")[0] for path in figures} == {
+        "correct",
+        "incorrect",
+        "precision",
+        "reliability",
+        "rerank",
+    }
     for path in figures:
         image = np.asarray(Image.open(path).convert("L"))
         assert image.shape[0] > 300
@@ -195,7 +201,7 @@ def test_results_say_what_made_them(demo):
     for row in rows:
         assert set(row["recall_at"]) == {"1", "5", "10"}
         assert (row["queries"], row["database"], row["candidates"]) == (100, 100, 50)
-        assert {"data", "features", "filter", "matching", "scores"} <= set(row["seconds"])
+        assert {"data", "features", "retrieval", "matching", "scores"} <= set(row["seconds"])
         assert {"mfvpr", "jax", "numpy"} <= set(row["versions"])
         assert set(map(len, row["data_fingerprint"].values())) == {16}
     histogram = next(row for row in rows if row["system"] == "histogram")

@@ -8,8 +8,8 @@ import pytest
 from experiments import axes, build, evaluation, settings
 from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, small
 
-FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={filter: 0.5, anchor: 1}")
-SYSTEM = "histogram + anchor + filter"
+FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
+SYSTEM = "histogram + anchor + retrieval"
 
 
 def ranked(out, name):
@@ -25,7 +25,7 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *FUSED, *more))
     rows = json.loads((out / "results.json").read_text())
     rows_by_system = {row["system"]: row for row in rows if row["tolerance"] == 1}
-    assert [*rows_by_system] == ["filter", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
+    assert [*rows_by_system] == ["retrieval", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
     assert [row["scorer"] for row in rows_by_system.values()] == [
         "none", "anchor", "histogram", "histogram + anchor", "histogram + anchor",
     ]  # fmt: skip
@@ -33,10 +33,10 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert parameters["anchor"]["weight"] == parameters["histogram"]["weight"] == "ratio"
     assert parameters[SYSTEM] == {
         "histogram": parameters["histogram"], "anchor": parameters["anchor"],
-        "c": "zscore", "filter_score": "cosine", "weights": {"filter": 0.5, "anchor": 1},
+        "c": "zscore", "retrieval_score": "cosine", "weights": {"retrieval": 0.5, "anchor": 1},
     }  # fmt: skip
     assert parameters[f"{SYSTEM} + frames"] == parameters[SYSTEM] | {"previous": 1, "reach": 15.0, "gain": 0.4}
-    decided = out / "predictions" / "histogram_anchor_filter.csv"
+    decided = out / "predictions" / "histogram_anchor_retrieval.csv"
     assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
     scores = [score for _, _, score in ranked(out, "histogram_anchor_filter")]
     for query in range(QUERIES):  # standardized: their mean is 0
@@ -51,9 +51,13 @@ def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
     for c in ("auto", "zscore"):
         more = ("scorer=histogram", f"fusion.c={c}", "figures=0", f"out={tmp_path}/{c}")
         evaluation.evaluate(composed(*small(root), *more))
-        places[c] = ranked(tmp_path / c, "histogram_filter")
+        places[c] = ranked(tmp_path / c, "histogram_retrieval")
         row = json.loads((tmp_path / c / "results.json").read_text())[-1]
-        assert (row["system"], row["parameters"]["c"], row["parameters"]["weights"]) == ("histogram + filter", c, None)
+        assert (row["system"], row["parameters"]["c"], row["parameters"]["weights"]) == (
+            "histogram + retrieval",
+            c,
+            None,
+        )
     assert [line[:2] for line in places["auto"]] == [line[:2] for line in places["zscore"]]
 
 
@@ -65,9 +69,9 @@ def test_our_system_fuses_two_scores_and_the_filter():
         settings.check(config)
         assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
         fusion = build.fusion(config)
-        assert (fusion.c, fusion.weights) == ("zscore", {"filter": weight, "anchor": 1})
+        assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": weight, "anchor": 1})
         assert fusion.system("histogram") == SYSTEM
-        assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + filter"
+        assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + retrieval"
     alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
     config = composed("system=mfvpr", *alone, config="sweep")
     settings.check(config)
@@ -75,18 +79,18 @@ def test_our_system_fuses_two_scores_and_the_filter():
 
 
 def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):
-    more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={filter: 0.5, histogram: 2}", "cohort=1", "figures=0")
+    more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, histogram: 2}", "cohort=1", "figures=0")
     evaluation.evaluate(composed(*small(root), *more, f"out={tmp_path}/out"))
     rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
-    name = "histogram + cohort + filter"
-    assert [*rows][-2:] == ["histogram + filter", name]
+    name = "histogram + cohort + retrieval"
+    assert [*rows][-2:] == ["histogram + retrieval", name]
     assert rows[name]["parameters"]["cohort"] == 1
-    filter_scores, cohort_scores, fused = (
+    retrieval_scores, cohort_scores, fused = (
         {line[:2]: line[2] for line in ranked(tmp_path / "out", system)}
-        for system in ("filter", "histogram_cohort", "histogram_cohort_filter")
+        for system in ("retrieval", "histogram_cohort", "histogram_cohort_filter")
     )
     for query in {query for query, _ in fused}:
         pairs = [pair for pair in fused if pair[0] == query]
-        scores = [np.array([part[pair] for pair in pairs]) for part in (filter_scores, cohort_scores)]
+        scores = [np.array([part[pair] for pair in pairs]) for part in (retrieval_scores, cohort_scores)]
         filtered, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
         np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * normalized, atol=1e-2)

@@ -63,12 +63,12 @@ def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
 
 @pytest.mark.slow
 def test_shards_are_one_command_line(tmp_path, succeed):
-    settings = [setting for setting in small(tmp_path) if "store=" not in setting] + ["figures=0"]
-    succeed("evaluate", *settings, f"store={tmp_path}/other", f"out={tmp_path}/plain")
+    settings = [setting for setting in small(tmp_path) if "cache=" not in setting] + ["figures=0"]
+    succeed("evaluate", *settings, f"cache={tmp_path}/other", f"out={tmp_path}/plain")
     launcher = ("-m", "launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/jobs")
     for _ in range(2):
-        done = run(*settings, *launcher, "shard=0/2,1/2", f"store={tmp_path}/store")
+        done = run(*settings, *launcher, "shard=0/2,1/2", f"cache={tmp_path}/store")
         assert done.returncode == 0, done.stderr
     assert done.stdout.count("are done; when all shards are") == 2
-    succeed("evaluate", *settings, f"store={tmp_path}/store", f"out={tmp_path}/out")
+    succeed("evaluate", *settings, f"cache={tmp_path}/store", f"out={tmp_path}/out")
     assert tables(tmp_path / "out") == tables(tmp_path / "plain")

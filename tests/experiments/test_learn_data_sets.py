@@ -46,7 +46,7 @@ def test_the_reported_set_is_reported_as_it_is_alone(root, streets, learned, tmp
     evaluation.evaluate(settings | {"dataset": alone})
     rows = {row["score"]: row for row in content["rows"]}
     expected = json.loads((tmp_path / "alone" / "results.json").read_text())
-    for system, name in (("sum", "paper"), ("sum + filter", "paper + filter")):
+    for system, name in (("sum", "paper"), ("sum + retrieval", "paper + retrieval")):
         for row in (row for row in expected if row["system"] == system):
             recall = rows[name]["by_set"]["street2"][str(row["tolerance"])]
             assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
 ROWS = [name + filtered for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
-        for filtered in ("", " + filter")]  # fmt: skip
+        for filtered in ("", " + retrieval")]  # fmt: skip
 WIDEST = 1  # frames
 
 
@@ -118,7 +118,7 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
 
     monkeypatch.setattr(TrainingSplit, "batch", watched)
     content = learn(
-        tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.filter_score=negative_euclidean"
+        tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.retrieval_score=negative_euclidean"
     )
     reported = dict(zip(("first_half", "second_half"), content["queries"]["reported"], strict=True))
     assert sorted(query for half in reported.values() for query in half) == list(range(QUERIES))
@@ -142,7 +142,7 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
     rows = rows_of(learn(tmp_path / "out", *SUM, *changes, "steps=1"))
     evaluation.evaluate(composed(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
     expected = json.loads((tmp_path / "evaluated" / "results.json").read_text())
-    names = {"sum": "paper", "sum + filter": "paper + filter"}
+    names = {"sum": "paper", "sum + retrieval": "paper + retrieval"}
     for row in expected:
         if row["system"] in names:
             recall = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
@@ -151,7 +151,7 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
 
 def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
     """Match weights, which look at the ratio, are begun as well. A store rounds its matches: settings may tie."""
-    rows = rows_of(learn(tmp_path / "out", *SHORT, "store=null"))
+    rows = rows_of(learn(tmp_path / "out", *SHORT, "cache=null"))
     assert list(rows) == ROWS
     for name in ROWS[:2]:
         assert rows[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"], name
@@ -163,7 +163,7 @@ def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp
 def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
     extra = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
     rows = rows_of(learn(tmp_path / "out", *SUM, *extra, *axes, "split=first_half", "steps=1"))
-    for filtered in ("", " + filter"):
+    for filtered in ("", " + retrieval"):
         searched, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
         assert searched["recall_at_1"] == expected["recall_at_1"]
         assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
@@ -223,7 +223,7 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
     shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
     changes = [
         "seed=0", "seed=1", "hidden=4", "inputs=absolute", "batch=3", "learning_rate=0.5", "loss=recall",
-        "candidates=7", "every=1", "fusion.filter_score=negative_euclidean", f"dataset.index_file={shifted}",
+        "candidates=7", "every=1", "fusion.retrieval_score=negative_euclidean", f"dataset.index_file={shifted}",
     ]  # fmt: skip
     for change in changes:
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
@@ -280,7 +280,7 @@ def test_too_few_queries_are_refused(root, tmp_path, refuse):
 
 def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):
     content = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
-    names = ["as set", "as set + filter", "1 - ratio", "1 - ratio + filter"]
+    names = ["as set", "as set + retrieval", "1 - ratio", "1 - ratio + retrieval"]
     assert [row["score"] for row in content["rows"]][:4] == names
     assert content["rows"][0]["recall_at_1"] == content["rows"][2]["recall_at_1"]
     assert "against as set" in (tmp_path / "out" / "table.md").read_text()

@@ -77,7 +77,7 @@ def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, 
 
 @pytest.mark.slow
 def test_jobs_in_several_processes(root, tmp_path):
-    jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"store={tmp_path}/store", SIGMA)
+    jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"cache={tmp_path}/store", SIGMA)
     done = run("-m", *small(root), *jobs, program="sweep", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("results: runs/folder/") == 2

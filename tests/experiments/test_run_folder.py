@@ -33,7 +33,7 @@ from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
 pytestmark = pytest.mark.thorough
 
 LINES = ("scorer=histogram", "figures=4")
-SYSTEMS = ("filter", "histogram", "histogram + filter")
+SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
 
 
 @pytest.fixture(scope="session")
@@ -55,35 +55,35 @@ def test_predictions_are_long_and_agree_with_the_recall(evaluated):
     entries = json.loads((evaluated / "results.json").read_text())
     for system in SYSTEMS:
         lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
-        assert list(lines[0]) == ["query", "rank", "database", "score", "right"]
+        assert list(lines[0]) == ["query", "rank", "database", "score", "correct"]
         assert [int(line["rank"]) for line in lines] == QUERIES * [*range(1, CANDIDATES + 1)]
         scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
         assert np.all(np.diff(scores) <= 0)
-        right = np.array([int(line["right"]) for line in lines]).reshape(QUERIES, -1)
+        correct = np.array([int(line["correct"]) for line in lines]).reshape(QUERIES, -1)
         recall = next(row["recall_at"] for row in entries if row["system"] == system and row["tolerance"] == 1)
-        assert right[:, 0].mean() == pytest.approx(recall["1"], abs=1e-6)
-        assert right[:, :5].any(axis=1).mean() == pytest.approx(recall["5"], abs=1e-6)
+        assert correct[:, 0].mean() == pytest.approx(recall["1"], abs=1e-6)
+        assert correct[:, :5].any(axis=1).mean() == pytest.approx(recall["5"], abs=1e-6)
     assert (evaluated / "predictions.csv").read_bytes() == (evaluated / "predictions" / "histogram.csv").read_bytes()
 
 
-@pytest.mark.parametrize("system", ["filter", "histogram", "histogram_filter"])
+@pytest.mark.parametrize("system", ["retrieval", "histogram", "histogram_retrieval"])
 def test_failures_are_the_wrong_first_answers(evaluated, system):
     ranked = {}
     for line in csv_rows(evaluated / "predictions" / f"{system}.csv"):
         ranked.setdefault(line["query"], []).append(line)
-    wrong = {query: lines for query, lines in ranked.items() if lines[0]["right"] == "0"}
+    incorrect = {query: lines for query, lines in ranked.items() if lines[0]["correct"] == "0"}
     failures = csv_rows(evaluated / "failures" / f"{system}.csv")
-    assert [line["query"] for line in failures] == list(wrong)
+    assert [line["query"] for line in failures] == list(incorrect)
     assert 0 < len(failures) < QUERIES
-    assert {bool(line["rank"]) for line in failures} == {True, False} or system != "filter"
+    assert {bool(line["rank"]) for line in failures} == {True, False} or system != "retrieval"
     for line in failures:
-        lines = wrong[line["query"]]
-        assert line["answer"] == lines[0]["database"]
-        first = next((line for line in lines if line["right"] == "1"), None)
+        lines = incorrect[line["query"]]
+        assert line["prediction"] == lines[0]["database"]
+        first = next((line for line in lines if line["correct"] == "1"), None)
         if first is None:
-            assert [line[name] for name in ("rank", "right_answer", "score", "margin")] == [""] * 4
+            assert [line[name] for name in ("rank", "correct_image", "score", "margin")] == [""] * 4
         else:
-            assert (line["rank"], line["right_answer"], line["score"]) == (
+            assert (line["rank"], line["correct_image"], line["score"]) == (
                 first["rank"], first["database"], first["score"])  # fmt: skip
             margin = float(lines[0]["score"]) - float(first["score"])
             assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
@@ -95,9 +95,9 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
     for system in SYSTEMS:
         lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         for line in gains:
-            right = [entry["rank"] for entry in lines if entry["query"] == line["query"] and entry["right"] == "1"]
-            assert line[f"{system} rank"] == (right[0] if right else "")
-            assert line[system] == str(int(right[:1] == ["1"]))
+            correct = [entry["rank"] for entry in lines if entry["query"] == line["query"] and entry["correct"] == "1"]
+            assert line[f"{system} rank"] == (correct[0] if correct else "")
+            assert line[system] == str(int(correct[:1] == ["1"]))
         hits[system] = np.array([line[system] == "1" for line in gains])
     assert {line["histogram rank"] for line in gains} > {"", "1"}
     for line, pair in zip(csv_rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
@@ -107,8 +107,8 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
         assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
         assert float(line["blocks_p"]) == pytest.approx(block_sign_flips(first, second).p_value, rel=1e-6)
     header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
-    assert header == "| only this is right, not | filter | histogram | histogram + filter |"
-    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['filter']).sum()} (p ")
+    assert header == "| only this is correct, not | filter | histogram | histogram + retrieval |"
+    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['retrieval']).sum()} (p ")
 
 
 def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys):
@@ -117,7 +117,7 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys)
     assert "no ground truth: rankings only" in capsys.readouterr().out
     entries = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [(row["system"], row["recall_at"]) for row in entries] == [(system, {}) for system in SYSTEMS]
-    assert {line["right"] for line in csv_rows(tmp_path / "out" / "predictions.csv")} == {""}
+    assert {line["correct"] for line in csv_rows(tmp_path / "out" / "predictions.csv")} == {""}
     files = {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == files
     assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
@@ -161,63 +161,63 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
 def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     heights = {path.name: len(read_image(path)) for path in (evaluated / "figures").glob("*_0*.png")}
     assert len(heights) == 4
-    assert min(height for name, height in heights.items() if name.startswith("wrong")) > 700
-    assert max(height for name, height in heights.items() if name.startswith("right")) < 600
+    assert min(height for name, height in heights.items() if name.startswith("incorrect")) > 700
+    assert max(height for name, height in heights.items() if name.startswith("correct")) < 600
 
     page = page_of(outcome)
-    [ranked], right = outcome.judged.result.systems["histogram"], outcome.judged.is_right("histogram", 0)
-    query_by_case = {bool(right[query].any()): query for query in np.flatnonzero(~right[:, 0])}
+    [ranked], correct = outcome.evaluation.result.systems["histogram"], outcome.evaluation.is_correct("histogram", 0)
+    query_by_case = {bool(correct[query].any()): query for query in np.flatnonzero(~correct[:, 0])}
     names = outcome.images.dataset.database.names
     query = query_by_case[True]
-    rank = int(np.argmax(right[query]))
-    [answer] = page.correct_candidates(query)
+    rank = int(np.argmax(correct[query]))
+    [prediction] = page.correct_candidates(query)
     score = f"{ranked.scores[query, rank]:.5g}"
-    assert answer.caption == f"right: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
-    assert float(answer.explanation.score) == pytest.approx(float(score), rel=1e-3)
-    [answer] = page.correct_candidates(query_by_case[False])
+    assert prediction.caption == f"correct: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
+    assert float(prediction.explanation.score) == pytest.approx(float(score), rel=1e-3)
+    [prediction] = page.correct_candidates(query_by_case[False])
     place = outcome.images.dataset.truth.place(query_by_case[False])
-    assert answer.caption == f"right: {names[place]}, not among the 3 candidates"
-    assert answer.matches is None
+    assert prediction.caption == f"correct: {names[place]}, not among the 3 candidates"
+    assert prediction.matches is None
 
 
 def page_of(outcome, **changes):
-    result = outcome.judged.result
+    result = outcome.evaluation.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
-    judged = replace(outcome.judged, result=replace(result, dataset=dataset))
-    return SequenceFigures(judged, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
+    evaluation = replace(outcome.evaluation, result=replace(result, dataset=dataset))
+    return SequenceFigures(evaluation, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
     """If the nearest image is excluded, the page shows another correct image, or none."""
-    right = outcome.judged.is_right("histogram", 0)
-    query = int(np.flatnonzero(~right.any(axis=1))[0])
+    correct = outcome.evaluation.is_correct("histogram", 0)
+    query = int(np.flatnonzero(~correct.any(axis=1))[0])
     names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
     excluded = np.zeros((len(outcome.images.dataset.queries), len(names)), bool)
     excluded[query, truth.place(query)] = True
 
-    def answers(excluded):
+    def predictions(excluded):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
-        return [answer.caption for answer in page.correct_candidates(query)]
+        return [prediction.caption for prediction in page.correct_candidates(query)]
 
-    other = int(np.argmax(outcome.judged.positives[0].dense()[query] & ~excluded[query]))
-    assert answers(excluded) == [f"right: {names[other]}, not among the 3 candidates"]
-    assert answers(np.ones_like(excluded)) == []
+    other = int(np.argmax(outcome.evaluation.positives[0].dense()[query] & ~excluded[query]))
+    assert predictions(excluded) == [f"correct: {names[other]}, not among the 3 candidates"]
+    assert predictions(np.ones_like(excluded)) == []
 
 
 def test_figures_of_chosen_queries(outcome):
     query_rows, dataset = evaluation.query_rows, outcome.images.dataset
     assert query_rows([5, "0002.png", 5], dataset) == [5, 2]
     assert query_rows(7, dataset) == 7
-    for wrong in (24, -1, "nope.png"):
+    for incorrect in (24, -1, "nope.png"):
         with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
-            query_rows([0, wrong], dataset)
+            query_rows([0, incorrect], dataset)
     assert list(page_of(outcome).verdicts([5, 2])) == [5, 2]
 
 
 def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
     page = replace(page_of(outcome), refused=np.arange(24) == 5)
-    assert "no place" in page.title(5, "right")
-    assert "no place" not in page.title(2, "right")
+    assert "no place" in page.title(5, "correct")
+    assert "no place" not in page.title(2, "correct")
 
 
 # --- the claim ---------------------------------------------------------------------------------------------------
@@ -291,7 +291,7 @@ def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
     assert list(tmp_path.rglob("*-*")) == []
 
 
-# --- what goes wrong at the end ----------------------------------------------------------------------------------
+# --- what goes incorrect at the end ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -316,7 +316,7 @@ def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, limited):
     limited(2000)
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 2
-    assert "\nhistogram + filter " in stdout
+    assert "\nhistogram + retrieval " in stdout
     last = stderr.splitlines()[-1]
     assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large); they are printed")
     assert "with out=DIR" in last
@@ -348,7 +348,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     )
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
-    assert "\nhistogram + filter " in stdout
+    assert "\nhistogram + retrieval " in stdout
     assert stderr.splitlines()[-1].startswith("interrupted")
     names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names

@@ -18,27 +18,27 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    return (*(setting for setting in small(tmp_path_factory.mktemp("data")) if "store=" not in setting), "figures=0")
+    return (*(setting for setting in small(tmp_path_factory.mktemp("data")) if "cache=" not in setting), "figures=0")
 
 
 @pytest.fixture(scope="module")
 def plain(settings, tmp_path_factory):
     place = tmp_path_factory.mktemp("plain")
-    assert run(*settings, f"store={place}/store", f"out={place}/out").returncode == 0
+    assert run(*settings, f"cache={place}/store", f"out={place}/out").returncode == 0
     return place / "out"
 
 
 @pytest.fixture
 def evaluate(monkeypatch, capsys, settings, tmp_path):
     def start(*more):
-        return typed(monkeypatch, capsys, "evaluate", *settings, f"store={tmp_path}/store", *more)
+        return typed(monkeypatch, capsys, "evaluate", *settings, f"cache={tmp_path}/store", *more)
 
     return start
 
 
 def tables(place):
     """Every file of results, without times and folders."""
-    names = ("predictions", "table", "gains", "failures", "answers", "shifts", "confidence", "differences")
+    names = ("predictions", "table", "gains", "failures", "predictions", "shifts", "confidence", "differences")
     return {name: (place / f"{name}.csv").read_bytes() for name in names}
 
 
@@ -78,7 +78,7 @@ def test_a_plain_run_computes_the_parts_of_missing_shards(evaluate, plain, tmp_p
         (("shard=2/2",), "shard=2/2: expected i/n with i from 0"),
         (("shard=1",), "shard=1: expected i/n"),
         (("shard=a/b",), "shard=a/b: expected i/n"),
-        (("shard=0/2", "store=null"), "shard=0/2: expected store=DIR as well"),
+        (("shard=0/2", "cache=null"), "shard=0/2: expected store=DIR as well"),
         (("shard=0/2", "wait=5"), "wait: unknown setting"),
     ],
 )
@@ -103,7 +103,7 @@ def test_killed_shards_go_on(settings, plain, tmp_path):
     """Shards are killed at many moments, side by side."""
 
     def start(shard):
-        command = [sys.executable, "-m", "experiments.evaluate", *settings, f"store={tmp_path}/store", f"shard={shard}"]
+        command = [sys.executable, "-m", "experiments.evaluate", *settings, f"cache={tmp_path}/store", f"shard={shard}"]
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
     delays, shards = iter([3, 5, 7, 4]), ["0/2", "1/2"]
@@ -115,5 +115,5 @@ def test_killed_shards_go_on(settings, plain, tmp_path):
                 task.send_signal(signal.SIGKILL)
         lines = {shard: task.communicate()[0] for shard, task in tasks.items()}
         shards = [shard for shard in shards if "are done" not in lines[shard]]
-    assert run(*settings, f"store={tmp_path}/store", f"out={tmp_path}/out").returncode == 0
+    assert run(*settings, f"cache={tmp_path}/store", f"out={tmp_path}/out").returncode == 0
     assert tables(tmp_path / "out") == tables(plain)

@@ -66,7 +66,7 @@ def evaluated(root, out, *overrides):
 def test_a_sweep_is_one_evaluation_per_setting(root, swept, tmp_path, sigma, weight):
     changes = (f"scorer.sigma={sigma}", f"scorer.weight={weight}", "fusion.c=2")
     _, expected = evaluated(root, tmp_path / "out", "scorer=histogram", *changes)
-    for system, c in (("histogram", 0), ("histogram + filter", 2)):
+    for system, c in (("histogram", 0), ("histogram + retrieval", 2)):
         for tolerance, recall in recall_of(swept[1], sigma=sigma, weight=weight, c=c).items():
             assert recall == pytest.approx(expected[system, tolerance], abs=1e-6)
 
@@ -174,7 +174,7 @@ def test_chunks_change_nothing(sweep, swept, tmp_path):
 
 def test_without_a_store(root, sweep, tmp_path):
     """Nor with many ties, by another rule: most pairs have no matches."""
-    common = ("store=null", "matching.max_distance=0.3", "ties=index")
+    common = ("cache=null", "matching.max_distance=0.3", "ties=index")
     _, expected = evaluated(root, tmp_path / "evaluated", "scorer=histogram", "scorer.sigma=10", *common)
     content = sweep(tmp_path / "swept", "grid.sigma=[10]", *common)
     for tolerance, recall in recall_of(content, sigma=10).items():
@@ -291,12 +291,12 @@ def test_matches_of_something_else_are_refused(root, swept, tmp_path, call, chan
     def place(*changes):
         return matches_path(composed(*small(root), *changes, config="sweep"))[0]
 
-    matching_place, foreign = place(f"store={tmp_path}/store"), place(change)
+    matching_place, foreign = place(f"cache={tmp_path}/store"), place(change)
     with match_store.open_match_store(matching_place, {"other": 1}, num_queries=24, num_candidates=8):
         pass
     matching_place.parent.joinpath(foreign.name).symlink_to(matching_place)
     before = snapshot(tmp_path)
-    folders = (f"store={tmp_path}/store", f"out={tmp_path}/out")
+    folders = (f"cache={tmp_path}/store", f"out={tmp_path}/out")
     code, stdout, stderr = call("sweep", *small(root), change, SIGMA, *folders)
     assert (code, stdout, stderr.count("\n")) == (2, "", 1)
     assert "these matches were made with" in stderr

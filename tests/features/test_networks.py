@@ -42,17 +42,17 @@ def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate,
     assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first
     assert "as the paper stores them" in first
     rows = read_rows(tmp_path / "first")
-    assert list(dict.fromkeys(row["system"] for row in rows)) == ["filter", "histogram", "histogram + filter"]
+    assert list(dict.fromkeys(row["system"] for row in rows)) == ["retrieval", "histogram", "histogram + retrieval"]
     assert rows[0]["features"]["weights"] == "d2_tf"
     assert rows[-1]["parameters"]["c"] == 1e6
     predictions = [(tmp_path / "first" / name).read_text()
-                   for name in ("predictions.csv", "predictions/histogram_filter.csv")]  # fmt: skip
+                   for name in ("predictions.csv", "predictions/histogram_retrieval.csv")]  # fmt: skip
     assert predictions[0] == predictions[1]
 
     again = evaluate("system=mix_hist_comb_10", *SMALL, out="again")
     assert "matches: all 10 queries from" in again
     assert "images to do" not in again
-    for name in ("filter", "histogram", "histogram_filter"):
+    for name in ("retrieval", "histogram", "histogram_retrieval"):
         earlier, later = (tmp_path / out / "predictions" / f"{name}.csv" for out in ("first", "again"))
         assert earlier.read_text() == later.read_text()
 
@@ -66,14 +66,14 @@ def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, tmp_path):
     assert "SsmWindows: whitening of 30 dimensions: " in stderr
     rows = read_rows(tmp_path / "out")
     parameters = {row["system"]: row["parameters"] for row in rows}
-    assert list(parameters) == ["filter", "grid", "grid + filter", "grid + frames"]
+    assert list(parameters) == ["retrieval", "grid", "grid + retrieval", "grid + frames"]
     assert parameters["grid + frames"] == parameters["grid"] | {"previous": 2, "reach": 15.0, "gain": 0.4}
     assert rows[-1]["scorer"] == "grid"
 
 
 @pytest.mark.skipif(not random_checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 @pytest.mark.parametrize(
-    ("name", "decides"), [("mix_hist_aliked_50", "histogram"), ("mfvpr", "histogram + anchor + filter")]
+    ("name", "decides"), [("mix_hist_aliked_50", "histogram"), ("mfvpr", "histogram + anchor + retrieval")]
 )
 def test_aliked_recognizes_the_street(evaluate, tmp_path, name, decides):
     evaluate(f"system={name}", *SMALL, "features.image_size=[320,320]")
@@ -128,7 +128,7 @@ def test_mistakes_are_one_line(evaluate, arguments, words, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    (("candidates=10", f"store={ROOT}/README.md"), "README.md"),
+    (("candidates=10", f"cache={ROOT}/README.md"), "README.md"),
     pytest.param(("candidates=10", "matching=lightglue"), "got Sift of 128; ", marks=needs_lightglue),
     (("features=d2net", "features.multiscale=true", "features.image_size=[16,100]"), "got 16 x 100"),
     (("retrieval=netvlad", "retrieval.weights=mixvpr_512"), "=mixvpr_512: expected weights of netvlad: one of"),

@@ -196,7 +196,7 @@ def test_its_configurations_run_by_name(program, system, scorer):
     rows = read_rows(out)
     assert [row["system"] for row in rows if row["decides"]] == [scorer] * 3
     assert rows[0]["features"]["patch_sizes"] == ([2, 5, 8] if "performance" in system else [5])
-    assert rows[0]["filter"]["name"] == "same"
+    assert rows[0]["retrieval"]["name"] == "same"
 
 
 @pytest.mark.slow

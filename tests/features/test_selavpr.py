@@ -55,7 +55,7 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
     program("evaluate", f"system={system}", "features.image_size=[56,42]", "candidates=6")
     rows = read_rows(tmp_path / "out")
     assert [row["system"] for row in rows if row["decides"]] == ["count"] * 3
-    assert (rows[0]["filter"]["name"], rows[0]["candidates"]) == ("same", 6)
+    assert (rows[0]["retrieval"]["name"], rows[0]["candidates"]) == ("same", 6)
     assert {row["parameters"]["single"] for row in rows if row["system"] == "count"} == {"zero"}
 
 
@@ -85,7 +85,7 @@ def test_dinov2_is_a_filter(program, tmp_path, pooling):
     options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
     small = "features.max_keypoints=50", "candidates=5", "figures=0"
     program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
-    assert {row["filter"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
+    assert {row["retrieval"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
     stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2", code=2)
     assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
 

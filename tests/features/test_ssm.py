@@ -33,7 +33,7 @@ from tests.matching.arrays import make_shortlist
 pytestmark = pytest.mark.thorough
 
 SMALL = (48, 40)  # px: 4 x 3 cells
-FILTER = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)))
+RETRIEVAL = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)))
 CANDIDATE = Matching(cross_check="candidate")
 
 
@@ -291,7 +291,7 @@ def test_candidates_without_cells_score_zero():
 def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
     of_cells = fit_to_database(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, FeatureCache())
     assert isinstance(of_cells.describer.extractor.whitening, Whitening)
-    assert fit_to_database(FILTER, dataset.database, FeatureCache()) is FILTER
+    assert fit_to_database(RETRIEVAL, dataset.database, FeatureCache()) is RETRIEVAL
 
 
 # The whole way
@@ -301,14 +301,14 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     labels, database = [], small_street / "database"
     several = sequences_dataset(database, [small_street / "queries", database], ground_truth="none")
     options = {"candidates": 3, "matching": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
-    report = mfvpr.evaluate(several, cells, FILTER, {"count": mfvpr.MatchCount()}, **options)
+    report = mfvpr.evaluate(several, cells, RETRIEVAL, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = report.matched
     assert (first.matches[0].counts == 12).all()
     np.testing.assert_array_equal(report.systems["count"][1].scores, np.full((10, 3), 12))
     assert second.matches[0].counts.shape == (10, 3)
     with pytest.raises(InputError, match=r"^grid: .*NaN"):  # of 4 x 3 cells
-        mfvpr.evaluate(several, cells, FILTER, {"grid": GridAnchors(3)}, **options)
+        mfvpr.evaluate(several, cells, RETRIEVAL, {"grid": GridAnchors(3)}, **options)
 
 
 @pytest.mark.slow
@@ -317,11 +317,11 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
     self_dataset = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
     options = {"matching": CANDIDATE, "cache": FeatureCache(tmp_path)}
-    report = mfvpr.evaluate(self_dataset, square, FILTER, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
+    report = mfvpr.evaluate(self_dataset, square, RETRIEVAL, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
     [ranked] = report.systems["grid"]
     np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
     np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
-    recipes = [matches_recipe(self_dataset, self_dataset.only, square, FILTER, 4, CANDIDATE, FeatureCache(tmp_path))]
+    recipes = [matches_recipe(self_dataset, self_dataset.only, square, RETRIEVAL, 4, CANDIDATE, FeatureCache(tmp_path))]
     recipes.append(recipes[0] | {"database": FeatureCache().recipe(self_dataset.database, square)})
     assert "whitening" in difference(*recipes)
 
@@ -334,5 +334,5 @@ def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset,
     [candidates] = filter.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
     assert len(kept(tmp_path)) == 1
-    matched = match_sequence(replace(dataset, database=few), sequence, FILTER.describer.extractor, filter, 3)
+    matched = match_sequence(replace(dataset, database=few), sequence, RETRIEVAL.describer.extractor, filter, 3)
     np.testing.assert_array_equal(matched.candidates.scores.sum(1), [36 * 3])

@@ -1,4 +1,4 @@
-"""A map: the answers of an evaluation, whole rows only, and no place without evidence."""
+"""A map: the predictions of an evaluation, whole rows only, and no place without evidence."""
 
 import os
 import re
@@ -57,8 +57,8 @@ def opened(folder, **options):
     return Map(folder, SIFT, VLAD, **{"candidates": 5} | options)
 
 
-def rows_of(answer):
-    return [alternative.row for alternative in answer.alternatives]
+def rows_of(prediction):
+    return [alternative.row for alternative in prediction.alternatives]
 
 
 def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_path):
@@ -70,59 +70,59 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
     for name, scorer in systems.items():
         [ranked], known = result.systems[name], opened(folder, scorer=scorer)
         for query, path in enumerate(dataset.queries.paths):
-            answer = known.localize(path)
-            assert rows_of(answer) == ranked.rows[query].tolist()
-            scores = [alternative.score for alternative in answer.alternatives]
+            prediction = known.localize(path)
+            assert rows_of(prediction) == ranked.rows[query].tolist()
+            scores = [alternative.score for alternative in prediction.alternatives]
             np.testing.assert_allclose(scores, ranked.scores[query], rtol=1e-5)
-            assert (answer.place, answer.score) == (ranked.rows[query, 0], scores[0])
+            assert (prediction.place, prediction.score) == (ranked.rows[query, 0], scores[0])
 
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
-    answers = []
+    predictions = []
     monkeypatch.setattr(map_matching, "_AT_ONCE", 2)  # of five candidates
     for cores in (1, 2, 3, 7):
         monkeypatch.setattr(map_matching, "available_cpus", lambda cores=cores: cores)
-        answers.append([opened(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
-    assert answers[1:] == answers[:1] * 3
+        predictions.append([opened(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
+    assert predictions[1:] == predictions[:1] * 3
 
 
 def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
-    answer = opened(folder).localize(dataset.database.read(3))
-    assert (answer.place, answer.alternatives[0].name) == (3, dataset.database.names[3])
-    np.testing.assert_allclose(answer.shift, 0, atol=0.5)
-    (low_x, low_y), (high_x, high_y) = answer.shift_interval
-    assert low_x <= answer.shift[0] <= high_x
-    assert low_y <= answer.shift[1] <= high_y
-    assert answer.scale == 1
-    assert not answer.is_refused
-    assert len(answer.as_json(2)["alternatives"]) == 2
+    prediction = opened(folder).localize(dataset.database.read(3))
+    assert (prediction.place, prediction.alternatives[0].name) == (3, dataset.database.names[3])
+    np.testing.assert_allclose(prediction.shift, 0, atol=0.5)
+    (low_x, low_y), (high_x, high_y) = prediction.shift_interval
+    assert low_x <= prediction.shift[0] <= high_x
+    assert low_y <= prediction.shift[1] <= high_y
+    assert prediction.scale == 1
+    assert not prediction.is_refused
+    assert len(prediction.as_json(2)["alternatives"]) == 2
 
 
 def test_a_question_keeps_what_it_was_answered_with(dataset, folder):
     known = opened(folder)
     for path in dataset.queries.paths[:3]:
-        answer, (features, vector), matches = known.ask(path)
-        assert answer == known.localize(path)
-        assert known.scorer(matches) == pytest.approx(answer.score, rel=1e-5)
-        best = answer.alternatives[0]
+        prediction, (features, vector), matches = known.localize_with_evidence(path)
+        assert prediction == known.localize(path)
+        assert known.scorer(matches) == pytest.approx(prediction.score, rel=1e-5)
+        best = prediction.alternatives[0]
         assert (known.row(best.name), known.place(best.row)) == (best.row, best.place)
         keypoints = {tuple(point) for point in features.keypoints.tolist()}
         assert {tuple(point) for point in matches.points0[matches.mask].tolist()} <= keypoints
         assert vector @ vector == pytest.approx(1, rel=1e-5)
-        np.testing.assert_allclose(explain(known.scorer, matches).peak, answer.shift, atol=1e-4)
+        np.testing.assert_allclose(explain(known.scorer, matches).peak, prediction.shift, atol=1e-4)
     assert known.row("no such") is None
     assert known.there.tolist() == [True] * len(dataset.database)
 
 
 def test_the_newest_rows_can_be_left_out(dataset, folder):
     known, last, image = opened(folder), len(dataset.database) - 1, dataset.database.paths[7]
-    answer, _, matches = known.ask(image, recent=2, before=6)
-    assert sorted(rows_of(answer)) == [0, 1, 2, 3]
+    prediction, _, matches = known.localize_with_evidence(image, recent=2, before=6)
+    assert sorted(rows_of(prediction)) == [0, 1, 2, 3]
     assert matches.mask.any()
-    assert known.ask(image, recent=np.int64(2), before=np.uint8(6)).answer == answer
-    answer, _, matches = known.ask(image, recent=2, before=2)
-    assert (answer.place, answer.alternatives, matches) == (None, (), None)
-    assert (answer.reason, answer.is_refused) == ("no candidates", False)
+    assert known.localize_with_evidence(image, recent=np.int64(2), before=np.uint8(6)).prediction == prediction
+    prediction, _, matches = known.localize_with_evidence(image, recent=2, before=2)
+    assert (prediction.place, prediction.alternatives, matches) == (None, (), None)
+    assert (prediction.reason, prediction.is_refused) == ("no candidates", False)
     assert max(rows_of(known.localize(dataset.database.paths[last], recent=3))) == last - 3
     assert known.localize(dataset.database.paths[last], recent=last + 1).alternatives == ()
 
@@ -139,16 +139,16 @@ def test_nothing_is_compiled_after_the_first_query(dataset, folder, compilations
 def test_unsure_answers_are_no_place(dataset, folder):
     image = dataset.queries.paths[0]
     sure = opened(folder, confidence=SURE).localize(image)
-    assert 0.5 < sure.p_right <= 1
+    assert 0.5 < sure.confidence <= 1
     assert sure.place is not None
     assert sure.reason is None
     refused = opened(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
     assert refused.place is None
     assert refused.is_refused
-    assert refused.p_right < 1e-9
+    assert refused.confidence < 1e-9
     assert (refused.reason, refused.shift, refused.shift_interval, refused.scale) == ("low confidence", *[None] * 3)
     assert refused.alternatives == sure.alternatives
-    assert opened(folder, confidence=SURE, threshold=sure.p_right).localize(image).place == sure.place
+    assert opened(folder, confidence=SURE, threshold=sure.confidence).localize(image).place == sure.place
     with pytest.raises(InputError, match="expected a confidence as well"):
         opened(folder, threshold=0.5)
 
@@ -339,9 +339,9 @@ def test_nothing_is_written_of_an_entry_that_is_refused(dataset, tmp_path, name,
 
 def test_of_a_score_that_is_not_finite_nothing_is_sure(dataset, folder):
     known = opened(folder, scorer=lambda matches: np.nan * matches.distance.sum(), confidence=SURE, threshold=0.5)
-    answer = known.localize(dataset.queries.paths[0])
-    assert (answer.place, answer.p_right, answer.as_json()["score"]) == (None, None, None)
-    assert answer.is_refused
+    prediction = known.localize(dataset.queries.paths[0])
+    assert (prediction.place, prediction.confidence, prediction.as_json()["score"]) == (None, None, None)
+    assert prediction.is_refused
 
 
 def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
@@ -357,7 +357,8 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
 @pytest.mark.parametrize("number", [-1, 1.5, "2", np.arange(4).reshape(2, 2), np.int64(-3)], ids=repr)
 def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
     known, image = opened(folder), dataset.database.paths[7]
-    for ask in (lambda: known.ask(image, recent=number), lambda: known.ask(image, before=number),
+    for ask in (lambda: known.localize_with_evidence(image, recent=number),
+                lambda: known.localize_with_evidence(image, before=number),
                 lambda: known.localize(image, recent=number), lambda: opened(folder, candidates=number)):  # fmt: skip
         with pytest.raises(InputError, match=r"^(recent|before|candidates): expected a whole number [^\n]+$"):
             ask()
@@ -396,19 +397,27 @@ def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
         image += rng.integers(0, 5, image.shape, np.uint8)
     if kind == "lens cap":  # with a little light at its rim
         image[:, :40] = np.arange(40, 0, -1)[:, None]
-    answer, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).ask(image)
-    assert (answer.place, answer.alternatives, answer.shift, answer.p_right) == (None, (), None, None)
-    assert (answer.reason, answer.is_refused, matches) == ("too few features", True, None)
-    assert "reason='too few features'" in repr(answer)
-    assert answer.as_json()["reason"] == "too few features"
+    prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
+    assert (prediction.place, prediction.alternatives, prediction.shift, prediction.confidence) == (
+        None,
+        (),
+        None,
+        None,
+    )
+    assert (prediction.reason, prediction.is_refused, matches) == ("too few features", True, None)
+    assert "reason='too few features'" in repr(prediction)
+    assert prediction.as_json()["reason"] == "too few features"
 
 
 def test_strong_features_with_few_matches_have_no_place(folder):
     image = np.zeros((120, 160, 3), np.uint8)
     image[40:60, 70:95] = 255
-    answer, (features, _), matches = opened(folder, confidence=SURE).ask(image)
+    prediction, (features, _), matches = opened(folder, confidence=SURE).localize_with_evidence(image)
     assert 0 < len(features.scores) < LEAST_MATCHES
-    assert (answer.reason, answer.place, answer.shift, answer.p_right, matches) == ("too few matches", *[None] * 4)
+    assert (prediction.reason, prediction.place, prediction.shift, prediction.confidence, matches) == (
+        "too few matches",
+        *[None] * 4,
+    )
 
 
 def test_the_strength_of_a_map_is_of_a_few_of_its_rows():

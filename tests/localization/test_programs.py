@@ -27,12 +27,12 @@ pytestmark = pytest.mark.thorough
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
 NAMES = [f"{row:04d}.png" for row in range(10)]
-WAIT = "10 images in the map; the first answer takes seconds more: programs compile\n"
+WAIT = "10 images in the map; the top prediction takes seconds more: programs compile\n"
 
 
 @pytest.fixture
 def call_program(monkeypatch, capsys):
-    """Runs a program: output and errors, without the line that says why the first answer takes long."""
+    """Runs a program: output and errors, without the line that says why the top prediction takes long."""
 
     def call(program, *arguments, code=0):
         exit_code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
@@ -94,7 +94,7 @@ def test_images_of_a_folder_are_localized(folder, small_street, monkeypatch, cap
     lines = [json.loads(line) for line in stdout.splitlines()]
     assert values_of("place", lines) == NAMES
     assert {len(line["alternatives"]) for line in lines} == {2}
-    assert all(line["p_right"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in lines)
+    assert all(line["confidence"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in lines)
 
 
 def test_images_of_the_map_are_not_added_again(folder, small_street, call_program, build_map):
@@ -358,7 +358,7 @@ def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path,
         origin = {"settings": same | {"scorer": build.describe_settings(settings["scorer"])}, "candidates": candidates}
         write_confidences(tmp_path / "c.json", {"histogram": SURE}, origin)
         [line], stderr = localize(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
-        assert 0 <= line["p_right"] <= 1
+        assert 0 <= line["confidence"] <= 1
         assert ("other settings of candidates" in stderr) == (candidates != settings["candidates"])
 
 

@@ -5,24 +5,24 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.localization import Alternative, Answer, Drive, Route, route
+from mfvpr.localization import Alternative, Drive, Prediction, Route, route
 from mfvpr.localization.route import motion, shares, step
 from mfvpr.utils import InputError
 
 
-def answer(scores, p=None):
-    """An answer with scores by row."""
+def prediction(scores, p=None):
+    """A prediction with scores by row."""
     alternatives = tuple(Alternative(row, str(row), row, score) for row, score in scores.items())
-    return Answer(None, alternatives, 0.0, p, None, None, None)
+    return Prediction(None, alternatives, 0.0, p, None, None, None)
 
 
 def sharp(row, p=1.0):
-    """An answer that is sure of one row."""
-    return answer({row: 3.0}, p)
+    """A prediction that is sure of one row."""
+    return prediction({row: 3.0}, p)
 
 
 def stepped_by_loops(belief, there, advance, spread, kidnapped, scores, p, sharpness):
-    """`step` of an answer, written from the module's first lines."""
+    """`step` of a prediction, written from the module's first lines."""
     size = len(belief)
     rows = [row for row in range(size) if there[row]]
     before, moves = [0.0] * size, {}
@@ -55,7 +55,7 @@ def test_it_is_the_filter_that_its_first_lines_state():
         scores = dict(zip(rows, rng.exponential(size=8).tolist(), strict=True))
         p = None if turn % 3 else float(rng.uniform())
         belief = stepped_by_loops(belief, there, 1.3, 0.8, 0.05, scores, 0.4 if p is None else p, 3.0)
-        row, near = drive_route(answer(scores, p), there)
+        row, near = drive_route(prediction(scores, p), there)
         assert row == np.argmax(belief)
         assert near == pytest.approx(sum(belief[max(0, row - 2) : row + 3]), rel=1e-4)
         np.testing.assert_allclose(drive_route.belief[:40], belief, rtol=1e-3, atol=1e-7)
@@ -103,7 +103,14 @@ def test_it_finds_a_robot_that_was_carried_away():
 
 def test_a_sum_of_one_and_never_nan():
     there, drive_route = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
-    for says in (sharp(3), sharp(20), None, answer({4: math.nan}, 1.0), answer({4: math.inf, 5: 1.0}, 1.0), sharp(0)):
+    for says in (
+        sharp(3),
+        sharp(20),
+        None,
+        prediction({4: math.nan}, 1.0),
+        prediction({4: math.inf, 5: 1.0}, 1.0),
+        sharp(0),
+    ):
         located = drive_route(says, there)
         assert drive_route.belief.sum() == pytest.approx(1, abs=1e-5)
         assert 0 <= located.p <= 1
@@ -148,9 +155,9 @@ def test_motions_are_probabilities():
         assert weights @ steps == pytest.approx(advance, abs=0.01 + (0.5 if spread < 0.1 else 0) * (advance % 1 > 0))
 
 
-@pytest.mark.parametrize("wrong", [
-    {"advance": math.nan}, {"spread": 0}, {"sharpness": math.inf}, {"kidnapped": 1.1}, {"p_right": -0.1},
+@pytest.mark.parametrize("incorrect", [
+    {"advance": math.nan}, {"spread": 0}, {"sharpness": math.inf}, {"kidnapped": 1.1}, {"confidence": -0.1},
 ])  # fmt: skip
-def test_drives_that_cannot_be(wrong):
+def test_drives_that_cannot_be(incorrect):
     with pytest.raises(InputError, match=r"Drive\("):
-        Drive(**wrong)
+        Drive(**incorrect)

@@ -102,8 +102,8 @@ def test_the_vocabulary_is_learned_from_the_features_that_are_added(images, tmp_
         assert maps[-1].build(images) == len(images)
         assert len(extractor.calls) == len(images)
         assert not (tmp_path / name / "learning").exists()
-    answers = [[known.localize(path) for path in images.paths] for known in maps]
-    assert answers[0] == answers[1]
+    predictions = [[known.localize(path) for path in images.paths] for known in maps]
+    assert predictions[0] == predictions[1]
     assert maps[0].names == maps[1].names
 
 

@@ -8,7 +8,7 @@ from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import line_chart
 
-SYSTEMS = ["filter", *(f"histogram + anchor + cohort + filter {number}" for number in range(10))]
+SYSTEMS = ["retrieval", *(f"histogram + anchor + cohort + retrieval {number}" for number in range(10))]
 P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
 
 
@@ -22,8 +22,8 @@ def query():
 
 
 def draw(path, query, name, **options):
-    answer = figures.Candidate(query, f"wrong: {name}, rank 1")
-    figures.histogram_figure(path, query, [answer], title=f"histogram: {name} -> {name}", **options)
+    prediction = figures.Candidate(query, f"incorrect: {name}, rank 1")
+    figures.histogram_figure(path, query, [prediction], title=f"histogram: {name} -> {name}", **options)
     return pixels(path)
 
 

@@ -15,8 +15,8 @@ HOSTILE = (
     ("name", "file"),
     [
         ("histogram", "histogram"),
-        ("histogram + anchor + filter", "histogram_anchor_filter"),
-        ("homography_24 + filter", "homography_24_filter"),
+        ("histogram + anchor + retrieval", "histogram_anchor_filter"),
+        ("homography_24 + retrieval", "homography_24_filter"),
         ("my score (v2), straße=1", "my score (v2), straße=1"),
     ],
 )

@@ -97,7 +97,7 @@ def test_names_are_nothing_but_text(page, several):
         assert len(parsed.of("img")) == len(parsed.of("figcaption"))
         assert not re.search(r"[<>&]", parsed.scripts[0])
     labels = [trace["name"] for trace in several.charts["depths"]["data"]]
-    assert labels == ["filter", "histogram", "&lt;script&gt;alert(2)&lt;/script&gt;"]  # plotly reads some HTML
+    assert labels == ["retrieval", "histogram", "&lt;script&gt;alert(2)&lt;/script&gt;"]  # plotly reads some HTML
 
 
 def test_nothing_comes_from_elsewhere(page):
@@ -144,21 +144,21 @@ def test_sequences_have_bars_and_rows_of_their_own(several):
         assert trace["x"] == [10.0 * RANKS[name].count(1)] * 3
     rows = several.rows[1 : 1 + 4 * len(SYSTEMS)]
     assert [row[1] for row in rows] == [*TWO, "mean", "pooled"] * len(SYSTEMS)
-    hits = np.repeat(np.array(RANKS["filter"]) == 1, 2)  # two drives, in the order of the one map
+    hits = np.repeat(np.array(RANKS["retrieval"]) == 1, 2)  # two drives, in the order of the one map
     low, high = recall_interval(hits)
     assert [row[-1] for row in rows[2:4]] == ["", f"[{100 * low:.1f}, {100 * high:.1f}]"]
 
 
 def test_answers_are_pictures_and_rows(page, several, run):
     images = page.of("img")
-    assert [image["alt"].split()[0] for image in images] == ["right", "wrong"]
+    assert [image["alt"].split()[0] for image in images] == ["correct", "incorrect"]
     assert text_on_page(HOSTILE[6]) in images[1]["alt"]
     for image in images:
         assert (image["width"], image["height"]) == ("1000", "231")
         assert base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))[:3] == b"\xff\xd8\xff"
     rows = [row for row in page.rows if len(row) == 6 and row[0] in SYSTEMS]
-    assert [row[0] for row in rows] == [HEADLINE] * 10 + ["filter"] * 10 + [SYSTEMS[2]] * 10
-    expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-4]), "13", "wrong", "2"]
+    assert [row[0] for row in rows] == [HEADLINE] * 10 + ["retrieval"] * 10 + [SYSTEMS[2]] * 10
+    expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-4]), "13", "incorrect", "2"]
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
@@ -177,7 +177,7 @@ def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, m
 
 
 def test_too_many_answers_are_left_to_the_files(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(one_run, "MOST_ANSWERS", 7)
+    monkeypatch.setattr(one_run, "MOST_PREDICTIONS", 7)
     text = write_report(run, tmp_path / "page.html").read_text("utf-8")
     assert "The first 7; 23 more are in the run" in text
 

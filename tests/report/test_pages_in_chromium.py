@@ -65,7 +65,7 @@ def tab(browser, pages):
     assert said == []
 
 
-def cells(page, column, table="First answers"):
+def cells(page, column, table="Top predictions"):
     """Texts of the visible cells of a table's column."""
     rows = page.locator(f"[aria-label='{table}'] tbody tr:visible td:nth-child({column})")
     return rows.all_text_contents()
@@ -93,16 +93,16 @@ def test_pages_and_their_charts_fit(tab, tmp_path, name, width):
 
 def test_tables_are_sorted_by_click_and_by_key(tab):
     page = tab.page("one")
-    scores, header = cells(page, 4), page.locator("[aria-label='First answers'] th").nth(3)
+    scores, header = cells(page, 4), page.locator("[aria-label='Top predictions'] th").nth(3)
     assert [float(score) for score in scores] == [*range(10, 20)]
     page.get_by_role("button", name="score", exact=True).click()
     assert (header.get_attribute("aria-sort"), cells(page, 4)) == ("ascending", scores)
     page.get_by_role("button", name="score", exact=True).press("Enter")
     assert (header.get_attribute("aria-sort"), cells(page, 4)) == ("descending", scores[::-1])
-    page.get_by_role("button", name="first right rank").press("Space")
+    page.get_by_role("button", name="first correct rank").press("Space")
     assert header.get_attribute("aria-sort") is None
     assert cells(page, 6) == ["1"] * 8 + ["2", ""]  # numbers, and what is empty behind them
-    page.get_by_role("button", name="first right rank").click()
+    page.get_by_role("button", name="first correct rank").click()
     assert cells(page, 6) == ["2"] + ["1"] * 8 + [""]
     page.get_by_role("button", name="McNemar p").click()
     assert cells(page, 5, "Every two systems") == ["1e-09", "0.06"]
@@ -111,16 +111,16 @@ def test_tables_are_sorted_by_click_and_by_key(tab):
 def test_answers_are_filtered_by_click_and_by_key(tab):
     page = tab.page("two")
     counts = page.locator("#shown")
-    assert counts.text_content() == "4 of 4 pictures, 20 of 60 answers"
-    page.get_by_role("combobox", name="Outcome").select_option("wrong")
-    assert counts.text_content() == "2 of 4 pictures, 4 of 60 answers"
-    assert {*cells(page, 6)} == {"wrong"}
+    assert counts.text_content() == "4 of 4 pictures, 20 of 60 predictions"
+    page.get_by_role("combobox", name="Outcome").select_option("incorrect")
+    assert counts.text_content() == "2 of 4 pictures, 4 of 60 predictions"
+    assert {*cells(page, 6)} == {"incorrect"}
     page.get_by_role("combobox", name="Sequence").select_option("day")
-    assert counts.text_content() == "1 of 4 pictures, 2 of 60 answers"
+    assert counts.text_content() == "1 of 4 pictures, 2 of 60 predictions"
     page.get_by_role("combobox", name="System").focus()
     page.keyboard.press("Home")
     num_wrong = sum(10 - ranks.count(1) for ranks in RANKS.values())
-    assert counts.text_content() == f"1 of 4 pictures, {num_wrong} of 60 answers"
+    assert counts.text_content() == f"1 of 4 pictures, {num_wrong} of 60 predictions"
     page.get_by_role("combobox", name="System").select_option(SYSTEMS[0])
     assert page.locator(".picture:visible").count() == 0
     assert {*cells(page, 1)} == {SYSTEMS[0]}

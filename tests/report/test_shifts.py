@@ -40,7 +40,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     for line in reversed(lines_of(tmp_path / "out" / "predictions.csv")):
         first[line["query"]] = line
     assert list(lines[0]) == list(HEADER)
-    assert [(line["query"], line["answer"]) for line in lines] == [
+    assert [(line["query"], line["prediction"]) for line in lines] == [
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
     tools, images = stages.begun(settings, Stopwatch())
@@ -50,7 +50,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     )
     names = images.dataset.database.names
     for row, line in enumerate(lines):
-        place = list(candidates.indices[row]).index(names.index(line["answer"]))
+        place = list(candidates.indices[row]).index(names.index(line["prediction"]))
         pair = jax.tree.map(lambda leaf: leaf[place], matches[row])  # noqa: B023
         numbers = [float(line[name]) for name in HEADER[2:]]
         fitted = scorer.with_capacity(pair.image_size0, pair.image_size1)
@@ -93,10 +93,10 @@ def test_refused_answers_have_no_shift(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
     confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
     evaluation.evaluate(composed(*small(root), *STEERING, *confidence))
-    answers = {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "answers.csv")}
-    places = {query: answer for query, answer in answers.items() if answer != "no place"}
-    assert 0 < len(places) < len(answers)
-    assert {line["query"]: line["answer"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == places
+    predictions = {line["query"]: line["prediction"] for line in lines_of(tmp_path / "out" / "top_predictions.csv")}
+    places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
+    assert 0 < len(places) < len(predictions)
+    assert {line["query"]: line["prediction"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == places
 
 
 def test_only_a_histogram_has_one(root, tmp_path):

@@ -142,8 +142,8 @@ def evaluation(dataset, cache_folder):
 
 def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, cache_folder, evaluation):
     result, *_ = evaluation
-    more = ["histogram + cohort", "count + cohort", "histogram + cohort + filter", "count + cohort + frames"]
-    assert [*result.systems] == ["filter", "histogram", "count", *more]
+    more = ["histogram + cohort", "count + cohort", "histogram + cohort + retrieval", "count + cohort + frames"]
+    assert [*result.systems] == ["retrieval", "histogram", "count", *more]
     without = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(cache_folder))
     for name, [ranked] in without.systems.items():
         np.testing.assert_array_equal(result.systems[name][0].rows, ranked.rows)
@@ -193,23 +193,23 @@ def test_a_run_names_its_cohort(root, tmp_path, monkeypatch, capsys):
                                  "cohort=3", f"out={tmp_path}/out")  # fmt: skip
     assert code == 0, stderr
     assert f"cohort matches: {QUERIES} of {QUERIES} queries to match" in stderr
-    assert "histogram + cohort + filter" in stdout
+    assert "histogram + cohort + retrieval" in stdout
     rows = json.loads((tmp_path / "out" / "results.json").read_text())
     parameters = {row["system"]: row["parameters"] for row in rows}
-    assert [*parameters] == ["filter", "histogram", "histogram + cohort", "histogram + filter",
-                             "histogram + cohort + filter"]  # fmt: skip
-    assert not any("cohort" in parameters[name] for name in ("filter", "histogram", "histogram + filter"))
+    assert [*parameters] == ["retrieval", "histogram", "histogram + cohort", "histogram + retrieval",
+                             "histogram + cohort + retrieval"]  # fmt: skip
+    assert not any("cohort" in parameters[name] for name in ("retrieval", "histogram", "histogram + retrieval"))
     assert parameters["histogram + cohort"] == parameters["histogram"] | {"cohort": 3}
-    assert parameters["histogram + cohort + filter"] == parameters["histogram + filter"] | {"cohort": 3}
+    assert parameters["histogram + cohort + retrieval"] == parameters["histogram + retrieval"] | {"cohort": 3}
     assert {row["scorer"] for row in rows} == {"none", "histogram"}
-    assert (tmp_path / "out" / "predictions" / "histogram_cohort_filter.csv").exists()
+    assert (tmp_path / "out" / "predictions" / "histogram_cohort_retrieval.csv").exists()
     assert json.loads((tmp_path / "out" / "run.json").read_text())["settings"]["cohort"] == 3
     assert composed()["cohort"] is None
 
 
 def test_a_list_of_pairs_must_be_of_database_images_as_well(small_street, tmp_path, monkeypatch, capsys):
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *folder(small_street), "retrieval=pairs", "cohort=2",
-                            "retrieval.queries=pairs.txt", "store=null", f"out={tmp_path}/out")  # fmt: skip
+                            "retrieval.queries=pairs.txt", "cache=null", f"out={tmp_path}/out")  # fmt: skip
     assert code == 2
     assert f"{small_street}/database: expected" in stderr
     assert f"one of: {small_street}/queries;" in stderr

@@ -63,6 +63,6 @@ def test_nan_stays_nan_and_is_no_place():
 
 
 def test_numbers_without_meaning_raise():
-    for wrong in ((0,), (1, 0.0), (1, 1.0, -0.1), (1, np.nan), (1, np.inf), (1, 1.0, np.inf)):
+    for incorrect in ((0,), (1, 0.0), (1, 1.0, -0.1), (1, np.nan), (1, np.inf), (1, 1.0, np.inf)):
         with pytest.raises(InputError, match="expected at least one query"):
-            FrameCorrelation(*wrong)
+            FrameCorrelation(*incorrect)

@@ -19,7 +19,7 @@ from tests.reranking.conftest import SCORERS, SIFT, VLAD
 
 pytestmark = pytest.mark.thorough
 
-BOTH = Fusion("zscore", weights={"filter": 0.5, "count": 2.0})
+BOTH = Fusion("zscore", weights={"retrieval": 0.5, "count": 2.0})
 
 
 def random_scores(num_queries=6, num_candidates=9):
@@ -45,7 +45,7 @@ def assert_fused(fused, candidates, parts, weights):
 
 def test_standardized_scores_are_summed():
     candidates, scores = random_scores()
-    fused = Fusion("zscore", weights={"filter": 0.5, "a": 3.0, "b": 0.25})("a", candidates, scores)
+    fused = Fusion("zscore", weights={"retrieval": 0.5, "a": 3.0, "b": 0.25})("a", candidates, scores)
     assert fused.dtype == np.float32
     assert_fused(fused, candidates, [candidates.scores, scores["a"], scores["b"]], [0.5, 3.0, 0.25])
     fused = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # the filter counts 1
@@ -99,7 +99,12 @@ def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
 
 @pytest.mark.parametrize(
     ("names", "system"),
-    [("", "a + filter"), ("filter a", "a + filter"), ("b filter", "a + b + filter"), ("c a b", "a + c + b + filter")],
+    [
+        ("", "a + retrieval"),
+        ("filter a", "a + retrieval"),
+        ("b filter", "a + b + retrieval"),
+        ("c a b", "a + c + b + retrieval"),
+    ],
 )
 def test_a_system_is_called_by_what_takes_part(names, system):
     assert Fusion("zscore", weights=dict.fromkeys(names.split(), 2.0)).system("a") == system
@@ -112,35 +117,35 @@ def sequence_matches(dataset):
 
 def rank_by(matched, fused, correlated):
     return rank_sequence(
-        matched, stages.score(SCORERS, matched.by_scale, matched.candidates), fused, correlated, "filter"
+        matched, stages.score(SCORERS, matched.by_scale, matched.candidates), fused, correlated, "retrieval"
     )
 
 
 def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches):
     fused = {"histogram": BOTH, "count": Fusion("zscore")}
-    correlated = {"histogram + count + filter": FrameCorrelation(1)}
+    correlated = {"histogram + count + retrieval": FrameCorrelation(1)}
     systems = rank_by(sequence_matches, fused, correlated)
-    assert [*systems] == ["filter", *SCORERS, "histogram + count + filter", "count + filter",
-                          "histogram + count + filter + frames"]  # fmt: skip
+    assert [*systems] == ["retrieval", *SCORERS, "histogram + count + retrieval", "count + retrieval",
+                          "histogram + count + retrieval + frames"]  # fmt: skip
     alone = rank_by(sequence_matches, {"count": Fusion()}, {})
-    for name in ("filter", *SCORERS):
+    for name in ("retrieval", *SCORERS):
         np.testing.assert_array_equal(systems[name].scores, alone[name].scores)
-    np.testing.assert_array_equal(systems["count + filter"].rows, alone["count + filter"].rows)
+    np.testing.assert_array_equal(systems["count + retrieval"].rows, alone["count + retrieval"].rows)
 
     by_row = {
         name: np.take_along_axis(system.scores, np.argsort(system.rows, axis=1), axis=1)
         for name, system in systems.items()
     }
     assert sequence_matches.candidates.mask.all()
-    parts = [by_row[name] for name in ("filter", *SCORERS)]
-    assert_fused(by_row["histogram + count + filter"], sequence_matches.candidates, parts, [0.5, 1.0, 2.0])
+    parts = [by_row[name] for name in ("retrieval", *SCORERS)]
+    assert_fused(by_row["histogram + count + retrieval"], sequence_matches.candidates, parts, [0.5, 1.0, 2.0])
 
 
 def test_scores_of_several_scales_are_fused_again_with_the_filter(sequence_matches):
     """They are standardized sums themselves."""
     twice = replace(sequence_matches, matches=sequence_matches.matches * 2, weights=(1.0, 1.0))
     systems, once = (rank_by(matched, {"histogram": Fusion("zscore")}, {}) for matched in (twice, sequence_matches))
-    name = "histogram + filter"
+    name = "histogram + retrieval"
     np.testing.assert_allclose(systems[name].scores, once[name].scores, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(systems["histogram"].scores.mean(axis=1), 0, atol=1e-5)
 
@@ -152,7 +157,7 @@ def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     options = {"candidates": 5, "fused": {"histogram": BOTH}}
     results = [mfvpr.evaluate(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several)]
-    [alone], rankings = (result.systems["histogram + count + filter"] for result in results)
+    [alone], rankings = (result.systems["histogram + count + retrieval"] for result in results)
     for ranking in rankings:
         np.testing.assert_array_equal(ranking.rows, alone.rows)
         np.testing.assert_array_equal(ranking.scores, alone.scores)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mfvpr import Shortlist, balancing_c, combine, rank, rerank
 from mfvpr.reranking import fuse_scales
-from mfvpr.reranking.ranking import filter_scores, fuse, fuse_shortlist
+from mfvpr.reranking.ranking import fuse, fuse_shortlist, retrieval_scores
 from tests import oracles
 
 pytestmark = pytest.mark.thorough
@@ -41,38 +41,40 @@ def test_ties_may_go_by_index_instead():
 
 def test_combined_score_spans_plain_to_filter_order():
     rng = np.random.default_rng(1)
-    filter_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)
-    np.testing.assert_array_equal(rank(combine(filter_scores, scores, c=0.0)), rank(scores))
-    np.testing.assert_array_equal(rank(combine(filter_scores, scores)), rank(filter_scores))
-    np.testing.assert_allclose(combine(filter_scores, scores, c=3.0), oracles.combine(filter_scores, scores, 3.0), 1e-6)
+    retrieval_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)
+    np.testing.assert_array_equal(rank(combine(retrieval_scores, scores, c=0.0)), rank(scores))
+    np.testing.assert_array_equal(rank(combine(retrieval_scores, scores)), rank(retrieval_scores))
+    np.testing.assert_allclose(
+        combine(retrieval_scores, scores, c=3.0), oracles.combine(retrieval_scores, scores, 3.0), 1e-6
+    )
 
 
 def test_padding_is_no_similarity():
     candidates = Shortlist(np.array([[3, -1]]), np.array([[0.5, 99.0]], np.float32), np.array([[True, False]]))
-    assert filter_scores(candidates, "negative_euclidean")[0, 0] == -1
+    assert retrieval_scores(candidates, "negative_euclidean")[0, 0] == -1
 
 
 def test_balancing_c_equalizes_the_spread_of_real_candidates():
-    filter_scores = jnp.array([0.5, 0.7, 0.9, 77.0])
+    retrieval_scores = jnp.array([0.5, 0.7, 0.9, 77.0])
     scores = jnp.array([10.0, 50.0, 30.0, np.nan])
     mask = jnp.array([True, True, True, False])
-    c = balancing_c(filter_scores, scores, mask)
-    np.testing.assert_allclose(c * np.std(filter_scores[:3]), np.std(scores[:3]), rtol=1e-6)
+    c = balancing_c(retrieval_scores, scores, mask)
+    np.testing.assert_allclose(c * np.std(retrieval_scores[:3]), np.std(scores[:3]), rtol=1e-6)
     assert balancing_c(jnp.ones(4), scores, mask) == 0.0
 
 
 def test_a_score_that_is_no_number_takes_no_part_in_the_balance():
-    filter_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
-    expected = np.std([10.0, 50.0, 30.0]) / np.std(filter_scores)  # the similarity of its candidate counts
+    retrieval_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
+    expected = np.std([10.0, 50.0, 30.0]) / np.std(retrieval_scores)  # the similarity of its candidate counts
     for broken in (np.nan, np.inf):
-        c = balancing_c(filter_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
+        c = balancing_c(retrieval_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
         np.testing.assert_allclose(c, expected, rtol=1e-6)
-    assert balancing_c(filter_scores, jnp.full(4, jnp.nan), mask) == 0.0
+    assert balancing_c(retrieval_scores, jnp.full(4, jnp.nan), mask) == 0.0
 
 
 def test_balanced_fusion_has_a_gradient_where_all_scores_are_equal():
-    filter_scores, mask = jnp.array([[0.5, 0.7], [0.3, 0.3]]), jnp.ones((2, 2), bool)
-    total = lambda scores: jnp.sum(fuse(filter_scores, scores, mask, None) ** 2)  # noqa: E731
+    retrieval_scores, mask = jnp.array([[0.5, 0.7], [0.3, 0.3]]), jnp.ones((2, 2), bool)
+    total = lambda scores: jnp.sum(fuse(retrieval_scores, scores, mask, None) ** 2)  # noqa: E731
     for scores in (jnp.full((2, 2), 3.0), jnp.array([[1.0, 2.0], [4.0, 4.0]])):
         assert np.isfinite(jax.grad(total)(scores)).all()
 

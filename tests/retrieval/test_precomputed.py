@@ -45,7 +45,7 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     data = Dataset("same", same, (QuerySequence("same", same, None),))
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
     for group, build_stage, defaults in (("features", build.extractor, {"image_size": None}),
-                             ("retrieval", lambda *options: build.filter(*options[:1], SimpleNamespace(), data),
+                             ("retrieval", lambda *options: build.retriever(*options[:1], SimpleNamespace(), data),
                               {"whiten": None})):  # fmt: skip
         settings = {"name": "import"} | common | defaults | change
         if not refused:

@@ -16,7 +16,7 @@ import mfvpr
 from mfvpr.datasets import folder_dataset, sequences_dataset
 from mfvpr.features import Aggregated, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.retrieval import Filtered, Retrieval
+from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache, NotYet, Shard
 from mfvpr.storage.shards import indices, shard_of, together
 from mfvpr.storage.vectors import open_vector_store
@@ -151,7 +151,7 @@ class Drawn:
     def shortlist(self, sequence, database, num_candidates, cache):
         rng = np.random.default_rng()
         indices = np.array([rng.permutation(len(database))[:num_candidates] for _ in sequence.images.names], np.int32)
-        return Filtered(Shortlist(indices, np.ones(indices.shape, np.float32), indices >= 0), {}, {})
+        return RetrievalResult(Shortlist(indices, np.ones(indices.shape, np.float32), indices >= 0), {}, {})
 
 
 def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):

@@ -73,7 +73,7 @@ def settings_of(folder, *changes):
 
 @pytest.mark.parametrize("changes", [("dataset.name=one", "dataset.name=two"), ("memory=1", "devices=all")])
 def test_matches_do_not_depend_on_names_and_devices(small_street, tmp_path, changes):
-    paths = {matches_path(settings_of(small_street, f"store={tmp_path}", change))[0] for change in changes}
+    paths = {matches_path(settings_of(small_street, f"cache={tmp_path}", change))[0] for change in changes}
     assert len(paths) == 1
 
 
@@ -87,5 +87,5 @@ def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path, change
     street = tmp_path / "street"  # whose queries are database images
     for side in ("database", "queries"):
         shutil.copytree(small_street / "database", street / side)
-    plain, other = (matches_path(settings_of(street, f"store={tmp_path}/s", *more))[0] for more in ((), (change,)))
+    plain, other = (matches_path(settings_of(street, f"cache={tmp_path}/s", *more))[0] for more in ((), (change,)))
     assert plain != other

@@ -26,7 +26,7 @@ from mfvpr.utils.errors import InputError, require_word
 
 _LEFT_BY = "expected the run folder of an evaluation"
 _KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}
-_KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "filter.name": str, "features.name": str,
+_KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "retrieval.name": str, "features.name": str,
           "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int,
           "bytes_per_image": int | None}  # fmt: skip
 # Columns of text in front of the numbers; None = all.
@@ -58,14 +58,15 @@ class Gains:
 class Prediction:
     """The first prediction of a system for a query, as texts of the files.
 
-    `outcome` is "right", "wrong", or "best" without ground truth. `answer` and `score` are empty without a prediction.
+    `outcome` is "correct", "incorrect", or "best" without ground truth. Without a prediction, `prediction`
+    and `score` are empty.
     `rank` is of the first correct candidate, empty if there is none or if it is unknown.
     """
 
     system: str
     sequence: str
     query: str
-    answer: str
+    prediction: str
     score: str
     outcome: str
     rank: str
@@ -155,7 +156,7 @@ class Run:
                 if gains := self.gains.get(sequence):
                     ranks = dict(zip(gains.queries, gains.ranks[system].tolist(), strict=True))
                 for query, rank in ranks.items():
-                    row, outcome = first.get(query), "best" if rank is None else "right" if rank == 1 else "wrong"
+                    row, outcome = first.get(query), "best" if rank is None else "correct" if rank == 1 else "incorrect"
                     texts = (row["database"], row["score"]) if row else ("", "")
                     yield Prediction(system, sequence, query, *texts, outcome, str(rank or ""))
 

@@ -16,10 +16,10 @@ from mfvpr.report.pages.files import Gains, Run, read_run
 from mfvpr.report.pages.pictures import pictures
 from mfvpr.report.pages.rendering import Gallery, Section, write_page
 from mfvpr.report.tables import Table
-from mfvpr.reranking.results import FILTER
+from mfvpr.reranking.results import RETRIEVAL
 
 PAGE = "report.html"  # in a run folder
-MOST_ANSWERS = 5000  # rows of a table that a browser still sorts at once
+MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
 _P_VALUES = (4, 7)  # columns of differences.csv
@@ -53,18 +53,18 @@ def description(run: Run) -> str:
     """One line that says what was evaluated."""
     common = run.common
     several = f" in {len(run.sequences)} sequences" if len(run.sequences) > 1 else ""
-    right = f"right is what is within{run.within}" if run.gains and run.within else ""
-    right = right or ("right or not, as told" if run.gains else "no ground truth: rankings only")
+    correct = f"correct is what is within{run.within}" if run.gains and run.within else ""
+    correct = correct or ("correct or not, as told" if run.gains else "no ground truth: rankings only")
     lacks = f"; incomplete: {', '.join(common['incomplete'])}" if common.get("incomplete") else ""
     return (
         f"{common['queries']} queries{several}, {common['database']} database images, {common['candidates']} candidates"
-        f" ({common['filter']['name']}), {common['features']['name']} features; {right}{lacks}"
+        f" ({common['retrieval']['name']}), {common['features']['name']} features; {correct}{lacks}"
     )
 
 
 def _facts(run: Run) -> dict[str, str]:
     facts = {"decides": run.headline}
-    for name in dict.fromkeys((run.headline, FILTER)) if run.gains else ():
+    for name in dict.fromkeys((run.headline, RETRIEVAL)) if run.gains else ():
         bar = recall_bar(run.all_gains, name)
         words = f"{bar.percent:.1f} %", bar.interval_words
         facts[f"{name}, R@1{run.within}"] = " ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in words)
@@ -87,7 +87,9 @@ def _recall_section(run: Run) -> Section:
         bar_chart("intervals", f"Recall at 1{run.within}, with intervals", groups, axis="recall at 1, %"),
         *tolerance_charts(curves), depths_chart(f"Recall over K{run.within}", curves),
     ]  # fmt: skip
-    words = f"In %. Everything told of single queries is what is right at the middle tolerance{run.within}. Intervals "
+    words = (
+        f"In %. Everything told of single queries is what is correct at the middle tolerance{run.within}. Intervals "
+    )
     words += "are 95 % and know that neighbors along the path fail together."
     tables = {}
     if table := run.tables.get("table.csv"):
@@ -138,7 +140,7 @@ def precision_charts(curves: Curves, by: str = "score", words: str = "by the sco
             label = f"{name}: AP {100 * curve.average_precision:.1f}"
             pairs = zip(curve.recall[shown], curve.precision[shown], strict=True)
             points[label] = [(round(100 * x, 3), round(100 * y, 3)) for x, y in pairs]
-    axes = "recall of queries with an answer, %", "precision, %"
+    axes = "recall of queries with a prediction, %", "precision, %"
     title = f"Precision and recall {words}"
     return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
 
@@ -152,8 +154,8 @@ def paired_tests_table(kind: str, rows: list[list[str]]) -> Table:
 def paired_tests_words(kind: str) -> str:
     """The explanation of `paired_tests_table`."""
     return (
-        f"How many queries only one of two {kind}s gets right, and how probable that is if neither is better: by "
-        "McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
+        f"How many queries only one of two {kind}s predicts correctly, and how probable that is if neither is better, "
+        "by McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
     )
 
 
@@ -172,17 +174,17 @@ def _confidence_section(run: Run) -> Iterator[Section]:
         return
     table, shares = run.tables.get("confidence.csv"), run.tables.get("rerank_share.csv")
     curves = {name: (run, name) for name in run.systems}
-    charts = precision_charts(curves) + precision_charts(curves, "p", "by p(right)")
+    charts = precision_charts(curves) + precision_charts(curves, "confidence", "by confidence")
     if shares and shares.rows and len(shares.header) > 1:
         share, *recalls = [list(map(float, column)) for column in zip(*shares.rows, strict=True)]
-        points = {FILTER: [(0.0, recalls[0][0]), (100.0, recalls[0][0])]}  # alone, it re-ranks nothing
+        points = {RETRIEVAL: [(0.0, recalls[0][0]), (100.0, recalls[0][0])]}  # alone, it re-ranks nothing
         for name, recall in zip(shares.header[1:], recalls, strict=True):
             points[name] = [(100 * x, y) for x, y in zip(share, recall, strict=True)]
-        axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what the filter is unsure of"
+        axes, title = ("queries re-ranked, %", "recall at 1, %"), "Re-ranking only what retrieval is unsure of"
         charts.append(line_chart("shares", title, points, axes=axes, scale="percent"))
-    tables = {"Confidence of first answers, in %": table} if table and table.rows else {}
+    tables = {"Confidence of top predictions, in %": table} if table and table.rows else {}
     words = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
-    yield Section("confidence", "Precision and recall", f"{words}p(right).", charts, tables)
+    yield Section("confidence", "Precision and recall", f"{words}confidence.", charts, tables)
 
 
 def _costs_section(run: Run) -> Section:
@@ -201,12 +203,14 @@ def _costs_section(run: Run) -> Section:
 def _answers_section(run: Run) -> Section:
     """First predictions, with pictures of some."""
     total = len(run.systems) * len(run.all_gains.queries) if run.gains else 0
-    answers = [*islice(run.predictions(), MOST_ANSWERS)]
-    left_out = max(0, total - len(answers))
-    gallery = Gallery(run.headline, run.systems, run.sequences, pictures(run.folder), answers, left_out)
-    words = "Query and first answer with their heaviest matches, and the histogram of their shifts; below a wrong "
-    words += "answer the right one. The table has the queries without a picture, too."
-    return Section("answers", "Answers", words, gallery=gallery)
+    predictions = [*islice(run.predictions(), MOST_PREDICTIONS)]
+    left_out = max(0, total - len(predictions))
+    gallery = Gallery(run.headline, run.systems, run.sequences, pictures(run.folder), predictions, left_out)
+    words = (
+        "Query and top prediction with their heaviest matches, and the histogram of their shifts; below an incorrect "
+    )
+    words += "prediction the correct one. The table has the queries without a picture, too."
+    return Section("predictions", "Predictions", words, gallery=gallery)
 
 
 def _settings_section(run: Run) -> Section:

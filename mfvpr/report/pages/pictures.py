@@ -23,7 +23,7 @@ class Picture:
     sequence: str
     outcome: str
     query: str
-    answer: str
+    prediction: str
     source: str
     size: tuple[int, int]
 

@@ -24,13 +24,13 @@ class Gallery:
     systems: Sequence[str]
     sequences: Sequence[str]
     pictures: Sequence[Picture]
-    answers: Sequence[Prediction] = ()
+    predictions: Sequence[Prediction] = ()
     left_out: int = 0
 
     @property
     def outcomes(self) -> list[str]:
         """Outcomes that occur."""
-        return sorted({shown.outcome for shown in (*self.pictures, *self.answers)})
+        return sorted({shown.outcome for shown in (*self.pictures, *self.predictions)})
 
 
 @dataclass(frozen=True)

@@ -31,12 +31,12 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         InputError: a folder is named twice, or is no run folder of an evaluation.
     """
     runs = dict(zip(_labels(folders), map(read_run, folders), strict=True))
-    judged = {label: run for label, run in runs.items() if run.gains}
-    sections = [_overview(runs), *([_recall(judged), _pairs(runs)] if judged else []), _settings(runs)]
+    evaluation = {label: run for label, run in runs.items() if run.gains}
+    sections = [_overview(runs), *([_recall(evaluation), _pairs(runs)] if evaluation else []), _settings(runs)]
     words = "The systems that decide, beside each other; each run has a page of its own."
     names = ", ".join(dict.fromkeys(str(run.common["dataset"]) for run in runs.values()))
     facts = {f"{label}, R@1{run.within}": f"{recall_bar(run.all_gains, run.headline).percent:.1f} %"
-             for label, run in judged.items()}  # fmt: skip
+             for label, run in evaluation.items()}  # fmt: skip
     write_page(path, title=f"{names}: {len(runs)} runs compared", words=words, facts=facts, sections=sections)
 
 
@@ -91,7 +91,7 @@ def _recall(runs: Mapping[str, Run]) -> Section:
         recalls = [recall_bar(run.all_gains, system) if system in run.systems else None for run in runs.values()]
         rows.append([system, *(f"{bar.percent:.1f} {bar.interval_words}" if bar else "" for bar in recalls)])
     header = ["system", *(f"{label}{run.within}" for label, run in runs.items())]
-    words = "In %, of all queries, right at the middle tolerance of each run; intervals are 95 % and know that "
+    words = "In %, of all queries, correct at the middle tolerance of each run; intervals are 95 % and know that "
     words += "neighbors along the path fail together."
     if any(why_not(*pair) for pair in itertools.combinations(runs.values(), 2)):
         words += " Not all of these runs have the same queries and the same ground truth: see below."

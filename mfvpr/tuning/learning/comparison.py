@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.recall import hits
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.matching.match_set import MatchSet
@@ -65,13 +65,13 @@ class Comparison:
     """The scores of all halves.
 
     Attributes:
-        judge: the ground truth.
+        protocol: the ground truth.
         match_set: of all queries.
         candidates: their shortlist.
         halves: the rows of each half, in the same order.
     """
 
-    judge: Judge
+    protocol: EvaluationProtocol
     match_set: MatchSet
     candidates: Shortlist
     halves: Sequence[Sequence[Row]]
@@ -79,11 +79,12 @@ class Comparison:
     def rows(self) -> Iterator[tuple[str, np.ndarray, Sequence[Row]]]:
         """Name, hits `[tolerances, reported]` of all reported queries along the path, and the row of each half."""
         for rows in zip(*self.halves, strict=True):
-            yield rows[0].name, self.judge.join_halves([row.hits for row in rows]), rows
+            yield rows[0].name, self.protocol.join_halves([row.hits for row in rows]), rows
 
 
 def compare(
-    axes: Axes, judge: Judge, match_set: MatchSet, candidates: Shortlist, options: Options | None = None, *,
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet, candidates: Shortlist,
+    options: Options | None = None, *,
     checkpoints: Checkpoints | None = None, track: Stages = untracked_stages,
 ) -> Comparison:  # fmt: skip
     """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
@@ -95,7 +96,7 @@ def compare(
 
     Args:
         axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances retrieval and score.
-        judge: the ground truth, with halves.
+        protocol: the ground truth, with halves.
         match_set: matches of Q queries with C candidates, with their ratio.
         candidates: their shortlist.
         options: of the learning.
@@ -111,9 +112,9 @@ def compare(
         raise InputError(f"{type(axes.scorer).__name__}: expected a scorer with numbers to learn and a match weight")
     axes.check(match_set.image_sizes)
     options = options or Options()
-    splits = training_splits(match_set, candidates, judge, filter_score=options.filter_score)
+    splits = training_splits(match_set, candidates, protocol, retrieval_score=options.retrieval_score)
     halves = [_HalfComparison(split, axes, options, checkpoints, track) for split in splits]
-    return Comparison(judge, match_set, candidates, [list(half.rows()) for half in halves])
+    return Comparison(protocol, match_set, candidates, [list(half.rows()) for half in halves])
 
 
 @dataclass(frozen=True)
@@ -133,12 +134,12 @@ class _HalfComparison:
         yield from self.by_hand("1 - ratio", replace(scorer, weight=RatioWeight()))
         deviation = self.split.score_deviation(scorer)
         for fused in (False, True):
-            name = "grid search" + " + filter" * fused
+            name = "grid search" + " + retrieval" * fused
             setting, values = self.search(name, deviation, fused=fused)
             yield replace(self.evaluate(name, scorer, setting), values=values)
         for learned_weight in (False, True):
             for fused in (False, True):
-                name = ("match weights" if learned_weight else "gradient") + " + filter" * fused
+                name = ("match weights" if learned_weight else "gradient") + " + retrieval" * fused
                 model = start(self.split, scorer, self.options, fused=fused, learned_weight=learned_weight)
                 fitted = self.learn(name, model)
                 values = model.values(fitted.parameters)
@@ -153,22 +154,22 @@ class _HalfComparison:
     def by_hand(self, name: str, scorer: Scorer) -> Iterator[Row]:
         """The scorer alone, and fused with the retrieval by the c of the options."""
         yield self.evaluate(name, scorer, {})
-        yield self.evaluate(f"{name} + filter", scorer, {FUSION: self.options.c})
+        yield self.evaluate(f"{name} + retrieval", scorer, {FUSION: self.options.c})
 
     def evaluate(self, name: str, scorer: Scorer, setting: Setting) -> Row:
         """Evaluate a setting on the half to report on, with all candidates."""
-        queries, judge = self.split.half.report, self.split.judge
+        queries, protocol = self.split.half.report, self.split.protocol
         [first] = self.first_rows(name, scorer, [setting], queries, self.split.candidates.mask)
-        by_threshold = [hits(first, positives.take(queries)) for positives in judge.positives]
+        by_threshold = [hits(first, positives.take(queries)) for positives in protocol.positives]
         return Row(self.split.name, name, np.stack(by_threshold), {}, None)
 
     def search(self, name: str, deviation: float, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
         """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
         axes = self.axes if fused else self.axes.without(FUSION)
-        grid, queries, judge = axes.grid(), self.split.half.tune, self.split.judge
+        grid, queries, protocol = axes.grid(), self.split.half.tune, self.split.protocol
         settings = [self.with_fusion(axes.setting(plain), self.split.balance(deviation), fused=fused) for plain in grid]
         rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
-        recall = hits(rows, judge.positives[judge.main].take(queries)).mean(axis=-1)
+        recall = hits(rows, protocol.positives[protocol.main].take(queries)).mean(axis=-1)
         best = best_setting(recall, axes.values)
         return settings[best], grid[best]
 

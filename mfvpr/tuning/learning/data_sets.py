@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from mfvpr.datasets.positives import join_positives
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.types import Matches, Shortlist, per_pair
@@ -21,19 +21,19 @@ class Part:
 
     Attributes:
         name: of the data set.
-        judge: ground truth of all queries.
+        protocol: ground truth of all queries.
         match_set: matches of Q queries with C candidates.
         candidates: their shortlist.
     """
 
     name: str
-    judge: Judge
+    protocol: EvaluationProtocol
     match_set: MatchSet
     candidates: Shortlist
 
 
 def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
-    """Join data sets to one, whose judge learns on the first sets and reports on the others.
+    """Join data sets to one, whose protocol learns on the first sets and reports on the others.
 
     Args:
         teach: sets to learn on, each from its first query to its last.
@@ -50,20 +50,20 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         raise InputError(f"expected data sets of different names, got {', '.join(names)}")
     for part in parts[1:]:
         for what in ("unit", "thresholds"):
-            expected, got = getattr(parts[0].judge, what), getattr(part.judge, what)
+            expected, got = getattr(parts[0].protocol, what), getattr(part.protocol, what)
             if expected != got:
                 raise InputError(f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; compare sets "
                                  "whose ground truth is of one kind")  # fmt: skip
-    sizes, databases = ([len(part.match_set) for part in parts], [part.judge.places.num_database for part in parts])
+    sizes, databases = ([len(part.match_set) for part in parts], [part.protocol.places.num_database for part in parts])
     split = sum(sizes[: len(teach)])
     half = Half(
         np.arange(split), np.arange(split, sum(sizes)), np.arange(sum(databases)) < sum(databases[: len(teach)]),
         tuple(sizes[: len(teach)]),
     )  # fmt: skip
-    judge = replace(
-        parts[0].judge,
-        positives=[join_positives(sets) for sets in zip(*(part.judge.positives for part in parts), strict=True)],
-        places=join_positives([part.judge.places for part in parts]),
+    protocol = replace(
+        parts[0].protocol,
+        positives=[join_positives(sets) for sets in zip(*(part.protocol.positives for part in parts), strict=True)],
+        places=join_positives([part.protocol.places for part in parts]),
         halves=[half], split="other sets", reported_sets={part.name: len(part.match_set) for part in report},
     )  # fmt: skip
     width = max(part.match_set.counts.shape[1] for part in parts)
@@ -74,7 +74,7 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         max(part.match_set.capacity for part in parts),
     )
     shortlists = [_shift(part.candidates, int(start), width) for part, start in zip(parts, starts, strict=True)]
-    return Part(" ".join(names), judge, match_set, jax.tree.map(lambda *rows: np.concatenate(rows), *shortlists))
+    return Part(" ".join(names), protocol, match_set, jax.tree.map(lambda *rows: np.concatenate(rows), *shortlists))
 
 
 def _shift(candidates: Shortlist, start: int, width: int) -> Shortlist:

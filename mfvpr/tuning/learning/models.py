@@ -91,7 +91,7 @@ class Model:
         def mean(parameters: Parameters, batch: Batch) -> Array:
             scorer, c = self.scorer_of(parameters), self.c_of(parameters)
             scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
-            scores = scores if c is None else combine(batch.filter_scores, scores, c=c)
+            scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
             logits = scores / self.unit * jnp.exp(parameters["sharpness"])
             return losses.mean_loss(loss, logits, batch.positives, batch.mask)
 

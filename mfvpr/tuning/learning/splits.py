@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half, separate
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.reranking.batched_scoring import score
-from mfvpr.reranking.ranking import FilterScore, filter_scores
+from mfvpr.reranking.ranking import RetrievalScore, retrieval_scores
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Array, Matches, Shortlist, value
 from mfvpr.utils import ragged
@@ -27,7 +27,7 @@ class Batch:
     """Queries to learn from, padded; matches `[queries, candidates, slots, ...]`."""
 
     matches: Matches
-    filter_scores: Float[Array, "queries candidates"]
+    retrieval_scores: Float[Array, "queries candidates"]
     positives: Bool[Array, "queries candidates"]
     mask: Bool[Array, "queries candidates"]
 
@@ -39,7 +39,7 @@ class TrainingSplit:
     Attributes:
         match_set: matches of all queries.
         candidates: of all queries; their scores are the retrieval's part of a combined score.
-        judge: the ground truth.
+        protocol: the ground truth.
         half: queries to choose on and to report on.
         train: queries of the losses.
         validation: queries that decide when learning stops.
@@ -49,7 +49,7 @@ class TrainingSplit:
 
     match_set: MatchSet
     candidates: Shortlist
-    judge: Judge
+    protocol: EvaluationProtocol
     half: Half
     train: Int[np.ndarray, " train"]
     validation: Int[np.ndarray, " validation"]
@@ -59,12 +59,12 @@ class TrainingSplit:
     @cached_property
     def correct(self) -> Bool[np.ndarray, "queries candidates"]:
         """Correct candidates at the main threshold."""
-        return self._positive(self.judge.positives[self.judge.main])
+        return self._positive(self.protocol.positives[self.protocol.main])
 
     @cached_property
     def usable(self) -> Bool[np.ndarray, "queries candidates"]:
         """Candidates of the losses: seen, and not correct at the widest threshold only."""
-        return self.seen & ~(self._positive(self.judge.positives[-1]) & ~self.correct)
+        return self.seen & ~(self._positive(self.protocol.positives[-1]) & ~self.correct)
 
     def _positive(self, positives: Positives) -> np.ndarray:
         return positives.contains(self.candidates.indices) & self.candidates.mask
@@ -102,33 +102,39 @@ class TrainingSplit:
 
 
 def training_splits(
-    match_set: MatchSet, candidates: Shortlist, judge: Judge, *, filter_score: FilterScore = "cosine"
+    match_set: MatchSet,
+    candidates: Shortlist,
+    protocol: EvaluationProtocol,
+    *,
+    retrieval_score: RetrievalScore = "cosine",
 ) -> list[TrainingSplit]:
-    """Split each half of a judge into queries to train on and queries to validate on.
+    """Split each half of a protocol into queries to train on and queries to validate on.
 
     Args:
         match_set: of all queries.
         candidates: their shortlist.
-        judge: the ground truth, with halves.
-        filter_score: the retrieval's part of a combined score, see `mfvpr.reranking.ranking.filter_scores`.
+        protocol: the ground truth, with halves.
+        retrieval_score: the retrieval's part of a combined score, see `mfvpr.reranking.ranking.retrieval_scores`.
 
     Raises:
-        InputError: the judge has no halves, or a half has no usable queries to train on or to validate on.
+        InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.
     """
-    if not judge.halves:
+    if not protocol.halves:
         raise InputError("split=None: expected first_half, second_half or both, since what is learned is never "
                          "reported on the same queries")  # fmt: skip
-    candidates = replace(candidates, scores=filter_scores(candidates, filter_score))
-    split = partial(_split, match_set, candidates, judge)
-    return [split(half, name) for half, name in zip(judge.halves, judge.names, strict=True)]
+    candidates = replace(candidates, scores=retrieval_scores(candidates, retrieval_score))
+    split = partial(_split, match_set, candidates, protocol)
+    return [split(half, name) for half, name in zip(protocol.halves, protocol.names, strict=True)]
 
 
-def _split(match_set: MatchSet, candidates: Shortlist, judge: Judge, half: Half, name: str) -> TrainingSplit:
+def _split(
+    match_set: MatchSet, candidates: Shortlist, protocol: EvaluationProtocol, half: Half, name: str
+) -> TrainingSplit:
     paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
     pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
-    split_half = separate(judge.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+    split_half = separate(protocol.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
     seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
-    split = TrainingSplit(match_set, candidates, judge, half, split_half.tune, split_half.report, seen, name)
+    split = TrainingSplit(match_set, candidates, protocol, half, split_half.tune, split_half.report, seen, name)
     correct, incorrect = split.correct & split.usable, ~split.correct & split.usable
     has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
     train, validation = (rows[has_both[rows]] for rows in (split_half.tune, split_half.report))

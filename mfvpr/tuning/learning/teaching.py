@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import optax
 
-from mfvpr.reranking.ranking import FilterScore, Ties
+from mfvpr.reranking.ranking import RetrievalScore, Ties
 from mfvpr.scoring import parameters
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
@@ -27,7 +27,7 @@ class Options:
 
     Attributes:
         c: the retrieval's weight if it is set by hand; None = balanced.
-        filter_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.fuse_shortlist`.
+        retrieval_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.fuse_shortlist`.
         ties: as in `mfvpr.reranking.ranking.rank_shortlist`.
         loss: of one query.
         steps: updates of a training, at most.
@@ -41,8 +41,8 @@ class Options:
     """
 
     c: float | None = None
-    filter_score: FilterScore = "cosine"
-    ties: Ties = "filter"
+    retrieval_score: RetrievalScore = "cosine"
+    ties: Ties = "retrieval"
     loss: Loss = cross_entropy
     steps: int = 200
     every: int = 5

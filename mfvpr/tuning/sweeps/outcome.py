@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mfvpr import evaluation
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import Estimate, McNemar, SignFlips, block_sign_flips, estimate, mcnemar
 from mfvpr.tuning.sweeps.axes import Axes
 
@@ -38,7 +38,7 @@ class Outcome:
 
     Attributes:
         axes: of the sweep.
-        judge: the ground truth, with the views of the shortlist.
+        protocol: the ground truth, with the views of the shortlist.
         settings: in plain values; those of a complete grid come first, in its order.
         rows: of the database, best first.
         ks: depths of the recall, ascending, up to the depth of `rows`.
@@ -46,7 +46,7 @@ class Outcome:
     """
 
     axes: Axes
-    judge: Judge
+    protocol: EvaluationProtocol
     settings: Sequence[Mapping[str, Any]]
     rows: Int[np.ndarray, "views settings queries depth"]
     ks: Sequence[int]
@@ -55,7 +55,7 @@ class Outcome:
     @cached_property
     def recall(self) -> Float[np.ndarray, "settings tolerances"]:
         """Recall@1 over all queries."""
-        return self.judge.recall(self.rows[0])
+        return self.protocol.recall(self.rows[0])
 
     @property
     def own(self) -> int:
@@ -67,18 +67,18 @@ class Outcome:
         """Number of the best setting, for each half."""
         size = self.axes.size if self.is_grid else len(self.settings)
         axes = self.axes.values if self.is_grid else None
-        tuning = self.judge.tuning(self.rows)
-        return [evaluation.best_setting(recall[:size, self.judge.main], axes) for recall in tuning]
+        tuning = self.protocol.tuning(self.rows)
+        return [evaluation.best_setting(recall[:size, self.protocol.main], axes) for recall in tuning]
 
     @cached_property
     def report(self) -> list[Verdict]:
         """Verdicts by threshold, on the queries to report on."""
-        chosen_hits = self.judge.reported_hits(self.rows, self.chosen)
-        own_hits = self.judge.reported_hits(self.rows, [self.own] * len(self.chosen))
+        chosen_hits = self.protocol.reported_hits(self.rows, self.chosen)
+        own_hits = self.protocol.reported_hits(self.rows, [self.own] * len(self.chosen))
         return [
             Verdict(
                 threshold, len(first), estimate(first), estimate(second),
                 mcnemar(first, second), block_sign_flips(first, second),
             )
-            for threshold, first, second in zip(self.judge.thresholds, chosen_hits, own_hits, strict=True)
+            for threshold, first, second in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True)
         ]  # fmt: skip

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mfvpr.evaluation.protocol import Judge
+from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.matching.match_set import MatchSet, Scales
 from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning.sweeps.axes import Axes
@@ -31,37 +31,37 @@ def untracked_stages(stage: str) -> Track:
 
 
 def search_grid(
-    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, *,
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, *,
     ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
 ) -> Outcome:  # fmt: skip
     """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them.
 
     Args:
         axes: of the grid.
-        judge: the ground truth, and the queries to choose on.
+        protocol: the ground truth, and the queries to choose on.
         match_set: matches of Q queries with C candidates.
         candidates: their shortlist.
         ks: of the recall.
         track: progress.
-        options: of `mfvpr.tuning.sweeps.sweep`: `ties`, `filter_score`, the sizes of blocks, and their folder.
+        options: of `mfvpr.tuning.sweeps.sweep`: `ties`, `retrieval_score`, the sizes of blocks, and their folder.
 
     Raises:
         InputError: a setting cannot be scored.
     """
     axes.check(match_set.image_sizes)
-    judge, own_values, settings = judge.of(candidates), dict(axes.own), axes.grid()
+    protocol, own_values, settings = protocol.of(candidates), dict(axes.own), axes.grid()
     settings += [] if own_values in settings else [own_values]
-    rank = _ranker(axes, judge, match_set, candidates, depth=max(ks), **options)
-    return Outcome(axes, judge, settings, rank(settings, track("sweep")), sorted({*ks}), is_grid=True)
+    rank = _ranker(axes, protocol, match_set, candidates, depth=max(ks), **options)
+    return Outcome(axes, protocol, settings, rank(settings, track("sweep")), sorted({*ks}), is_grid=True)
 
 
 def search_optuna(
-    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, *,
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, *,
     trials: int, seed: int = 0, ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
 ) -> Outcome:  # fmt: skip
     """Rank with the scorer's own values, and with settings that Optuna's sampler (TPE) proposes from a seed.
 
-    Numbers are drawn between the smallest and the largest value of an axis, words among its values. If the judge has
+    Numbers are drawn between the smallest and the largest value of an axis, words among its values. If the protocol has
     halves, Optuna gets the mean recall of the queries to choose on. Arguments not listed here are those of
     `search_grid`.
 
@@ -77,8 +77,8 @@ def search_optuna(
     import optuna
 
     axes.check(match_set.image_sizes)
-    judge = judge.of(candidates)
-    rank = _ranker(axes, judge, match_set, candidates, depth=max(ks), **options)
+    protocol = protocol.of(candidates)
+    rank = _ranker(axes, protocol, match_set, candidates, depth=max(ks), **options)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
     settings: list[Mapping[str, Any]] = [dict(axes.own)]
@@ -87,11 +87,11 @@ def search_optuna(
         batch = [study.ask() for _ in range(min(BATCH, trials - start))]
         proposed = [suggest_setting(trial, axes) for trial in batch]
         rows.append(rank(proposed, track(f"trials {start + 1} to {start + len(batch)}")))
-        recall = judge.tuning(rows[-1])[..., judge.main].mean(axis=0)
+        recall = protocol.tuning(rows[-1])[..., protocol.main].mean(axis=0)
         for trial, value in zip(batch, recall, strict=True):
             study.tell(trial, float(value))
         settings += proposed
-    return Outcome(axes, judge, settings, np.concatenate(rows, axis=1), sorted({*ks}), is_grid=False)
+    return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*ks}), is_grid=False)
 
 
 def require_optuna() -> None:
@@ -101,12 +101,12 @@ def require_optuna() -> None:
 
 
 def _ranker(
-    axes: Axes, judge: Judge, match_set: MatchSet | Scales, candidates: Shortlist, **options: Any
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, **options: Any
 ) -> Callable[[Sequence[Mapping[str, Any]], Track], np.ndarray]:
     """A function of plain settings that returns the rows `[V, S, Q, depth]` of their rankings."""
     return lambda settings, track: sweep(
         axes.scorer, [axes.setting(plain) for plain in settings], match_set, candidates,
-        views=judge.views, track=track, **options,
+        views=protocol.views, track=track, **options,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.matching.match_set import MatchSet, Scales, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
-from mfvpr.reranking.ranking import FilterScore, Ties, breaks_ties_by_row, filter_scores
+from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
 from mfvpr.scoring.scorer import check_host, on_host
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, groups
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
@@ -52,7 +52,7 @@ class Work:
     views: Sequence[np.ndarray]
     depth: int
     ties: Ties
-    filter_score: FilterScore
+    retrieval_score: RetrievalScore
 
     @cached_property
     def digest(self) -> str:
@@ -79,9 +79,10 @@ class Work:
 
 def sweep(
     scorer: Any, settings: Sequence[Setting], match_set: MatchSet | Scales, candidates: Shortlist, *,
-    views: Sequence[Bool[np.ndarray, "queries candidates"]] | None = None, depth: int = 10, ties: Ties = "filter",
-    filter_score: FilterScore = "cosine", settings_per_block: int | None = None, queries_per_block: int | None = None,
-    folder: Path | None = None, devices: Sequence[Device] | None = None, track: Track = no_progress,
+    views: Sequence[Bool[np.ndarray, "queries candidates"]] | None = None, depth: int = 10, ties: Ties = "retrieval",
+    retrieval_score: RetrievalScore = "cosine", settings_per_block: int | None = None,
+    queries_per_block: int | None = None, folder: Path | None = None, devices: Sequence[Device] | None = None,
+    track: Track = no_progress,
 ) -> Int[np.ndarray, "views settings queries depth"]:  # fmt: skip
     """Database rows of the first candidates of every query's ranking by every setting, best first, -1 = none.
 
@@ -96,7 +97,7 @@ def sweep(
         views: candidates that are ranked; by default one view, all of the shortlist.
         depth: number of rows of a ranking to return.
         ties: as in `reranking.rank_shortlist`.
-        filter_score: as in `reranking.fuse_shortlist`.
+        retrieval_score: as in `reranking.fuse_shortlist`.
         settings_per_block: by default 64. The result does not depend on it.
         queries_per_block: by default as many as fit into 256 MB. The result does not depend on it.
         folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
@@ -113,7 +114,7 @@ def sweep(
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(unique))
     queries = queries_per_block or queries_that_fit(match_set, per_block)
     programs = list(groups(scorer, unique, match_set.image_sizes))
-    work = Work(match_set, all_queries, len(unique) / len(programs), candidates, views, depth, ties, filter_score)
+    work = Work(match_set, all_queries, len(unique) / len(programs), candidates, views, depth, ties, retrieval_score)
     if folder is not None:
         programs = [replace(group, program=group_program(work, group)) for group in programs]
     blocks = [block for group in programs for block in group.blocks(per_block)]
@@ -166,14 +167,14 @@ def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array])
 
 def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
     """Database rows `[W, q, depth]` by scores `[W, q, C]`, each setting fused with its own c."""
-    indices, of_filter = part.candidates.indices, filter_scores(part.candidates, part.filter_score)
+    indices, by_retrieval = part.candidates.indices, retrieval_scores(part.candidates, part.retrieval_score)
     rows = np.full((*scores.shape[:2], part.depth), -1, np.int32)
     kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
     for kind in np.unique(kinds):
         members = np.flatnonzero(kinds == kind)
         c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
         tie_break = indices if breaks_ties_by_row(part.ties) else None
-        order = np.asarray(_orders(of_filter, scores[members], c, view, tie_break, fused=kind != "alone"))
+        order = np.asarray(_orders(by_retrieval, scores[members], c, view, tie_break, fused=kind != "alone"))
         order = order[..., : part.depth]
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
         rows[members, :, : ranked.shape[-1]] = ranked
@@ -182,13 +183,13 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
 
 @partial(compiled, static_argnames="fused")
 def _orders(
-    of_filter: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
+    by_retrieval: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
 ) -> Array:
     """Positions `[W, q, C]` into the shortlist, best first, one setting at a time."""
 
     def order(scores_c: tuple[Array, Array | None]) -> Array:
         scores, c = scores_c
-        return ranking.rank(ranking.fuse(of_filter, scores, view, c) if fused else scores, view, tie_break=tie_break)
+        return ranking.rank(ranking.fuse(by_retrieval, scores, view, c) if fused else scores, view, tie_break=tie_break)
 
     return jax.lax.map(order, (scores, c))
 
@@ -214,7 +215,7 @@ def _read_or_compute(
 def _fingerprint(part: Work, block: Group, cs: Sequence[Any]) -> str:
     """Hash of everything that determines a block's rows: matches and shortlist, the scorer's program and numbers."""
     names = [*block.settings, *block.weightings]
-    options = part.depth, part.ties, part.filter_score, list(map(repr, cs)), block.rows.tolist(), names
+    options = part.depth, part.ties, part.retrieval_score, list(map(repr, cs)), block.rows.tolist(), names
     numbers = block.scorer, dict(block.settings), dict(block.weightings)
     return content_hash(repr(options), block.program, part.digest, numbers)
 

@@ -43,7 +43,7 @@ def test_recalls_are_shares_of_the_queries(table, name):
     number = QUERIES[name] if table == "sequences" else printed_tables()["data_sets"][name][1]
     for row, by_name in printed_tables()[table].items():
         for value in by_name[name]:
-            assert min(abs(100 * right / number - value) for right in range(number + 1)) <= 0.0501, (row, value)
+            assert min(abs(100 * correct / number - value) for correct in range(number + 1)) <= 0.0501, (row, value)
 
 
 def test_steps_add_up():

@@ -36,7 +36,7 @@ def data(tmp_path_factory):
 
 
 def arguments(data, out):
-    return f"data={data}", "datasets=[grief_season,gardens_point]", SYSTEMS, f"out={out}", f"store={out.parent}/store"
+    return f"data={data}", "datasets=[grief_season,gardens_point]", SYSTEMS, f"out={out}", f"cache={out.parent}/store"
 
 
 @pytest.fixture(scope="module")

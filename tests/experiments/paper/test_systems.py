@@ -126,7 +126,7 @@ TOLERANCES = (1, 2, 5)
 
 def result(system, recall, *, decides=False, **more):
     return {"system": system, "recall_at": {"1": recall, "5": 0.9, "10": 1.0}, "decides": decides, "tolerance": 1,
-            "filter": {"name": "vlad"}, "features": {"name": "sift", "image_size": [336, 320]}, "candidates": 50,
+            "retrieval": {"name": "vlad"}, "features": {"name": "sift", "image_size": [336, 320]}, "candidates": 50,
             "parameters": {}} | more  # fmt: skip
 
 
@@ -147,7 +147,7 @@ def tables_of(evaluations):
 
 def test_a_rows_ranking_is_taken_from_its_evaluation():
     rows = {row.name: row for row in ROWS}
-    results = [result("filter", 0.1), result("histogram", 0.2, decides=True), result("histogram + filter", 0.3)]
+    results = [result("retrieval", 0.1), result("histogram", 0.2, decides=True), result("histogram + retrieval", 0.3)]
     recall = {name: row_result(rows[name], results).recall[OVERALL][1][1]
               for name in ("mixvpr", "mix_hist_50", "sift_hist_50", "sift_hist_comb_50")}  # fmt: skip
     assert recall == pytest.approx({"mixvpr": 10, "mix_hist_50": 20, "sift_hist_50": 20, "sift_hist_comb_50": 30})

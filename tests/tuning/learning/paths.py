@@ -4,7 +4,7 @@ import numpy as np
 
 from mfvpr import Shortlist
 from mfvpr.datasets import Positives
-from mfvpr.evaluation import Judge, halves
+from mfvpr.evaluation import EvaluationProtocol, halves
 from mfvpr.matching import MatchSet
 from mfvpr.tuning.learning.splits import training_splits
 from tests.builders import of_query, random_matches
@@ -15,14 +15,14 @@ SIZES = (96, 200)  # px, of every other image: the first is the smaller
 
 
 def matches_of(query, candidates, rng, sizes):
-    """Matches of one query with its candidates one after the other, and their counts; the right ones share a shift."""
+    """Matches of one query with its candidates, and their counts; those of correct candidates share a shift."""
     pairs = [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
              for c in candidates]  # fmt: skip
     return of_query(pairs)
 
 
 def path(*, sizes=SIZES, only_right=(), seed=0):
-    """Judge, matches, candidates: all frames are those of every query, in an order of its own; of some, one is."""
+    """Protocol, matches, candidates: all frames are those of every query, in an order of its own; of some, one is."""
     rng = np.random.default_rng(seed)
     indices = np.stack([rng.permutation(QUERIES) for _ in range(QUERIES)]).astype(np.int32)
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
@@ -32,11 +32,11 @@ def path(*, sizes=SIZES, only_right=(), seed=0):
     matches = MatchSet([flat for flat, _ in of_queries], np.array([counts for _, counts in of_queries]), 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
-    judge = Judge(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
-    return judge, matches, candidates
+    protocol = EvaluationProtocol(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
+    return protocol, matches, candidates
 
 
 def split(*, half=0, **options):
     """One half of it to learn on."""
-    judge, matches, candidates = path(**options)
-    return training_splits(matches, candidates, judge)[half]
+    protocol, matches, candidates = path(**options)
+    return training_splits(matches, candidates, protocol)[half]

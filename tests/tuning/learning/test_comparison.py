@@ -24,25 +24,25 @@ OPTIONS = Options(batch=4, hidden=5, inputs=ABSOLUTE)
 
 @pytest.mark.parametrize("half", [0, 1])
 def test_candidates_are_right_wrong_or_of_no_account(half):
-    """Right within the widest tolerance alone: neither positive nor negative. Reported places: not there at all."""
+    """Correct within the widest tolerance alone: neither positive nor negative. Reported places: not there at all."""
     at = split(half=half)
     batch = at.batch(at.train, len(at.train) + 2)
     reported = set(at.half.report.tolist())
-    kinds = {"right": 0, "wrong": 0, "near": 0, "hidden": 0}
+    kinds = {"correct": 0, "incorrect": 0, "near": 0, "hidden": 0}
     for row, query in enumerate(at.train):
         frames = dict(zip(at.candidates.scores[query].tolist(), at.candidates.indices[query].tolist(), strict=True))
-        rows = zip(batch.filter_scores[row].tolist(), batch.positives[row].tolist(), batch.mask[row], strict=True)
+        rows = zip(batch.retrieval_scores[row].tolist(), batch.positives[row].tolist(), batch.mask[row], strict=True)
         taught = {frames[score]: positive for score, positive, real in rows if real}
         for frame in range(QUERIES):
             apart = abs(frame - query)
             if any(abs(frame - other) <= TOLERANCES[2] for other in reported):
                 kind, expected = "hidden", None
             elif apart <= TOLERANCES[1]:
-                kind, expected = "right", True
+                kind, expected = "correct", True
             elif apart <= TOLERANCES[2]:
                 kind, expected = "near", None
             else:
-                kind, expected = "wrong", False
+                kind, expected = "incorrect", False
             assert taught.get(frame) is expected
             kinds[kind] += 1
     assert min(kinds.values()) > 0
@@ -122,8 +122,8 @@ def test_what_cannot_be_compared_is_refused():
     at = split()
     data = at.match_set, at.candidates
     with pytest.raises(InputError, match=r"MatchCount: .*numbers to learn"):
-        comparison.compare(Axes(MatchCount(), {}, {}), at.judge, *data)
-    without_halves = replace(at.judge, halves=(), split=None)
+        comparison.compare(Axes(MatchCount(), {}, {}), at.protocol, *data)
+    without_halves = replace(at.protocol, halves=(), split=None)
     with pytest.raises(InputError, match=r"split=None: .*first_half, second_half .*both"):
         comparison.compare(Axes(AggregatedScore(), {}, {}), without_halves, *data)
     with pytest.raises(InputError, match=r"split=first_half: .*queries .*got 0"):

@@ -21,8 +21,8 @@ from tests.tuning.learning.paths import QUERIES, TOLERANCES, path
 
 def part(name, seed, width=QUERIES):
     """A data set of its own; the best so many candidates of every query."""
-    judge, matches, candidates = path(seed=seed)
-    judge = replace(judge, halves=(), split=None)
+    protocol, matches, candidates = path(seed=seed)
+    protocol = replace(protocol, halves=(), split=None)
     keep = [int(ends[width - 1]) for ends in np.cumsum(matches.counts, axis=1)]
     flat = [
         replace(flat_matches, image_size1=flat_matches.image_size1[:width], count1=flat_matches.count1[:width],
@@ -31,7 +31,7 @@ def part(name, seed, width=QUERIES):
         for flat_matches, end in zip(matches.matches, keep, strict=True)
     ]  # fmt: skip
     matches = replace(matches, matches=flat, counts=matches.counts[:, :width])
-    return Part(name, judge, matches, jax.tree.map(lambda values: values[:, :width], candidates))
+    return Part(name, protocol, matches, jax.tree.map(lambda values: values[:, :width], candidates))
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +61,14 @@ def test_every_query_keeps_its_own(parts, joined):
             for name, values in per_match(matches).items():
                 np.testing.assert_array_equal(getattr(joined_matches, name)[:width], values)
             assert not joined_matches.mask[width:].any()
-            for level, positives in enumerate(joined.judge.positives):
-                right = data_set.judge.positives[level].of(query) + number * QUERIES
-                np.testing.assert_array_equal(positives.of(row), right)
-    assert joined.judge.reported_sets == {"c": QUERIES}
+            for level, positives in enumerate(joined.protocol.positives):
+                correct = data_set.protocol.positives[level].of(query) + number * QUERIES
+                np.testing.assert_array_equal(positives.of(row), correct)
+    assert joined.protocol.reported_sets == {"c": QUERIES}
 
 
 def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(joined):
-    [split] = training_splits(joined.match_set, joined.candidates, joined.judge)
+    [split] = training_splits(joined.match_set, joined.candidates, joined.protocol)
     assert split.name == "other sets"
     assert {*split.half.report} == {*range(2 * QUERIES, 3 * QUERIES)}
     for number in range(2):
@@ -83,7 +83,7 @@ def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(joi
 
 
 def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
-    [split] = training_splits(joined.match_set, joined.candidates, joined.judge)
+    [split] = training_splits(joined.match_set, joined.candidates, joined.protocol)
     scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
     compared = comparison._HalfComparison(split, Axes(scorer, {}, {}), Options(), None, untracked_stages)
     alone = training_splits(parts[2].match_set, parts[2].candidates, path(seed=2)[0])[0]
@@ -107,6 +107,6 @@ def test_sets_that_do_not_go_together_are_refused(parts):
     with pytest.raises(InputError, match=r"names, got a, b, a"):
         join_data_sets([a, b], [replace(c, name="a")])
     with pytest.raises(InputError, match=r"c: .*unit of a, frames, got m;"):
-        join_data_sets([a], [replace(c, judge=replace(c.judge, unit="m"))])
+        join_data_sets([a], [replace(c, protocol=replace(c.protocol, unit="m"))])
     with pytest.raises(InputError, match=r"c: .*thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
-        join_data_sets([a], [replace(c, judge=replace(c.judge, thresholds=(0, 1, 3)))])
+        join_data_sets([a], [replace(c, protocol=replace(c.protocol, thresholds=(0, 1, 3)))])

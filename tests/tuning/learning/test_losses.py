@@ -34,21 +34,21 @@ def softmax(scores):
 def oracle(name, scores, positives, mask, temperature=0.7):
     """The loss with loops over the real candidates."""
     real = [i for i in range(len(scores)) if mask[i]]
-    scores, right = [float(scores[i]) for i in real], [bool(positives[i]) for i in real]
-    if not any(right):
+    scores, correct = [float(scores[i]) for i in real], [bool(positives[i]) for i in real]
+    if not any(correct):
         return 0.0
     if name == "cross_entropy":
-        return -math.log(sum(p for p, is_right in zip(softmax(scores), right, strict=True) if is_right))
+        return -math.log(sum(p for p, is_correct in zip(softmax(scores), correct, strict=True) if is_correct))
     if name == "recall":
         scaled = softmax([score / temperature for score in scores])
-        return 1 - sum(p for p, is_right in zip(scaled, right, strict=True) if is_right)
+        return 1 - sum(p for p, is_correct in zip(scaled, correct, strict=True) if is_correct)
     precisions = []
     for i in range(len(scores)):
-        if not right[i]:
+        if not correct[i]:
             continue
         ahead = [1 / (1 + math.exp((scores[i] - scores[j]) / temperature)) for j in range(len(scores))]
         rivals = [j for j in range(len(scores)) if j != i]
-        among = 1 + sum(ahead[j] for j in rivals if right[j])
+        among = 1 + sum(ahead[j] for j in rivals if correct[j])
         precisions.append(among / (1 + sum(ahead[j] for j in rivals)))
     return 1 - sum(precisions) / len(precisions)
 

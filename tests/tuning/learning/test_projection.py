@@ -113,14 +113,14 @@ def test_a_projection_is_learned_through_soft_matching():
 
         return jax.vmap(lambda query: jax.vmap(lambda candidate: of_pair(query, candidate))(database))(queries)
 
-    right = np.eye(5, dtype=bool)
+    correct = np.eye(5, dtype=bool)
 
     def objective(projection, _):
-        return mean_loss(cross_entropy, scores(projection), right, np.ones_like(right))
+        return mean_loss(cross_entropy, scores(projection), correct, np.ones_like(correct))
 
     fitted = fit(start, objective, lambda step: 0, optimizer=optax.adam(0.1), steps=80, every=80)
     scores_of_both = [jax.jit(scores)(projection) for projection in (start, fitted.parameters)]
-    losses = [mean_loss(cross_entropy, of_pair, right, np.ones_like(right)) for of_pair in scores_of_both]
+    losses = [mean_loss(cross_entropy, of_pair, correct, np.ones_like(correct)) for of_pair in scores_of_both]
     recall = [np.mean(np.argmax(of_pair, axis=1) == np.arange(5)) for of_pair in scores_of_both]
     assert losses[1] < 0.5 * losses[0]
     assert recall[1] == 1.0 > recall[0]

@@ -1,4 +1,4 @@
-"""Matches that teach: which of them count as right, the loss against a loop, and what is learned from them."""
+"""Matches that teach: which of them count as correct, the loss against a loop, and what is learned from them."""
 
 import math
 from dataclasses import replace
@@ -23,9 +23,9 @@ SHIFT = (30, -20)
 TEACHER = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=RatioWeight(), max_bins=160)
 
 
-def pair(rng, right, size=24, capacity=30):
-    """Half of the matches of a right pair share a shift; these have the smaller ratios, wrong ones look alike."""
-    agree = (np.arange(size) < size // 2) & right
+def pair(rng, correct, size=24, capacity=30):
+    """Half of the matches of a correct pair share a shift; these have the smaller ratios, incorrect ones look alike."""
+    agree = (np.arange(size) < size // 2) & correct
     points0 = rng.uniform(50, 250, (size, 2))
     apart = rng.uniform(60, 150, (size, 2)) * rng.choice([-1, 1], (size, 2))  # further than the teacher's reach
     points1 = points0 + SHIFT + np.where(agree[:, None], 0, apart)
@@ -34,7 +34,7 @@ def pair(rng, right, size=24, capacity=30):
 
 
 def batch(seed=0, queries=4, candidates=3):
-    """The first candidate of every query is right; the last of the last query is none."""
+    """The first candidate of every query is correct; the last of the last query is none."""
     rng = np.random.default_rng(seed)
     pairs = [pair(rng, candidate == 0) for _ in range(queries) for candidate in range(candidates)]
     matches = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(queries, candidates, *leaves[0].shape), *pairs)
@@ -56,18 +56,18 @@ def test_the_loss_is_that_of_a_loop():
     start = start_model.start | {
         "weight": replace(start_model.start["weight"], output=output, output_bias=np.float32(0.3))
     }
-    right, wrong = [], []
+    correct, incorrect = [], []
     for query, candidate in np.argwhere(taught.mask):
         matches = jax.tree.map(lambda leaf: leaf[query, candidate], taught.matches)  # noqa: B023
         logits = np.asarray(start["weight"].logits(matches), np.float64)
         for k in np.flatnonzero(matches.mask):
             off = np.abs(matches.points1[k] - matches.points0[k] - np.float32(SHIFT)).max()
             if taught.positives[query, candidate] and off < 2:
-                right.append(math.log1p(math.exp(-logits[k])))
+                correct.append(math.log1p(math.exp(-logits[k])))
             else:
-                wrong.append(math.log1p(math.exp(logits[k])))
-    assert len(right) == 4 * 12
-    expected = (np.mean(right) + np.mean(wrong)) / 2
+                incorrect.append(math.log1p(math.exp(logits[k])))
+    assert len(correct) == 4 * 12
+    expected = (np.mean(correct) + np.mean(incorrect)) / 2
     assert float(jax.jit(start_model.objective(None))(start, taught)) == pytest.approx(expected, rel=1e-5)
 
 

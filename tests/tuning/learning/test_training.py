@@ -182,10 +182,10 @@ def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
         train(validate=lambda parameters: np.nan if parameters["slope"] != 1 else 0.0)
 
 
-@pytest.mark.parametrize("wrong", [{"every": 0}, {"steps": -1}, {"patience": 0}, {"patience": 1, "validate": None}])
-def test_impossible_settings_are_refused(wrong):
+@pytest.mark.parametrize("incorrect", [{"every": 0}, {"steps": -1}, {"patience": 0}, {"patience": 1, "validate": None}])
+def test_impossible_settings_are_refused(incorrect):
     with pytest.raises(ValueError, match=r"patience .*validate"):
-        train(**wrong)
+        train(**incorrect)
 
 
 def test_progress_is_told():

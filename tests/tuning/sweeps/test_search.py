@@ -9,7 +9,7 @@ import pytest
 import mfvpr
 from mfvpr import InputError
 from mfvpr.datasets import FrameTruth
-from mfvpr.evaluation import best_setting, hits, judge, statistics
+from mfvpr.evaluation import best_setting, evaluation_protocol, hits, statistics
 from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, search
@@ -30,7 +30,7 @@ def data():
 @pytest.fixture(scope="module")
 def outcome(data):
     axes = Axes(SUM, WEIGHTS, {"weight": "dmf", "c": 2})
-    return sweeping.search_grid(axes, judge(TRUTH, TOLERANCES, "both"), *data, ks=[5, 1])
+    return sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES, "both"), *data, ks=[5, 1])
 
 
 def test_words_become_values():
@@ -55,16 +55,16 @@ def test_one_axis_less():
 def test_bins_that_do_not_fit_are_refused_before_any_work(data):
     axes = Axes(mfvpr.HistogramOfShifts(), {"bin_size": [15.0, 0.01]}, {"bin_size": 15.0})
     with pytest.raises(InputError, match=r"bin_size=0\.01: expected at most 1024 bins"):
-        sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, track=lambda _: pytest.fail("begun"))
+        sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, track=lambda _: pytest.fail("begun"))
 
 
 def test_what_is_no_word_or_has_no_own_value_is_refused(data):
     words = Axes(SUM, {"weight": [mfvpr.UnitWeight()]}, {"weight": "fs"})
     with pytest.raises(InputError, match=r"weight=UnitWeight\(\): .*fs, dmf, ratio, unit"):
-        sweeping.search_grid(words, judge(TRUTH, TOLERANCES), *data)
+        sweeping.search_grid(words, evaluation_protocol(TRUTH, TOLERANCES), *data)
     without = Axes(SUM, {"weight": ["fs"], "c": [0]}, {"weight": "fs"})
     with pytest.raises(InputError, match=r"own: .*weight, c, got weight"):
-        sweeping.search_grid(without, judge(TRUTH, TOLERANCES), *data)
+        sweeping.search_grid(without, evaluation_protocol(TRUTH, TOLERANCES), *data)
 
 
 def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outcome):
@@ -75,13 +75,13 @@ def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outc
     settings = [
         {"weight": weights[row["weight"]], "c": None if row["c"] == "auto" else row["c"]} for row in outcome.settings
     ]
-    rows = sweeping.sweep(SUM, settings, *data, views=outcome.judge.views, depth=5)
+    rows = sweeping.sweep(SUM, settings, *data, views=outcome.protocol.views, depth=5)
     np.testing.assert_array_equal(outcome.rows, rows)
 
 
 def test_own_values_that_the_grid_has_are_ranked_once(data):
     axes = Axes(SUM, {"weight": ["fs", "dmf"]}, {"weight": "dmf"})
-    outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
+    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, ks=[1])
     assert (len(outcome.settings), outcome.own) == (2, 1)
     [chosen] = outcome.chosen
     assert outcome.recall[chosen, 1] == outcome.recall[:, 1].max()
@@ -91,14 +91,14 @@ def test_own_values_that_the_grid_has_are_ranked_once(data):
 
 def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     """The scorer's own values are beside the grid, and never chosen."""
-    right = outcome.judge.positives[1]
+    right = outcome.protocol.positives[1]
     first, of_scorer = [], []
-    for view, half, chosen in zip((1, 2), outcome.judge.halves, outcome.chosen, strict=True):
+    for view, half, chosen in zip((1, 2), outcome.protocol.halves, outcome.chosen, strict=True):
         tuned = hits(outcome.rows[view][:4, half.tune], right.take(half.tune)).mean(axis=1)
         assert chosen == best_setting(tuned, WEIGHTS)
         first += hits(outcome.rows[0][chosen], right)[half.report].tolist()
         of_scorer += hits(outcome.rows[0][4], right)[half.report].tolist()
-    path = np.argsort(np.concatenate([half.report for half in outcome.judge.halves]))
+    path = np.argsort(np.concatenate([half.report for half in outcome.protocol.halves]))
     first, of_scorer = np.array(first)[path], np.array(of_scorer)[path]
     verdict = outcome.report[1]
     assert (verdict.threshold, verdict.queries) == (TOLERANCES[1], QUERIES)
@@ -125,7 +125,7 @@ def test_optuna_draws_within_the_axes():
 def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
     pytest.importorskip("optuna")
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
-    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES), *data, trials=3, seed=1, ks=[1])
+    outcome = sweeping.search_optuna(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, trials=3, seed=1, ks=[1])
     assert outcome.settings[0] == axes.own
     assert outcome.rows.shape == (1, 4, QUERIES, 1)
     assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
@@ -139,10 +139,12 @@ def test_optuna_learns_from_the_queries_that_choose(data, monkeypatch):
     values = []
     monkeypatch.setattr(optuna.Study, "tell", lambda study, trial, value: values.append(value))
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
-    outcome = sweeping.search_optuna(axes, judge(TRUTH, TOLERANCES, "both"), *data, trials=3, seed=1, ks=[1])
-    tuning = outcome.judge.tuning(outcome.rows)[:, 1:, outcome.judge.main].mean(axis=0)
+    outcome = sweeping.search_optuna(
+        axes, evaluation_protocol(TRUTH, TOLERANCES, "both"), *data, trials=3, seed=1, ks=[1]
+    )
+    tuning = outcome.protocol.tuning(outcome.rows)[:, 1:, outcome.protocol.main].mean(axis=0)
     np.testing.assert_array_equal(values, tuning)
-    assert (tuning != outcome.recall[1:, outcome.judge.main]).all()  # of all queries, reported ones among them
+    assert (tuning != outcome.recall[1:, outcome.protocol.main]).all()  # of all queries, reported ones among them
 
 
 def test_what_people_read_is_what_was_measured(outcome):
@@ -164,7 +166,7 @@ def test_what_people_read_is_what_was_measured(outcome):
 
 def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
     axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
-    outcome = sweeping.search_grid(axes, judge(TRUTH, TOLERANCES), *data, ks=[1])
+    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, ks=[1])
     assert "neighbors" not in sweeps.sweep_summary(outcome)
     monkeypatch.setattr(sweeps, "TOP", 2)
     assert "The best, and its neighbors in the grid:" in sweeps.sweep_summary(outcome)

@@ -233,7 +233,7 @@ OTHER_DATA = {
     "shortlist": lambda matches, listed: (
         matches, replace(listed, indices=np.where(listed.mask, listed.indices[:, ::-1], -1))
     ),
-    "filter": lambda matches, listed: (matches, replace(listed, scores=listed.scores[:, ::-1])),
+    "retrieval": lambda matches, listed: (matches, replace(listed, scores=listed.scores[:, ::-1])),
 }  # fmt: skip
 
 
@@ -274,8 +274,8 @@ def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_p
         (scorer(1.0), limits, {"ties": "index"}),
         (lambda matches: mfvpr.MatchCount()(matches), limits, {}),
         (lambda matches: -mfvpr.MatchCount()(matches), limits, {}),
-        (mfvpr.MatchCount(), fused, {"filter_score": "cosine"}),
-        (mfvpr.MatchCount(), fused, {"filter_score": "negative_euclidean"}),
+        (mfvpr.MatchCount(), fused, {"retrieval_score": "cosine"}),
+        (mfvpr.MatchCount(), fused, {"retrieval_score": "negative_euclidean"}),
     ):
         sweep_with_folder(tmp_path, changed_scorer, settings, *data, **options)
 

@@ -24,9 +24,9 @@ for (const button of document.querySelectorAll("table.sortable th button")) {
   button.addEventListener("click", () => sort(button));
 }
 
-// Pictures and answers are shown that every filter lets through.
+// Pictures and predictions that pass every filter are shown.
 const filters = [...document.querySelectorAll("[data-filter]")];
-const kinds = { pictures: document.querySelectorAll(".picture"), answers: document.querySelectorAll("tr[data-outcome]") };
+const kinds = { pictures: document.querySelectorAll(".picture"), predictions: document.querySelectorAll("tr[data-outcome]") };
 
 function filter() {
   const counts = Object.entries(kinds).filter(([, items]) => items.length).map(([kind, items]) => {

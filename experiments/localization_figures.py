@@ -10,9 +10,9 @@ from jaxtyping import UInt8
 from experiments import build
 from experiments.console import tell
 from experiments.settings import SettingsError
-from mfvpr.localization import Asked, Map
-from mfvpr.report.answers import answer_figure
+from mfvpr.localization import Localization, Map
 from mfvpr.report.file_names import file_names
+from mfvpr.report.localizations import localization_figure
 
 
 class AnswerFigures:
@@ -28,7 +28,7 @@ class AnswerFigures:
             raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
     def draw(
-        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Asked
+        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Localization
     ) -> dict[str, Any]:
         """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
         names = {number, name, PurePath(name).name}
@@ -38,7 +38,7 @@ class AnswerFigures:
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = self._out / f"{file}.png"
         try:
-            answer_figure(path, self._map, name, pixels, localized, root=self._root)
+            localization_figure(path, self._map, name, pixels, localized, root=self._root)
         except Exception as error:
             self._failed += 1
             tell(f"warning: {path}: not drawn ({error})")

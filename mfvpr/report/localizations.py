@@ -8,8 +8,8 @@ from jaxtyping import UInt8
 
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.evaluation.stages import explain
-from mfvpr.localization.answers import Asked
 from mfvpr.localization.map import Map
+from mfvpr.localization.predictions import Localization
 from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
@@ -19,16 +19,16 @@ _GRAY = 150  # of an image that is not at hand
 _NAME_LENGTH = 80  # characters of a name or a place
 
 
-def answer_figure(
+def localization_figure(
     path: Path,
     known: Map,
     name: str,
     image: UInt8[np.ndarray, "height width 3"],
-    localization: Asked,
+    localization: Localization,
     *,
     root: Path | None = None,
 ) -> None:
-    """Write the figure of one answer: the image beside the best candidate, their matches, the histogram of shifts.
+    """Write the figure of one prediction: the image beside the best candidate, their matches, the histogram of shifts.
 
     `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be
     read is drawn gray, as are all without a folder.
@@ -36,22 +36,26 @@ def answer_figure(
     Raises:
         InputError: the candidate's name leads out of the folder.
     """
-    answer, extractor = localization.answer, known.extractor
+    prediction, extractor = localization.prediction, known.extractor
     width, height = extractor.image_size
     candidate = Candidate(np.full((height, width, 3), _GRAY, np.uint8), "no candidate")
     if localization.matches is not None:
-        best = answer.alternatives[0].name
+        best = prediction.alternatives[0].name
         shown, note = candidate.image, " (its image is not at hand)"
         if root is not None:
             file = below(root, best)
             with suppress(InputError):  # the map keeps features, not images
                 shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
-        p = "" if answer.p_right is None else f", p(right) {answer.p_right:.2f}"
-        caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {answer.score:.5g}{p}"
+        p = "" if prediction.confidence is None else f", confidence {prediction.confidence:.2f}"
+        caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {prediction.score:.5g}{p}"
         candidate = Candidate(shown, caption, localization.matches, explain(histogram, localization.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
-    place = f"no place ({answer.reason})" if answer.place is None else clip_middle(str(answer.place), _NAME_LENGTH)
+    place = (
+        f"no place ({prediction.reason})"
+        if prediction.place is None
+        else clip_middle(str(prediction.place), _NAME_LENGTH)
+    )
     title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
-    about = {"image": name, "place": str(answer.place)}
+    about = {"image": name, "place": str(prediction.place)}
     histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)

@@ -27,14 +27,14 @@ class Alternative:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Prediction:
     """The place of an image, with its confidence and the alternatives.
 
     Attributes:
         place: of the best candidate; None = no place, and `reason` says why.
         alternatives: all candidates, best first; empty if there is no place for another reason than "low confidence".
         score: of the best candidate; 0 if there is none.
-        p_right: probability that the top prediction is correct; None without a confidence or without candidates.
+        confidence: probability that the top prediction is correct; None without a confidence or without candidates.
         shift: (x, y) px of the image that the detector saw, from the query's center to the same point in the best
             candidate; None without a place, if no match votes, or if the score is no histogram of shifts.
         shift_interval: its 95 % interval (low, high), each (x, y); None likewise.
@@ -45,7 +45,7 @@ class Answer:
     place: Any
     alternatives: tuple[Alternative, ...]
     score: float
-    p_right: float | None
+    confidence: float | None
     shift: tuple[float, float] | None
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
     scale: float | None
@@ -64,19 +64,19 @@ class Answer:
         return values
 
 
-class Asked(NamedTuple):
-    """An answer with the features and matches that led to it.
+class Localization(NamedTuple):
+    """A prediction with the features and matches that led to it.
 
-    answer: to the query.
+    prediction: to the query.
     described: features and global descriptor of the query, with which it can be added to the map.
     matches: with the best candidate, `[K, ...]`, NumPy; None if there is none.
     """
 
-    answer: Answer
+    prediction: Prediction
     described: Described
     matches: Matches | None
 
 
-def refusal(reason: Reason, described: Described) -> Asked:
-    """An answer without place and candidates."""
-    return Asked(Answer(None, (), 0.0, None, None, None, None, reason), described, None)
+def refusal(reason: Reason, described: Described) -> Localization:
+    """A prediction without place and candidates."""
+    return Localization(Prediction(None, (), 0.0, None, None, None, None, reason), described, None)
