@@ -34,7 +34,7 @@ def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
     """The figures that there are numbers for; of each data set, the best row shows its histogram and failures."""
     folders = {name: evaluations.folders[name, row.run] for name in evaluations.datasets
                for row in reversed(evaluations.best_rows) if (name, row.run) in evaluations.folders}  # fmt: skip
-    histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("right_*.png")))
+    histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("correct_*.png")))
     if histogram := next(histograms, None):
         yield "histogram.png", partial(_copy, source=histogram)
     if groups := mean_recalls(evaluations):

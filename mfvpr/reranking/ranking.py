@@ -63,7 +63,7 @@ def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array,
 
 
 def combine(
-    retrieval_scores: Num[Array, "*batch candidates"],
+    filter_scores: Num[Array, "*batch candidates"],
     rerank_scores: Num[Array, "*batch candidates"],
     *,
     c: float | Array = 1e6,
@@ -71,11 +71,11 @@ def combine(
     """Combined score s = c s_f + s_r, equation 4 (paper, section IV-E).
 
     Args:
-        retrieval_scores: s_f, retrieval scores.
+        filter_scores: s_f, retrieval scores (the paper's filter).
         rerank_scores: s_r, re-ranking scores.
         c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
-    return c * retrieval_scores + rerank_scores
+    return c * filter_scores + rerank_scores
 
 
 def balancing_c(
@@ -137,7 +137,8 @@ def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> 
     if kind == "cosine":
         return cosine
     if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
-        raise InputError(f"retrieval_score=negative_euclidean: expected cosine similarities, got {largest:.4g}; "
+        raise InputError("retrieval_score=negative_euclidean: expected cosine similarities up to 1, got "
+                         f"{largest:.4g}; "
                          "use cosine, which takes any score")  # fmt: skip
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 

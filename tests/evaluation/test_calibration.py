@@ -30,7 +30,7 @@ def rank_by_scores(scores, rows):
 
 @pytest.fixture(scope="module")
 def rankings():
-    """Rankings of a system and of the filter: 30 queries, 20 of 60 images; lists are short, empty, or of one place."""
+    """Rankings of a system and of retrieval: 30 queries, 20 of 60 images; lists are short, empty, or of one place."""
     rng = np.random.default_rng(0)
     rows = np.argsort(rng.random((30, 60)), axis=1)[:, :20]
     rows[rng.random(rows.shape) < 0.1] = -1
@@ -42,8 +42,8 @@ def rankings():
 
 @pytest.mark.parametrize("apart", [0, 5])
 def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
-    system, filtered = rankings
-    inputs = confidence_inputs(system, filtered, inputs=NAMES, apart=apart)
+    system, by_retrieval = rankings
+    inputs = confidence_inputs(system, by_retrieval, inputs=NAMES, apart=apart)
     for query, (rows, scores) in enumerate(zip(system.rows.tolist(), system.scores.tolist(), strict=True)):
         if rows[0] < 0:
             assert np.isnan(inputs[query]).all()
@@ -54,7 +54,7 @@ def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
         spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(elsewhere) + 2))
         margin = math.log(1 + (scores[0] - max(elsewhere)) / spread) if elsewhere else math.inf
         height = math.log(1 + (scores[0] - statistics.fmean(elsewhere)) / spread) if elsewhere else math.inf
-        place = [row >= 0 and abs(row - rows[0]) <= apart for row in filtered.rows[query].tolist()]
+        place = [row >= 0 and abs(row - rows[0]) <= apart for row in by_retrieval.rows[query].tolist()]
         expected = [margin, height, -math.log(1 + place.index(True)), math.asinh(scores[0])]
         np.testing.assert_allclose(inputs[query], expected, rtol=1e-9)
     assert np.isinf(inputs[4, :2]).all() == (apart == 5)
@@ -172,7 +172,7 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
 
 
 def test_queries_without_an_answer_are_reranked_first():
-    """Then those that the filter is the least sure of."""
+    """Then those that retrieval is the least sure of."""
     probabilities, correct = np.linspace(0.99, 0.01, 20), {"retrieval": np.zeros(20, bool), "it": np.zeros(20, bool)}
     probabilities[3] = np.nan
     correct["it"][3] = correct["retrieval"][19] = True

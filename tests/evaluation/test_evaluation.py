@@ -126,8 +126,8 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several)
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
     result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
     calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
-    predictions, filtered = result.systems["count"], result.systems["retrieval"]
-    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, filtered, strict=True)])
+    predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
+    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
     correct, halved = calibrated.correct("count"), halves(dataset.truth.positives(1))
     for half in halved:
         fitted = fit_confidence(inputs[half.tune], correct[half.tune])
@@ -138,7 +138,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several)
 
 
 class Vectors:
-    """A filter's extractor that knows nothing of local features."""
+    """A global extractor that knows nothing of local features."""
 
     image_size, interpolation, batch_size, vector_size, scales = (8, 8), "pil_bilinear", 4, 192, ()
     recipe = "thumbnails"
@@ -214,12 +214,12 @@ def at(dataset, root, suffix):
 
 def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result):
     local = FeatureFiles(at(dataset, files, ".npz"))
-    filters = {
+    retrievers = {
         "aggregated": Retrieval(Aggregated(local, VladFitting(num_words=8))),
         "descriptors": DescriptorFiles(at(dataset, files, "_vectors.npz")),
         "pairs": ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")}),
     }
-    for name, chosen in filters.items():
+    for name, chosen in retrievers.items():
         imported_result = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
         for system in ("retrieval", "histogram", "count"):
             [got], [expected] = imported_result.systems[system], result.systems[system]
@@ -358,7 +358,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
 
 
 def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
-    names = ["count_filter", "count + retrieval", "../../up", "count"]
+    names = ["count_retrieval", "count + retrieval", "../../up", "count"]
     systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
     write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1], "count"))
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -388,4 +388,4 @@ def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
     for name in (*names, "real", "second"):
         folder = tmp_path / "out" / "sequences" / name
-        assert {path.name for path in folder.rglob("*.csv")} >= {"predictions.csv", "filter.csv", "count.csv"}
+        assert {path.name for path in folder.rglob("*.csv")} >= {"predictions.csv", "retrieval.csv", "count.csv"}

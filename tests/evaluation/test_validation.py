@@ -82,14 +82,14 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"candidates": 0}, r"candidates=0: expected .*'all'"),
         ({"candidates": "some"}, "candidates='some': expected"),
         ({"candidates": 2.5}, "candidates=2.5: expected"),
-        ({"ties": "indx"}, "ties='indx': expected one of retriever, index"),
+        ({"ties": "indx"}, "ties='indx': expected one of retrieval, index"),
         ({"memory": -1}, "memory=-1: expected GB above 0, or None"),
         ({"memory": np.nan}, "memory=nan: expected GB"),
         ({"fused": {"nope": Fusion()}}, r"fused: .*\(histogram\), got nope"),
-        ({"correlated": {"retrieval": FRAMES}}, r"correlated: .*\(histogram\), got filter"),
+        ({"correlated": {"retrieval": FRAMES}}, r"correlated: .*\(histogram\), got retrieval"),
         ({"scorers": HISTOGRAM | {"histogram + frames": mfvpr.MatchCount()}, "correlated": {"histogram": FRAMES}},
          r"histogram \+ frames .*system"),
-        ({"scorers": {"retrieval": mfvpr.MatchCount()}}, r"retriever .*system"),
+        ({"scorers": {"retrieval": mfvpr.MatchCount()}}, r"retrieval .*system"),
         ({"scorers": HISTOGRAM | {"histogram + retrieval": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
          r"histogram \+ retrieval .*system"),
         ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*the class MatchCount"),
@@ -143,10 +143,10 @@ def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
     np.testing.assert_array_equal(counts[2], counts[0])
 
 
-def test_no_scorer_is_the_filter_alone(dataset):
+def test_no_scorer_is_retrieval_alone(dataset):
     result = evaluate(dataset, scorers={}, candidates=np.int64(3))
     assert list(result.systems) == ["retrieval"]
-    assert repr(result) == "Result(folder: folder (10 queries); retriever)"
+    assert repr(result) == "Result(folder: folder (10 queries); retrieval)"
     [ranked] = result.systems["retrieval"]
     np.testing.assert_array_equal(ranked.shortlist.indices, ranked.rows)
 

@@ -21,7 +21,7 @@ RATES = dict(
 
 def test_one_machine_takes_what_its_parts_take():
     plan = forecast(RATES, images=1000, queries=10, candidates=5, machines=1)
-    expected = {"describing": 500, "asking": 7.5, "filtering": 10, "merging": 0, "extracting": 50 * 0.375,
+    expected = {"describing": 500, "asking": 7.5, "retrieving": 10, "merging": 0, "extracting": 50 * 0.375,
                 "reranking": 20, "answering": 7.5 + 10 + 18.75 + 20, "memory": 2_048_000, "disk": 50_000}  # fmt: skip
     assert plan == pytest.approx(expected)
 
@@ -31,7 +31,7 @@ def test_machines_divide_all_but_the_merging():
     assert four["merging"] == pytest.approx(1e-2 * 10 * 5 * 4)
     for name in ("describing", "asking", "extracting", "reranking", "memory", "disk"):
         assert four[name] == pytest.approx(single[name] / 4)
-    for name in ("filtering", "answering"):
+    for name in ("retrieving", "answering"):
         assert four[name] == pytest.approx(single[name] / 4 + four["merging"])
 
 

@@ -96,12 +96,12 @@ def test_version(succeed, program):
     ("evaluate", ["fusion.weights={retrieval: 2}"], "{'retrieval': 2}: expected fusion.c=zscore"),
     ("evaluate", ["system=mfvpr", "fusion.c=auto"], "1}: expected fusion.c=zscore"),
     *(
-        ("evaluate", ["system=mfvpr", f"fusion.weights.filter={wrong}"], f".filter={wrong}: expected a number")
+        ("evaluate", ["system=mfvpr", f"fusion.weights.retrieval={wrong}"], f".retrieval={wrong}: expected a number")
         for wrong in (0, -1, "nan", "inf", "x")
     ),
-    ("evaluate", ["fusion.weights.filter=2"], "the nearest is fusion.weights"),
+    ("evaluate", ["fusion.weights.retrieval=2"], "the nearest is fusion.weights"),
     ("evaluate", ["fusion.weights=[2]"], "fusion.weights=[2]: expected weights"),
-    ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected filter"),
+    ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected retrieval"),
     ("evaluate", ["system=mfvpr", "scorer=histogram"], "(histogram), got anchor; choose scorer=all"),
     ("evaluate", ["=5"], "=5: expected name=value"),
     ("evaluate", [".=5"], ".=5: expected name=value"),

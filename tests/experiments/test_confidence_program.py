@@ -59,7 +59,7 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
     assert [(line["query"], line["prediction"], line["score"], line["correct"]) for line in predictions] == [
         (line["query"], line["database"], line["score"], line["correct"]) for line in predictions
     ]
-    probability = np.array([float(line["p"]) for line in predictions])
+    probability = np.array([float(line["confidence"]) for line in predictions])
     assert len(np.unique(probability)) > QUERIES / 2
     table = {line["system"]: line for line in csv_rows(out / "confidence.csv")}
     assert tuple(table) == SYSTEMS
@@ -74,9 +74,9 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
         assert table[system]["AP by score"] == f"{100 * curve.average_precision:.1f}"
         assert table[system]["R@100P by score"] == f"{100 * curve.recall_at(1):.1f}"
     error = reliability(probability, hits["histogram"]).calibration_error
-    assert table["histogram"]["ECE of p"] == f"{100 * error:.1f}"
+    assert table["histogram"]["ECE"] == f"{100 * error:.1f}"
     average_precision = precision_recall(probability, hits["histogram"]).average_precision
-    assert table["histogram"]["AP by p"] == f"{100 * average_precision:.1f}"
+    assert table["histogram"]["AP by confidence"] == f"{100 * average_precision:.1f}"
     shares = csv_rows(out / "rerank_share.csv")
     for line, system in ((shares[0], "retrieval"), (shares[-1], "histogram")):
         assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
@@ -98,7 +98,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
     assert header.endswith("correct  incorrect  refused  of these correct")
     predictions = csv_rows(out / "top_predictions.csv")
-    probability, score = (np.array([float(line[name]) for line in predictions]) for name in ("p", "score"))
+    probability, score = (np.array([float(line[name]) for line in predictions]) for name in ("confidence", "score"))
     refused = probability < 0.4
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
@@ -110,7 +110,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     line = next(line for line in csv_rows(out / "confidence.csv") if line["system"] == "histogram")
     counts = [int(line[name]) for name in ("correct", "incorrect", "refused", "of these correct")]
     assert counts == [(correct & ~refused).sum(), (~correct & ~refused).sum(), refused.sum(), (correct & refused).sum()]
-    assert line["ECE of p"] == f"{100 * reliability(probability, correct).calibration_error:.1f}"
+    assert line["ECE"] == f"{100 * reliability(probability, correct).calibration_error:.1f}"
     predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
     assert [line["query"] for line in none] == [
@@ -161,7 +161,7 @@ def test_what_cannot_say_how_sure_answers_are_is_refused(refused, settings, word
 def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
     del content["systems"]["histogram"]
     (tmp_path / "other.json").write_text(json.dumps(content))
-    assert "got filter, histogram + retrieval; " in refused(f"confidence={tmp_path}/other.json")
+    assert "got retrieval, histogram + retrieval; " in refused(f"confidence={tmp_path}/other.json")
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_a_single_candidate_leaves_nothing_to_say(evaluate, refused):
     first, *_ = evaluate("first", "candidates=1")
     line = csv_rows(first / "confidence.csv")[0]
     assert line["AP by score"]
-    assert {line[name] for name in line if " by p" in name or "ECE" in name or name == "by chance"} == {""}
+    assert {line[name] for name in line if " by confidence" in name or "ECE" in name or name == "by chance"} == {""}
     error = refused("candidates=1", f"confidence={first}/confidence.json")
     assert "expected p of systems, got none" in error
 

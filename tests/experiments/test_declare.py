@@ -153,7 +153,7 @@ def test_its_parameters_are_swept(near, root, tmp_path, succeed):
     recall = {radius: set() for radius in (0.001, 20)}
     for entry in content["settings"][:8]:
         recall[entry["parameters"]["radius"]].add(json.dumps(entry["recall_at"]))
-    assert len(recall[0.001]) == 1  # nothing is that near: the filter's order
+    assert len(recall[0.001]) == 1  # nothing is that near: retrieval's order
     assert len(recall[20]) > 1
 
 

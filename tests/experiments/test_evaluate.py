@@ -152,13 +152,13 @@ def demo(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_demo_ranks_histogram_above_count_above_filter(demo):
+def test_demo_ranks_histogram_above_count_above_retrieval(demo):
     _, folder = demo
     rows = json.loads((folder / "results.json").read_text())
     recall = {(row["system"], row["tolerance"]): row["recall_at"]["1"] for row in rows}
     for tolerance in (1, 2, 5):
         assert recall["histogram", tolerance] > recall["count", tolerance]
-    for tolerance in (1, 2):  # within 5 frames the filter alone finds as many
+    for tolerance in (1, 2):  # within 5 frames retrieval alone finds as many
         assert recall["count", tolerance] > recall["retrieval", tolerance]
 
 

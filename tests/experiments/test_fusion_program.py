@@ -38,7 +38,7 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert parameters[f"{SYSTEM} + frames"] == parameters[SYSTEM] | {"previous": 1, "reach": 15.0, "gain": 0.4}
     decided = out / "predictions" / "histogram_anchor_retrieval.csv"
     assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
-    scores = [score for _, _, score in ranked(out, "histogram_anchor_filter")]
+    scores = [score for _, _, score in ranked(out, "histogram_anchor_retrieval")]
     for query in range(QUERIES):  # standardized: their mean is 0
         of_query = scores[query * CANDIDATES : (query + 1) * CANDIDATES]
         assert sum(of_query) == pytest.approx(0, abs=1e-3)
@@ -46,7 +46,7 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
 
 
-def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
+def test_of_retrieval_and_score_it_ranks_as_auto(root, tmp_path):
     places = {}
     for c in ("auto", "zscore"):
         more = ("scorer=histogram", f"fusion.c={c}", "figures=0", f"out={tmp_path}/{c}")
@@ -61,9 +61,9 @@ def test_of_filter_and_score_it_ranks_as_auto(root, tmp_path):
     assert [line[:2] for line in places["auto"]] == [line[:2] for line in places["zscore"]]
 
 
-def test_our_system_fuses_two_scores_and_the_filter():
+def test_our_system_fuses_two_scores_and_retrieval():
     for arguments, features, side, weight in (
-        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.filter=1"], "sift", 336, 1),
+        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.retrieval=1"], "sift", 336, 1),
     ):  # fmt: skip
         config = composed("system=mfvpr", *arguments)
         settings.check(config)
@@ -87,10 +87,10 @@ def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_p
     assert rows[name]["parameters"]["cohort"] == 1
     retrieval_scores, cohort_scores, fused = (
         {line[:2]: line[2] for line in ranked(tmp_path / "out", system)}
-        for system in ("retrieval", "histogram_cohort", "histogram_cohort_filter")
+        for system in ("retrieval", "histogram_cohort", "histogram_cohort_retrieval")
     )
     for query in {query for query, _ in fused}:
         pairs = [pair for pair in fused if pair[0] == query]
         scores = [np.array([part[pair] for pair in pairs]) for part in (retrieval_scores, cohort_scores)]
-        filtered, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
-        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * filtered + 2 * normalized, atol=1e-2)
+        by_retrieval, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
+        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * by_retrieval + 2 * normalized, atol=1e-2)

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.slow
 
 SUM = ("scorer=sum",)
 SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
-ROWS = [name + filtered for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
-        for filtered in ("", " + retrieval")]  # fmt: skip
+ROWS = [name + fused for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
+        for fused in ("", " + retrieval")]  # fmt: skip
 WIDEST = 1  # frames
 
 
@@ -90,7 +90,7 @@ def test_pictures_and_weights(learned):
         picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
         assert min(picture.shape) > 200
         assert picture.std() > 10
-    for name in ("match_weights", "match_weights_filter", "match_labels"):
+    for name in ("match_weights", "match_weights_retrieval", "match_labels"):
         weight, origin = read_weight(out / "weights" / f"first_half_{name}.json")
         assert weight.hidden.shape == (5, 16)
         assert origin["settings"]["seed"] == 0
@@ -163,10 +163,10 @@ def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp
 def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
     extra = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
     rows = rows_of(learn(tmp_path / "out", *SUM, *extra, *axes, "split=first_half", "steps=1"))
-    for filtered in ("", " + retrieval"):
-        searched, expected = rows[f"grid search{filtered}"], rows[f"paper{filtered}"]
+    for fused in ("", " + retrieval"):
+        searched, expected = rows[f"grid search{fused}"], rows[f"paper{fused}"]
         assert searched["recall_at_1"] == expected["recall_at_1"]
-        assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not filtered else set())
+        assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not fused else set())
 
 
 def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
@@ -190,8 +190,8 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
         learn(tmp_path / "out", *again)
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
     assert learn(tmp_path / "out", *again) == learned[1]
-    assert saved[:4] == [(f"first_half-gradient{more}", step) for more in ("", "_filter") for step in (2, 4)]
-    assert saved[4:6] == [("first_half-gradient_filter", 4), ("first_half-match_weights", 2)]
+    assert saved[:4] == [(f"first_half-gradient{more}", step) for more in ("", "_retrieval") for step in (2, 4)]
+    assert saved[4:6] == [("first_half-gradient_retrieval", 4), ("first_half-match_weights", 2)]
 
 
 def test_what_is_trained_already_is_not_trained_again(learn, learned, tmp_path, monkeypatch):

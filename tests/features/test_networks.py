@@ -112,7 +112,7 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, tmp_pat
     (["retrieval=mixvpr"], "weights none stated"),
     (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
     (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
-    (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's filter takes [224, 224] only"),
+    (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's retrieval takes [224, 224] only"),
     (["features=aliked", "features.weights=alikd-n16"], "expected weights of aliked: one of"),
     (["matching=lightglue"], "python -m experiments.weights download aliked_lightglue"),
     (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
@@ -147,10 +147,10 @@ def test_mistakes_with_installed_weights_are_one_line(evaluate, options, words):
     ("netvlad", ("retrieval.weights=patchnetvlad_mapillary_128", "retrieval.components=32")),
     ("gem", ("retrieval.weights=cosplace_vgg16_512",)),
 ])  # fmt: skip
-def test_global_descriptors_of_networks_are_filters(evaluate, weights, small_street, tmp_path, name, options):
+def test_global_descriptors_of_networks_are_retrievers(evaluate, weights, small_street, tmp_path, name, options):
     size = "retrieval.image_size=[96,64]"
     stderr = evaluate(f"retrieval={name}", *options, size, "candidates=3", "figures=0")
-    assert "note: R@5 and R@10 are R@3, of the filter too" in stderr
+    assert "note: R@5 and R@10 are R@3, of retrieval too" in stderr
     assert "GlobalDescriptor" in store_names(tmp_path)
     model, components = load_model(options[0].partition("=")[2], weights), 32 if name == "netvlad" else None
     extractor, vectors = GlobalDescriptor(model, (96, 64), components=components), []
@@ -159,5 +159,5 @@ def test_global_descriptors_of_networks_are_filters(evaluate, weights, small_str
         resized = [resize(images.read(row), (96, 64), "pil_bilinear") for row in range(len(images))]
         vectors.append(np.array([description.vector for description in extractor(np.array(resized))]))
     nearest = np.argsort(-(vectors[0] @ vectors[1].T), axis=1)[:, :3]
-    lines = (tmp_path / "out" / "predictions" / "filter.csv").read_text().splitlines()[1:]
+    lines = (tmp_path / "out" / "predictions" / "retrieval.csv").read_text().splitlines()[1:]
     assert [line.split(",")[2] for line in lines] == [f"{row:04d}.png" for row in nearest.reshape(-1)]

@@ -1,4 +1,4 @@
-"""Patch-NetVLAD as a system: patches of several sizes, scored by themselves and fused; one pass with its own filter."""
+"""Patch-NetVLAD as a system: patches of several sizes, scored alone and fused; one pass with its own retrieval."""
 
 from dataclasses import replace
 from functools import partial

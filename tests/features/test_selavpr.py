@@ -1,4 +1,4 @@
-"""SelaVPR as a system, and DINOv2 as a filter, by name, with weights converted as anybody's are; small networks."""
+"""SelaVPR as a system, and DINOv2 as a retriever, by name, with weights converted as anybody's are; small networks."""
 
 from functools import partial
 
@@ -79,7 +79,7 @@ def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pooling", ["cls", "gem"])
-def test_dinov2_is_a_filter(program, tmp_path, pooling):
+def test_dinov2_is_a_retriever(program, tmp_path, pooling):
     tensors = transformer_checkpoint(dinov2_shapes(64, 1))
     program("weights", "convert", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
     options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"

@@ -288,7 +288,7 @@ def test_candidates_without_cells_score_zero():
     np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
 
 
-def test_parts_of_filters_are_learned_as_well(cells, model, dataset):
+def test_parts_of_retrievers_are_learned_as_well(cells, model, dataset):
     of_cells = fit_to_database(Retrieval(Aggregated(cells, VladFitting(num_words=4))), dataset.database, FeatureCache())
     assert isinstance(of_cells.describer.extractor.whitening, Whitening)
     assert fit_to_database(RETRIEVAL, dataset.database, FeatureCache()) is RETRIEVAL
@@ -330,9 +330,9 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
 def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset, tmp_path):
     few = ImageFolder(dataset.database.root, dataset.database.names[:3])
     sequence = replace(dataset.only, images=ImageFolder(few.root, few.names[1:2]))
-    filter = SsmVoting(SsmWindows(model, whitening=WindowFitting(20)))
-    [candidates] = filter.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
+    retriever = SsmVoting(SsmWindows(model, whitening=WindowFitting(20)))
+    [candidates] = retriever.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
     assert len(kept(tmp_path)) == 1
-    matched = match_sequence(replace(dataset, database=few), sequence, RETRIEVAL.describer.extractor, filter, 3)
+    matched = match_sequence(replace(dataset, database=few), sequence, RETRIEVAL.describer.extractor, retriever, 3)
     np.testing.assert_array_equal(matched.candidates.scores.sum(1), [36 * 3])

@@ -65,8 +65,8 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
     """Also by scores of others: a plain function, one that holds a key, and OpenCV's on the host."""
     systems = {"histogram": mfvpr.HistogramOfShifts(), "plain": scorers.plain,
                "sampled": scorers.Sampled(jax.random.key(0)), "host": mfvpr.OpenCvHomography()}  # fmt: skip
-    filter = Retrieval(Aggregated(SIFT, VLAD))
-    result = mfvpr.evaluate(dataset, SIFT, filter, systems, candidates=5, cache=FeatureCache(tmp_path))
+    retriever = Retrieval(Aggregated(SIFT, VLAD))
+    result = mfvpr.evaluate(dataset, SIFT, retriever, systems, candidates=5, cache=FeatureCache(tmp_path))
     for name, scorer in systems.items():
         [ranked], known = result.systems[name], opened(folder, scorer=scorer)
         for query, path in enumerate(dataset.queries.paths):

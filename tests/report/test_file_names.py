@@ -15,8 +15,8 @@ HOSTILE = (
     ("name", "file"),
     [
         ("histogram", "histogram"),
-        ("histogram + anchor + retrieval", "histogram_anchor_filter"),
-        ("homography_24 + retrieval", "homography_24_filter"),
+        ("histogram + anchor + retrieval", "histogram_anchor_retrieval"),
+        ("homography_24 + retrieval", "homography_24_retrieval"),
         ("my score (v2), straße=1", "my score (v2), straße=1"),
     ],
 )

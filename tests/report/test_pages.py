@@ -253,7 +253,7 @@ def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypa
     (places["broken"] / "run.json").write_text("{")
     change_json(places["kind"] / "results.json", lambda rows: [{**row, "seconds": "3"} for row in rows])
     (places["lacking"] / "gains.csv").unlink()
-    (places["old"] / "gains.csv").write_text("query,filter,filter rank\na,1,1\n")
+    (places["old"] / "gains.csv").write_text("query,retrieval,retrieval rank\na,1,1\n")
     (places["figure"] / "figures" / "right_0009.png").write_bytes(b"no image")
     for place, words in (
         (tmp_path / "none", "none with a results.json"), (places["sweep"], "no rows"), (places["broken"], "JSONDecode"),

@@ -1,4 +1,4 @@
-"""Several scores of a query's candidates, the filter's among them, as one."""
+"""Several scores of a query's candidates, retrieval's among them, as one."""
 
 from dataclasses import replace
 
@@ -48,11 +48,11 @@ def test_standardized_scores_are_summed():
     fused = Fusion("zscore", weights={"retrieval": 0.5, "a": 3.0, "b": 0.25})("a", candidates, scores)
     assert fused.dtype == np.float32
     assert_fused(fused, candidates, [candidates.scores, scores["a"], scores["b"]], [0.5, 3.0, 0.25])
-    fused = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # the filter counts 1
+    fused = Fusion("zscore", weights={"a": 3.0})("a", candidates, scores)  # retrieval counts 1
     assert_fused(fused, candidates, [candidates.scores, scores["a"]], [1.0, 3.0])
 
 
-def test_the_filter_s_score_may_be_a_distance():
+def test_the_retrieval_score_may_be_a_distance():
     candidates, scores = random_scores()
     fused = Fusion("zscore", "negative_euclidean")("a", candidates, scores)
     distance = -np.sqrt(2 - 2 * candidates.scores.astype(np.float64))
@@ -101,8 +101,8 @@ def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
     ("names", "system"),
     [
         ("", "a + retrieval"),
-        ("filter a", "a + retrieval"),
-        ("b filter", "a + b + retrieval"),
+        ("retrieval a", "a + retrieval"),
+        ("b retrieval", "a + b + retrieval"),
         ("c a b", "a + c + b + retrieval"),
     ],
 )
@@ -141,7 +141,7 @@ def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches
     assert_fused(by_row["histogram + count + retrieval"], sequence_matches.candidates, parts, [0.5, 1.0, 2.0])
 
 
-def test_scores_of_several_scales_are_fused_again_with_the_filter(sequence_matches):
+def test_scores_of_several_scales_are_fused_again_with_retrieval(sequence_matches):
     """They are standardized sums themselves."""
     twice = replace(sequence_matches, matches=sequence_matches.matches * 2, weights=(1.0, 1.0))
     systems, once = (rank_by(matched, {"histogram": Fusion("zscore")}, {}) for matched in (twice, sequence_matches))

@@ -39,7 +39,7 @@ def test_ties_may_go_by_index_instead():
     np.testing.assert_array_equal(rank(scores, tie_break=large), [[1, 2, 4, 0, 3]])
 
 
-def test_combined_score_spans_plain_to_filter_order():
+def test_combined_score_spans_plain_to_retrieval_order():
     rng = np.random.default_rng(1)
     retrieval_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)
     np.testing.assert_array_equal(rank(combine(retrieval_scores, scores, c=0.0)), rank(scores))

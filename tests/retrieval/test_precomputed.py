@@ -22,8 +22,8 @@ def folder(root, count=3):
 
 def list_candidates(source, queries, database):
     """Rows of the first query's candidates."""
-    filtered = source.shortlist(QuerySequence("q", queries, None), database, 1, FeatureCache())
-    return filtered.candidates.indices[0].tolist()
+    retrieved = source.shortlist(QuerySequence("q", queries, None), database, 1, FeatureCache())
+    return retrieved.candidates.indices[0].tolist()
 
 
 @pytest.mark.parametrize("read", [

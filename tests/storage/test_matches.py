@@ -44,7 +44,7 @@ def test_any_float_survives(tmp_path):
 
     floats = {n: v for n, v in per_match(query.matches).items() if np.issubdtype(v.dtype, np.floating)}
     flat = replace(query.matches, **{name: anything(values) for name, values in floats.items()})
-    original = replace(query, matches=flat, retrieval_scores=np.full(4, np.nan, np.float32))
+    original = replace(query, matches=flat, filter_scores=np.full(4, np.nan, np.float32))
     with MATCHES.open(tmp_path / "s", 1) as store:
         store.write({0: original})
         assert_same(dict(store.read())[0], original)

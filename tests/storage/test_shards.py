@@ -71,10 +71,10 @@ def assert_same(report, expected):
 def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
     """Frame correlation, which looks at the queries before, and a cohort, which looks at all images, among it."""
     extractor = Counted()
-    filter = Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
+    retriever = Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
 
     def run(cache):
-        return mfvpr.evaluate(dataset, extractor, filter, SCORERS, cache=cache, **HOW)
+        return mfvpr.evaluate(dataset, extractor, retriever, SCORERS, cache=cache, **HOW)
 
     result, lines = shared(tmp_path, count, run)
     assert_same(result, plain)
@@ -87,11 +87,11 @@ def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
 
 
 def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
-    """With a filter of its own descriptors, as for a single machine."""
-    filter, plain_root = Retrieval(Mean()), tmp_path / "plain"
-    expected = mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=FeatureCache(plain_root))
+    """With a retrieval of its own descriptors, as for a single machine."""
+    retriever, plain_root = Retrieval(Mean()), tmp_path / "plain"
+    expected = mfvpr.evaluate(dataset, SIFT, retriever, SCORERS, candidates=2, cache=FeatureCache(plain_root))
     result, _ = shared(
-        tmp_path / "s", 3, lambda cache: mfvpr.evaluate(dataset, SIFT, filter, SCORERS, candidates=2, cache=cache)
+        tmp_path / "s", 3, lambda cache: mfvpr.evaluate(dataset, SIFT, retriever, SCORERS, candidates=2, cache=cache)
     )
     assert_same(result, expected)
 
@@ -144,7 +144,7 @@ def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
 
 
 class Drawn:
-    """A filter that draws candidates anew, as machines whose bits differ may."""
+    """A retriever that draws candidates anew, as machines whose bits differ may."""
 
     recipe = "drawn"
 

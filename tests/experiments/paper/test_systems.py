@@ -168,7 +168,7 @@ def test_tables_hold_both_numbers():
     tables = tables_of(Evaluations(
         [MIX], {"gardens_point": make_dataset("gardens_point", database=200)},
         {key: RowResult({OVERALL: recall}, result("histogram", 0.8))}, sizes={key: 2.0**20},
-        seconds={"mix_hist_50": dict(filter=0.1, features=0.2, matching=0.3, scores=0.1)},
+        seconds={"mix_hist_50": dict(retrieval=0.1, features=0.2, matching=0.3, scores=0.1)},
     ))  # fmt: skip
     assert tables["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
     assert tables["data_sets"].rows == [["gardens_point", "200 (200, +0)", "200 (200, +0)"]]

@@ -322,7 +322,7 @@ def test_code_that_depends_on_a_shape_is_told_apart(data, tmp_path, scorer):
         sweep_with_folder(tmp_path, scorer(sign), [{"max_distance": 2.0}], *data)
 
 
-def test_a_number_named_as_the_filters_share_is_refused(data):
+def test_a_number_named_as_retrievals_share_is_refused(data):
     @mfvpr.value
     class Score:
         c: float = 1.0
