@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from experiments import build, confidences, maps
 from experiments.console import tell
-from experiments.localization_figures import AnswerFigures
+from experiments.localization_figures import LocalizationFigures
 from experiments.query_images import images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
@@ -27,10 +27,10 @@ def localize(settings: dict[str, Any]) -> None:
         build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         memory=settings["memory"],
     )  # fmt: skip
-    drive, figures, failed = _Drive(robot_map, settings), AnswerFigures(robot_map, settings), 0
+    drive, figures, failed = _Drive(robot_map, settings), LocalizationFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
-            tell(f"{len(robot_map):,} images in the map; the top prediction takes seconds more: programs compile")
+            tell(f"{len(robot_map):,} images in the map; the first image takes seconds more: programs compile")
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
             localized, line = drive.localize(name, pixels)
@@ -43,7 +43,7 @@ def localize(settings: dict[str, Any]) -> None:
             line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
         print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
-        raise SettingsError(f"{failed} of the images could not be answered; their lines say why")
+        raise SettingsError(f"{failed} of the images could not be localized; their lines say why")
     figures.finish()
 
 

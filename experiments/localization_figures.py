@@ -15,7 +15,7 @@ from mfvpr.report.file_names import file_names
 from mfvpr.report.localizations import localization_figure
 
 
-class AnswerFigures:
+class LocalizationFigures:
     """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
 
     def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
@@ -51,5 +51,5 @@ class AnswerFigures:
             raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
         if self._missing:
             names = ",".join(sorted(map(str, self._missing)))
-            raise SettingsError(f"figures=[{names}]: expected rows of images that were answered, from 0, or names as "
+            raise SettingsError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
                                 "the lines have them, or the last parts of these")  # fmt: skip

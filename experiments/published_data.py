@@ -107,7 +107,7 @@ def _truth_lines(sequence: QuerySequence, queries: Contents, database: Contents)
         [threshold] = sequence.truth.thresholds(tolerances=[_TOLERANCE], radius=_RADIUS)
         counts = sequence.truth.positives(threshold).counts
         within = threshold_words(sequence.truth.unit, threshold).strip()
-        yield (f"right images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
+        yield (f"correct images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
                f"{np.median(counts):g}; {(counts == 0).sum():,} queries have none")  # fmt: skip
     if num_same := sum(map(bool, own_rows(queries, database))):
         yield f"{num_same:,} queries are images of the database"

@@ -61,7 +61,7 @@ RULES: dict[str, Rule] = {
         # paths and text
         "root cache database .map": _PATH,
         "queries .images": or_list(_PATH),
-        "index_file database_labels query_labels cache out checkpoints .confidence .data .root": either(_PATH, None),
+        "index_file database_labels query_labels .cache out checkpoints .confidence .data .root": either(_PATH, None),
         "dataset.name": pattern(r"[\w-][\w.-]*", "letters, digits, - and _"),
         "weights": _TEXT,
         "database_prefix query_prefix": either(_TEXT, ""),

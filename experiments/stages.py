@@ -206,8 +206,8 @@ def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, same_im
         return
     without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
     if without == thresholds:
-        tell("warning: the ground truth gives no query a correct prediction; every recall will be 0")
+        tell("warning: the ground truth has no correct image for any query; every recall will be 0")
     elif without:
         words = ", ".join(threshold_words(ground_truth.unit, threshold).strip() for threshold in without)
         remedy = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
-        tell(f"warning: no query has a correct prediction within {words}, so that recall will be 0 there; use {remedy}")
+        tell(f"warning: no query has a correct image within {words}; recall will be 0 there; use {remedy}")

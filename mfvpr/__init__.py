@@ -1,7 +1,7 @@
 """Model-free re-ranking for visual place recognition.
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
-rankings become recall. `evaluate` goes the whole way over a data set, a `Map` is asked with one image at a time; the
+rankings become recall. `evaluate` goes the whole way over a data set, a `Map` localizes one image at a time; the
 other names below are the core of that sentence, on arrays. The packages put it to work on images and files. `value`,
 `Scorer` and what follows from them is what a scorer of your own is written with; `mfvpr.testing.check_scorer` says
 whether it keeps the contract.

@@ -1,4 +1,4 @@
-"""Retriever, extraction of shortlisted images and re-ranking among 100,000 images, with a forecast for 2.8 million."""
+"""Retrieval, extraction of shortlisted images and re-ranking among 100,000 images, with a forecast for 2.8 million."""
 
 import os
 import tempfile
@@ -99,12 +99,12 @@ def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
     _, reranking = repeat("re-ranking", rounds, lambda: predictions.append(rerank(queries, database, candidates)))
     num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(predictions)
     positives = Positives.from_rows(data.similar(), data.images)
-    retrieval_scores, of_shortlist = recall_at_k(candidates.indices, positives, [1, CANDIDATES]).tolist()
+    of_retrieval, of_shortlist = recall_at_k(candidates.indices, positives, [1, CANDIDATES]).tolist()
     [of_reranking] = recall_at_k(predictions[0].rows, positives, [1]).tolist()
     return {
         "steps": steps | making | {"re-ranking": reranking}, "reranking": median_seconds(predictions[1:]),
         "made": num_images, "written": written, "rows_read": rows_read, "read": rows_read * written / num_images,
-        "recall": {"retrieval": retrieval_scores, "shortlist": of_shortlist, "re-ranking": of_reranking},
+        "recall": {"retrieval": of_retrieval, "shortlist": of_shortlist, "re-ranking": of_reranking},
     }  # fmt: skip
 
 

@@ -138,7 +138,7 @@ def _check_rows(states: FileStates, folder: Path) -> None:
 
 
 def _stage(folder: Path, shard: str) -> str:
-    """Stage under way, evaluation by the files in the stores."""
+    """Stage under way, according to the files in the stores."""
     if shard == NO_SHARD:
         return "results and report"
     kinds = {path.relative_to(folder / "store").parts[0].partition("-")[0] for path in _row_files(folder).values()}

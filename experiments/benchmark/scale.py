@@ -183,7 +183,7 @@ def _table(results: dict[str, dict[str, Any]]) -> Table:
         "rows read",
         "CPU ms",
         "peak GB",
-        "top prediction s",
+        "first prediction s",
         "R@1",
     ]
     lines = []

@@ -118,9 +118,9 @@ def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
 def _derivatives(dense: Tensor) -> tuple[Tensor, ...]:
     """Derivatives di, dj, dii, djj, dij of maps, zeros outside; shifted maps are faster than convolutions."""
     wide = F.pad(dense, (1, 1, 1, 1))
-    up, down, left, correct = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
+    up, down, left, right = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
     corners = wide[..., 2:, 2:] - wide[..., 2:, :-2] - wide[..., :-2, 2:] + wide[..., :-2, :-2]
-    return (down - up) / 2, (correct - left) / 2, up - 2 * dense + down, left - 2 * dense + correct, corners / 4
+    return (down - up) / 2, (right - left) / 2, up - 2 * dense + down, left - 2 * dense + right, corners / 4
 
 
 def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:

@@ -22,7 +22,7 @@ KINDS = {
     "order": "query i shows database image i",
     "index": "a file of pairs",
     "utm": "positions in the names, @easting@northing@...",
-    "label": "two csv files of name,label: the same label (floor, room) is right",
+    "label": "two csv files of name,label: images with the same label (floor, room) are correct",
     "none": "rankings only",
 }
 CHOICES = "; ".join(f"{kind} ({meaning})" for kind, meaning in KINDS.items())

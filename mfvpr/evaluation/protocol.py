@@ -124,7 +124,7 @@ class EvaluationProtocol:
 
 
 def evaluation_protocol(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> EvaluationProtocol:
-    """Prepare a `EvaluationProtocol` before anything is ranked, so that errors of the ground truth are raised early.
+    """Prepare an `EvaluationProtocol` before anything is ranked, so that errors of the ground truth are raised early.
 
     Args:
         truth: of the queries, in the order of their path.

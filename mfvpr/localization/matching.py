@@ -57,7 +57,7 @@ def match_and_score(
 
 
 def shift_of(scorer: Scorer, pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
-    """`shift`, `shift_interval` and `scale` of an `Prediction`, from the matches `[1, K, ...]` of a pair."""
+    """`shift`, `shift_interval` and `scale` of a `Prediction`, from the matches `[1, K, ...]` of a pair."""
     if not isinstance(scorer, HistogramOfShifts):
         return None, None, None
     histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)

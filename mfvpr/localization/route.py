@@ -87,7 +87,7 @@ class Route:
             return None
         alternatives = () if prediction is None else prediction.alternatives
         if (last := max((alternative.row for alternative in alternatives), default=-1)) >= len(there):
-            raise InputError(f"there: expected the rows of the map that answered, up to {last} at least, got "
+            raise InputError(f"there: expected the rows of the map of the prediction, up to {last} at least, got "
                              f"{len(there)}")  # fmt: skip
         while len(there) > len(self.belief):
             self.belief = np.concatenate([self.belief, np.zeros_like(self.belief)])

@@ -35,7 +35,7 @@ class CalibratedPredictions:
     """An evaluation whose first predictions have a confidence; arrays are of the queries of all sequences.
 
     Attributes:
-        evaluation: the evaluation.
+        evaluation: rankings of the systems, with ground truth or without.
         confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
             confidence that was fitted on the other half.
         threshold: of the confidence, below which the prediction is `NO_PLACE`; None = no prediction is refused.
@@ -47,7 +47,7 @@ class CalibratedPredictions:
 
     @cached_property
     def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
-        """confidence by system, NaN without a prediction, or without anything to fit on."""
+        """Confidence by system, NaN without a prediction, or without anything to fit on."""
         systems = self.evaluation.result.systems
         if self.confidences is not None:
             return {name: confidence.probability(self._inputs(name, confidence))
@@ -170,7 +170,7 @@ def _recalls_by_share(calibrated: CalibratedPredictions) -> dict[str, np.ndarray
 
 
 def recall_by_share(calibrated: CalibratedPredictions, system: str) -> Float[np.ndarray, " shares"]:
-    """Recall at 1, by `SHARES`, of a system that re-ranks the queries with the lowest the confidence of retrieval."""
+    """Recall at 1, by `SHARES`, of a system that re-ranks the queries with the lowest confidence of retrieval."""
     correct_by_retrieval, correct = calibrated.correct(RETRIEVAL), calibrated.correct(system)
     unsure = np.argsort(np.nan_to_num(calibrated.probabilities[RETRIEVAL], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(correct[unsure].astype(int) - correct_by_retrieval[unsure])])

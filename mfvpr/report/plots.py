@@ -55,7 +55,7 @@ def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, Precis
                 label = f"{_short(name)}: AP {100 * curve.average_precision:.1f}"
                 panel.plot(curve.recall, curve.precision, label=label, **_line(place))
         panel.set_title(f"by {kind}", fontsize=9)
-        _label(panel, "recall of the queries that have a prediction", "precision of the predictions")
+        _label(panel, "recall of the queries with a correct image", "precision of the predictions")
         panel.legend(fontsize=7, loc="lower left")
     save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel
 

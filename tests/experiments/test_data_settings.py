@@ -164,5 +164,5 @@ def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     calls, root = [], value or "~/.cache/mfvpr"
     monkeypatch.setattr("experiments.evaluate.evaluate", lambda: calls.append)
     succeed("evaluate")
-    assert (calls[0]["store"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
+    assert (calls[0]["cache"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
     assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")

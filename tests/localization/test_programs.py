@@ -27,7 +27,7 @@ pytestmark = pytest.mark.thorough
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
 NAMES = [f"{row:04d}.png" for row in range(10)]
-WAIT = "10 images in the map; the top prediction takes seconds more: programs compile\n"
+WAIT = "10 images in the map; the first image takes seconds more: programs compile\n"
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queri
     (first, second), stderr = localize(queries, code=2)
     assert "0.png: " in first["error"]
     assert second["place"] == "0004.png"
-    assert "1 of the images could not be answered" in stderr
+    assert "1 of the images could not be localized" in stderr
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -35,7 +35,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     """
     run, path = read_run(folder), path or folder / PAGE
     sections = [_recall_section(run), *_differences_section(run)] if run.gains else []
-    sections += [*_confidence_section(run), _answers_section(run), _costs_section(run), _settings_section(run)]
+    sections += [*_confidence_section(run), _predictions_section(run), _costs_section(run), _settings_section(run)]
     write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
     return path
 
@@ -53,8 +53,8 @@ def description(run: Run) -> str:
     """One line that says what was evaluated."""
     common = run.common
     several = f" in {len(run.sequences)} sequences" if len(run.sequences) > 1 else ""
-    correct = f"correct is what is within{run.within}" if run.gains and run.within else ""
-    correct = correct or ("correct or not, as told" if run.gains else "no ground truth: rankings only")
+    correct = f"correct within{run.within}" if run.gains and run.within else ""
+    correct = correct or ("correct by the ground truth" if run.gains else "no ground truth: rankings only")
     lacks = f"; incomplete: {', '.join(common['incomplete'])}" if common.get("incomplete") else ""
     return (
         f"{common['queries']} queries{several}, {common['database']} database images, {common['candidates']} candidates"
@@ -87,9 +87,7 @@ def _recall_section(run: Run) -> Section:
         bar_chart("intervals", f"Recall at 1{run.within}, with intervals", groups, axis="recall at 1, %"),
         *tolerance_charts(curves), depths_chart(f"Recall over K{run.within}", curves),
     ]  # fmt: skip
-    words = (
-        f"In %. Everything told of single queries is what is correct at the middle tolerance{run.within}. Intervals "
-    )
+    words = f"In %. Results of single queries are those at the middle tolerance{run.within}. Intervals "
     words += "are 95 % and know that neighbors along the path fail together."
     tables = {}
     if table := run.tables.get("table.csv"):
@@ -140,7 +138,7 @@ def precision_charts(curves: Curves, by: str = "score", words: str = "by the sco
             label = f"{name}: AP {100 * curve.average_precision:.1f}"
             pairs = zip(curve.recall[shown], curve.precision[shown], strict=True)
             points[label] = [(round(100 * x, 3), round(100 * y, 3)) for x, y in pairs]
-    axes = "recall of queries with a prediction, %", "precision, %"
+    axes = "recall of queries with a correct image, %", "precision, %"
     title = f"Precision and recall {words}"
     return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
 
@@ -200,16 +198,14 @@ def _costs_section(run: Run) -> Section:
     return Section("costs", "Seconds and sizes", words, [chart], tables)
 
 
-def _answers_section(run: Run) -> Section:
+def _predictions_section(run: Run) -> Section:
     """First predictions, with pictures of some."""
     total = len(run.systems) * len(run.all_gains.queries) if run.gains else 0
     predictions = [*islice(run.predictions(), MOST_PREDICTIONS)]
     left_out = max(0, total - len(predictions))
     gallery = Gallery(run.headline, run.systems, run.sequences, pictures(run.folder), predictions, left_out)
-    words = (
-        "Query and top prediction with their heaviest matches, and the histogram of their shifts; below an incorrect "
-    )
-    words += "prediction the correct one. The table has the queries without a picture, too."
+    words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
+    words += "prediction has the correct image below it. The table has the queries without a picture, too."
     return Section("predictions", "Predictions", words, gallery=gallery)
 
 

@@ -16,7 +16,7 @@ from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 
 pytestmark = pytest.mark.thorough
 
-SETTINGS = {"out": "out", "store": None, "memory": None, "devices": 1}
+SETTINGS = {"out": "out", "cache": None, "memory": None, "devices": 1}
 RUNS = list(dict.fromkeys(row.run for row in ROWS))
 
 
