@@ -74,7 +74,7 @@ def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path,
 def test_nothing_right_is_told_beforehand(small_street, run):
     settings = ("dataset.ground_truth=order", "dataset.exclude_neighbors=5", "recall.tolerances=[0,5]")
     rows, printed, _ = run(*same(small_street, *settings))
-    assert "warning: the ground truth gives no query" in printed.err
+    assert "warning: the ground truth has no correct image for any query" in printed.err
     assert set(recall(rows).values()) == {0.0}
 
 
