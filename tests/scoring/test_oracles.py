@@ -24,10 +24,10 @@ from tests.builders import make_matches, random_matches, real
 pytestmark = pytest.mark.thorough
 
 WEIGHTS = {
-    "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: oracles.fs_weight(s0, s1)),
-    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: oracles.dmf_weight(d)),
-    "ratio": (RatioWeight(), lambda d, s0, s1, r: oracles.ratio_weight(r)),
-    "ratio, squared": (RatioWeight(2.0), lambda d, s0, s1, r: oracles.ratio_weight(r, 2)),
+    "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: s0 + s1),
+    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: 2 - d),
+    "ratio": (RatioWeight(), lambda d, s0, s1, r: 1 - r),
+    "ratio, squared": (RatioWeight(2.0), lambda d, s0, s1, r: (1 - r) ** 2),
     "unit": (UnitWeight(), lambda d, s0, s1, r: np.ones(len(d))),
 }
 dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
