@@ -42,12 +42,14 @@ def confident(matches):
     return tuple(values[confidence > 0] for values in (points0, points1, distance, confidence))
 
 
-@given(pairs(), st.sampled_from(["image_size", "largest_coordinate", "largest_shift"]),
-       st.sampled_from([None, (90.0, 40.0)]), st.booleans())  # fmt: skip
-def test_rapid_agrees_with_the_loop(matches, reach, size, per_feature):
+@pytest.mark.parametrize(
+    "options",
+    [{"reach": "image_size"}, {"reach": "largest_coordinate"}, {"reach": "largest_shift"}, {"size": (90.0, 40.0)}],
+)
+@given(matches=pairs(), per_feature=st.booleans())
+def test_rapid_agrees_with_the_loop(options, matches, per_feature):
     points0, points1, _, confidence = confident(matches)
     count = max(float(matches.count0), 1) if per_feature else None
-    options = {"reach": reach, "size": size}
     expected = oracles.rapid_spatial_score(points0, points1, confidence, matches.image_size0, count0=count, **options)
     got = score(RapidSpatialScore(per_feature=per_feature, **options), matches)
     np.testing.assert_allclose(got, expected, rtol=2e-5, atol=1e-4)
