@@ -63,7 +63,8 @@ def test_phrases_agree_with_the_loop(matches, length, cell_size, align):
     np.testing.assert_allclose(score(VisualPhrases(**options), matches), expected, rtol=2e-6, atol=0)
 
 
-@given(pairs(), st.sampled_from(["weighted", "unweighted", "described"]), st.booleans())
+@pytest.mark.parametrize("form", ["weighted", "unweighted", "described"])
+@given(matches=pairs(), mirrored=st.booleans())
 def test_lost_agrees_with_the_loop(matches, form, mirrored):
     expected = oracles.lost_score(*confident(matches), form=form, mirrored=mirrored, width=matches.image_size0[0])
     np.testing.assert_allclose(score(LostScore(form, mirrored), matches), expected, rtol=1e-5, atol=1e-6)
