@@ -90,7 +90,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     cohort, fused_systems = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
         fused_systems.append(f"{main} + {COHORT}")
-    fusions = {name: fusion.renamed(main, name) for name in fused_systems}
+    fusions = {name: fusion.rename_main(main, name) for name in fused_systems}
     confidence = confidences.check(confidence, headline, settings, images)
     result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.retriever, scorers, candidates=settings["candidates"],

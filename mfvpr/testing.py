@@ -3,9 +3,10 @@
 The library relies on this contract when it pads, batches, sweeps and learns; see `mfvpr.Scorer`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -59,7 +60,7 @@ def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | Non
     ]
     scorer = with_capacity(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
-    close = _AssertClose(TOLERANCE * float(np.abs(scores).max()))
+    close = partial(_assert_close, TOLERANCE * float(np.abs(scores).max()))
     score_of = scorer if on_host(scorer) else jax.jit(lambda pair: scorer(pair))
     for pair, score in zip(pairs, scores, strict=True):
         close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
@@ -105,7 +106,7 @@ def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
     return np.asarray(score)
 
 
-def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_AssertClose") -> None:
+def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
     for garbage in (np.inf, -1e30, 7.0):
         close(scorer(_pad(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; take "
               "values by mfvpr.masked(values, matches.mask)")  # fmt: skip
@@ -113,18 +114,18 @@ def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_As
           "matches.mask, not with the number of slots")  # fmt: skip
 
 
-def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: "_AssertClose") -> None:
+def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
     order = np.random.default_rng(1).permutation(len(pair.mask))
     shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
     close(scorer(shuffled), score, "the order of the matches, and where padding stands among them, changes the score")
 
 
-def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: "_AssertClose") -> None:
+def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: Callable[..., None]) -> None:
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
     close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
 
 
-def _check_one_trace(scorer: Scorer, pair: Matches, close: "_AssertClose") -> None:
+def _check_one_trace(scorer: Scorer, pair: Matches, close: Callable[..., None]) -> None:
     traces = []
 
     @jax.jit
@@ -134,18 +135,13 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: "_AssertClose") -> No
 
     if holds_function(scorer):
         return  # a scorer that holds a function is compiled at every call
-    for changed in _with_other_numbers(scorer):
+    for factor in (1.0, 1.01, 1.02):
+        changed = jax.tree.map(lambda leaf: leaf * factor if _is_floating(leaf) else leaf, scorer)  # noqa: B023
         expected = changed(pair)
         close(score(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on them")
     if len(traces) > 1:
         raise AssertionError(f"{len(traces)} traces for three sets of numbers, expected one: keep numbers as they are "
                              "given, and what changes shapes in static fields")  # fmt: skip
-
-
-def _with_other_numbers(scorer: Any) -> Iterator[Any]:
-    """The scorer, and two copies with slightly larger floating point numbers."""
-    for factor in (1.0, 1.01, 1.02):
-        yield jax.tree.map(lambda leaf: leaf * factor if _is_floating(leaf) else leaf, scorer)  # noqa: B023
 
 
 def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, Array]]]:
@@ -179,16 +175,10 @@ def _check_gradients(name: str, gradients: Callable[[Matches], Any], pair: Match
             )
 
 
-class _AssertClose:
-    """Assertion that scores are equal up to an absolute tolerance."""
-
-    def __init__(self, tolerance: float) -> None:
-        self.tolerance = tolerance
-
-    def __call__(self, got: Any, expected: Any, broken: str) -> None:
-        got, expected = np.asarray(got), np.asarray(expected)
-        if got.shape != expected.shape or not (np.abs(got - expected) <= self.tolerance).all():
-            raise AssertionError(f"{broken}: got {got}, expected {expected}")
+def _assert_close(tolerance: float, got: Any, expected: Any, broken: str) -> None:
+    got, expected = np.asarray(got), np.asarray(expected)
+    if got.shape != expected.shape or not (np.abs(got - expected) <= tolerance).all():
+        raise AssertionError(f"{broken}: got {got}, expected {expected}")
 
 
 def _is_floating(leaf: Any) -> bool:

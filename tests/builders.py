@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from mfvpr import Features, Matches, types
+from mfvpr import Features, Matches, Shortlist, types
 
 SIZE = 336
 
@@ -107,6 +107,17 @@ def double(tree):
     """Every floating point leaf, and Python number, as float64 of JAX: only below `jax.enable_x64(True)`."""
     wide = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf  # noqa: E731
     return jax.tree.map(lambda leaf: wide(jnp.asarray(leaf)), tree)
+
+
+def make_shortlist(rows):
+    """A shortlist of these database rows without scores; -1 = none."""
+    indices = np.array(rows, np.int32)
+    return Shortlist(indices, np.zeros(indices.shape, np.float32), indices >= 0)
+
+
+def stack(trees):
+    """The leaves of equal trees, such as pairs of the same capacity, along a new first axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def fill(folder, names):

@@ -2,8 +2,8 @@
 
 Nothing here imports mfvpr or JAX, so that a test against this file is a test against the paper. Equations are
 numbered as in the paper, "On Model-Free Re-ranking for Visual Place Recognition with Deep Learned Local
-Features": 1 is the histogram of shifts, 2 anchor points, 3 the aggregated score, 4 the combined one. Where its
-text is ambiguous, the options are those of the README's table.
+Features": 1 is the histogram of shifts, 2 anchor points, 3 the aggregated score. Where its text is ambiguous,
+the options are those of the README's table.
 
 All inputs are real entries only (no padding). Points and shifts are (x, y) in pixels, sizes (width, height);
 a shift is the candidate's point minus the query's point. Sums whose equality decides a tie use `math.fsum`,
@@ -44,8 +44,6 @@ def _first_argmax(values):
 def nearest(descriptors0, descriptors1, crosscheck="mutual"):
     """Nearest neighbors with cross-check, first index wins ties: [(i, j, distance)] sorted by i, or by j."""
     rows0, rows1 = _rows(descriptors0), _rows(descriptors1)
-    if crosscheck not in ("mutual", "opencv_legacy", "none", "candidate"):
-        raise ValueError(f"unknown crosscheck: {crosscheck}")
     if not rows0 or not rows1:
         return []
     similarity = [[math.fsum(map(mul, a, b)) for b in rows1] for a in rows0]
@@ -68,24 +66,6 @@ def nearest(descriptors0, descriptors1, crosscheck="mutual"):
     return [(i, j, math.dist(rows0[i], rows1[j])) for i, j in matches]
 
 
-# --- weights ------------------------------------------------------------------------------------------------
-
-
-def fs_weight(scores0, scores1):
-    """FS-weight, w = s1 + s2."""
-    return np.array([a + b for a, b in zip(_values(scores0), _values(scores1), strict=True)], np.float64)
-
-
-def dmf_weight(distance):
-    """DMF-weight, w = 2 - d."""
-    return np.array([2.0 - d for d in _values(distance)], np.float64)
-
-
-def ratio_weight(ratio, exponent=1):
-    """w = (1 - ratio)^exponent."""
-    return np.array([(1.0 - r) ** exponent for r in _values(ratio)], np.float64)
-
-
 # --- histogram of shifts ------------------------------------------------------------------------------------
 
 
@@ -98,11 +78,9 @@ def _bin_centers(lower, upper, bin_size, align):
         first = math.floor(lower / bin_size + 0.5)
         last = math.ceil(upper / bin_size - 0.5)
         return [m * bin_size for m in range(first, max(last, first) + 1)]
-    if align == "zero_edge":  # bin m covers [m b, (m + 1) b]
-        first = math.floor(lower / bin_size)
-        last = math.ceil(upper / bin_size) - 1
-        return [(m + 0.5) * bin_size for m in range(first, max(last, first) + 1)]
-    raise ValueError(f"unknown align: {align}")
+    first = math.floor(lower / bin_size)  # zero_edge: bin m covers [m b, (m + 1) b]
+    last = math.ceil(upper / bin_size) - 1
+    return [(m + 0.5) * bin_size for m in range(first, max(last, first) + 1)]
 
 
 def histogram_of_shifts(
@@ -145,14 +123,6 @@ def histogram_of_shifts(
     return histogram, np.array(centers_x, np.float64), np.array(centers_y, np.float64)
 
 
-def histogram_score(shifts, weights, size0, size1, **options):
-    """Largest bin score (paper, text below eq. 1), 0 without matches."""
-    if len(shifts) == 0:
-        return 0.0
-    histogram, _, _ = histogram_of_shifts(shifts, weights, size0, size1, **options)
-    return max(_values(histogram))
-
-
 def refined_shift(shifts, weights, sigma, start):
     """Local maximum of the continuous density behind eq. 1, by mean shift from `start` (not in the paper)."""
     x, y = float(start[0]), float(start[1])
@@ -192,9 +162,7 @@ def _window_offsets(window, window_mode):
     if window_mode == "odd_down":
         odd = window if window % 2 == 1 else window - 1
         return range(-((odd - 1) // 2), (odd - 1) // 2 + 1)
-    if window_mode == "radius":
-        return range(-window, window + 1)
-    raise ValueError(f"unknown window_mode: {window_mode}")
+    return range(-window, window + 1)  # radius
 
 
 def anchor_cells(points0, points1, weights, size0, size1, *, num_bins=15):
@@ -230,10 +198,6 @@ def anchor_points(
     cell_weight="winner_sum",
 ):
     """Sum of the anchor scores over all cells with a match (paper eq. 2)."""
-    if first not in ("query", "candidate"):
-        raise ValueError(f"unknown first: {first}")
-    if cell_weight not in ("winner_sum", "cell_sum", "ones"):
-        raise ValueError(f"unknown cell_weight: {cell_weight}")
     if first == "candidate":
         points0, points1, size0, size1 = points1, points0, size1, size0
     cells = anchor_cells(points0, points1, weights, size0, size1, num_bins=num_bins)
@@ -269,8 +233,6 @@ def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, c
     """Aggregated score (paper eq. 3), 0 without matches. The unweighted mean counts the confidence."""
     shifts, weights = _rows(shifts, 2), _values(weights)
     confidence = [1.0] * len(shifts) if confidence is None else _values(confidence)
-    if mean not in ("unweighted", "weighted", "median"):
-        raise ValueError(f"unknown mean: {mean}")
     total = math.fsum(weights)
     if not shifts or (mean == "weighted" and total == 0):
         return 0.0
@@ -333,12 +295,6 @@ def fuse_scales(scores, mask, weights, normalize):
                 score = (score - np.mean(finite)) / deviation if deviation else 0.0
             fused[place] += weight * score
     return fused
-
-
-def combine(retrieval_scores, rerank_scores, c):
-    """s = c * s_f + s_r (paper eq. 4)."""
-    pairs = zip(_values(retrieval_scores), _values(rerank_scores), strict=True)
-    return np.array([float(c) * s_f + s_r for s_f, s_r in pairs], np.float64)
 
 
 def rank(scores, mask=None):

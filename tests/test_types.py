@@ -51,14 +51,6 @@ def test_jit_never_takes_one_class_for_another():
     assert [factor for factor in range(50) if evaluate(one_number(factor)(), matches) != factor] == []
 
 
-def test_nor_do_grids_and_candidates():
-    matches = jax.tree.map(lambda leaf: leaf[None], random_matches(np.random.default_rng(0), 3))
-    for factor in range(8):
-        scorer = one_number(factor)()
-        np.testing.assert_array_equal(mfvpr.score_grid(scorer, matches, number=[1.0, 2.0])[:, 0], [factor, 2 * factor])
-        assert mfvpr.score_candidates(scorer, matches) == factor
-
-
 def register_scorer(number, log):
     """A class of scorers that JAX's own function registers; its calls append `number` to `log`."""
 

@@ -15,7 +15,6 @@ from mfvpr.evaluation.validation import check_matching, image_warnings, validate
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
-from mfvpr.reranking.cohort_normalization import cohort_sequence
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult, Retriever
@@ -124,24 +123,6 @@ def _match(
     if shard is not None:
         raise NotYet(_COMPLETE)
     return Matched(sequence, shortlist, matches, remarks["queries"], remarks["database"])
-
-
-def match_cohort(
-    dataset: Dataset, neighbors: int, extractor: Extractor | Source, retriever: Retriever,
-    candidates: int | Literal["all"] = 50, *, cache: FeatureCache | None = None, **how: Any,
-) -> Matched:  # fmt: skip
-    """Match the database images among each other, once for all sequences.
-
-    See `mfvpr.reranking.cohort_normalization`. Arguments not listed here are those of `match_sequence`.
-
-    Args:
-        dataset: its database, in the order of the drive.
-        neighbors: frames on both sides of an image that show its place, and are never its candidates.
-    """
-    cache = cache or FeatureCache()
-    sequence = cohort_sequence(cache.contents(dataset.database), neighbors)
-    how = {"track": cache.track("cohort matching")} | how
-    return match_sequence(dataset, sequence, extractor, retriever, candidates, cache=cache, **how)
 
 
 def _extract(

@@ -47,7 +47,7 @@ class LightGlueMatching:
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatching":
         """Matcher from a model (`mfvpr.checkpoints.load_model`) and further attributes."""
-        return cls(jax.jit(type(model).packed)(model), fingerprint(recipe_of(model)), **options)
+        return cls(jax.jit(type(model).pack)(model), fingerprint(recipe_of(model)), **options)
 
     @property
     def dimension(self) -> int:
@@ -57,11 +57,7 @@ class LightGlueMatching:
     @property
     def recipe(self) -> dict[str, Any]:
         """Everything that matches depend on; packed weights vary in the last bits between machines."""
-        return {
-            "network": self.network,
-            "filter_threshold": self.filter_threshold,
-            "depth_confidence": self.depth_confidence,
-        }
+        return {name: getattr(self, name) for name in ("network", "filter_threshold", "depth_confidence")}
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
         """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`.

@@ -96,13 +96,10 @@ class MatchSet:
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
         rows = [self._row(by_query[query], query, place) for query, place in pairs]
         entries, mask = ragged.pad_rows(rows, capacity, total=total)
-        pair_fields = {
-            name: np.stack([_pair_value(by_query[query], name, place) for query, place in pairs])
-            for name in per_pair(by_query[pairs[0][0]])
-        }
-        if total is not None:
-            pair_fields = {name: ragged.repeat_last(values, total) for name, values in pair_fields.items()}
-        return Matches(**entries, mask=mask, **pair_fields)
+        for name in per_pair(by_query[pairs[0][0]]):
+            values = np.stack([_pair_value(by_query[query], name, place) for query, place in pairs])
+            entries[name] = ragged.repeat_last(values, len(mask))
+        return Matches(**entries, mask=mask)
 
     @cached_property
     def _ends(self) -> Int[np.ndarray, "queries candidates"]:

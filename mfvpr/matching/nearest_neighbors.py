@@ -52,7 +52,7 @@ def match(
     features0, features1 = ready(_pad_to_blocks(features0)), ready(_pad_to_blocks(at_least_one(features1)))
     similarity = _similarity(features0, features1)
     nearest1, valid = _neighbors(similarity, cross_check)
-    ratio = _ratio(features0, features1, similarity) if with_ratio else None
+    ratio = distance_ratio(features0, features1, similarity) if with_ratio else None
     matches = make_matches(features0, features1, nearest1, valid, ratio=ratio)
     without_padding = {name: values[:slots] for name, values in per_match(matches).items()}
     return replace(matches, mask=matches.mask[:slots], **without_padding)
@@ -233,16 +233,11 @@ def _distance(
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
 
 
-def distance_ratio(features0: Features, features1: Features) -> Float[Array, " keypoints0"]:
-    """Ratio as in `match`, for features that are `ready`."""
-    return _ratio(features0, features1, _similarity(features0, features1))
-
-
-def _ratio(
-    features0: Features, features1: Features, similarity: Float[Array, "keypoints0 keypoints1"]
+def distance_ratio(
+    features0: Features, features1: Features, similarity: Float[Array, "keypoints0 keypoints1"] | None = None
 ) -> Float[Array, " keypoints0"]:
-    """Distance to the nearest over the second nearest descriptor; 1 without a second."""
-    nearest1, second1 = nearest_two(similarity)
+    """Ratio as in `match`, for features that are `ready`; None computes the similarity."""
+    nearest1, second1 = nearest_two(_similarity(features0, features1) if similarity is None else similarity)
     has_second = second1.similarity > -jnp.inf
     closest, second = (_distance(features0, features1, side.index, has_second) for side in (nearest1, second1))
     differ = has_second & (closest < second)  # False if both are 0, and if rounding swaps two equal distances

@@ -2,14 +2,15 @@
 
 Hubs are database images that score high with any query.
 
-    cohort = match_cohort(dataset, 5, extractor, retriever)
+    sequence = cohort_sequence(FeatureCache().contents(dataset.database), 5)
+    cohort = match_sequence(dataset, sequence, extractor, retriever)
     scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
     strengths = hubness(cohort.candidates, scores, len(dataset.database))
     normalized = by_hubness(candidates, query_scores, strengths)
 
-The cohort of a database image are other places of the map. Only the last line needs queries; all others run when the
-map is made. Images far apart in the drive count as different places: if the drive passes a place twice, its images
-score high with each other and are treated as hubs.
+`mfvpr.evaluate(cohort=5)` does this for all scorers. The cohort of a database image are other places of the map. Only
+the last line needs queries; all others run when the map is made. Images far apart in the drive count as different
+places: if the drive passes a place twice, its images score high with each other and are treated as hubs.
 """
 
 import numpy as np

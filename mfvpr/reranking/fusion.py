@@ -46,7 +46,7 @@ class Fusion:
         """Names of the scorers that take part, the main scorer first."""
         return [main, *(name for name in self.weights if name not in (main, RETRIEVAL))]
 
-    def renamed(self, main: str, name: str) -> "Fusion":
+    def rename_main(self, main: str, name: str) -> "Fusion":
         """This fusion for a main scorer with another name, such as one with a cohort."""
         return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
 

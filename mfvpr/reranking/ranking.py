@@ -85,8 +85,7 @@ def balancing_c(
 ) -> Float[jax.Array, ""]:
     """The c with which both scores of one query's candidates have the same standard deviation.
 
-    The paper sets c by hand; this value adapts to detectors with
-    scores in other units.
+    The paper sets c by hand; this value adapts to detectors with scores in other units.
     """
 
     def deviation(scores: Array) -> Array:
@@ -138,8 +137,7 @@ def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> 
         return cosine
     if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
         raise InputError("retrieval_score=negative_euclidean: expected cosine similarities up to 1, got "
-                         f"{largest:.4g}; "
-                         "use cosine, which takes any score")  # fmt: skip
+                         f"{largest:.4g}; use cosine, which takes any score")  # fmt: skip
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
 

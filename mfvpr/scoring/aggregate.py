@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.fields import check_choices, choice, flag, named, number
+from mfvpr.scoring.fields import check_choices, choice, flag, number, table_value
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_confidence, match_weights
@@ -32,7 +32,7 @@ class AggregatedScore:
             not above 0 scores NaN.
     """
 
-    weight: Weight = named(NAMED_WEIGHTS, "dmf", file=SUFFIX)
+    weight: Weight = table_value(NAMED_WEIGHTS, "dmf", file=SUFFIX)
     mean: str = choice("unweighted", "weighted", "median")
     clamp: bool = flag(False)
     temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)

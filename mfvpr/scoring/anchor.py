@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.scoring.fields import check_choices, choice, flag, named, number, whole
+from mfvpr.scoring.fields import check_choices, choice, flag, integer, number, table_value
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_confidence, match_weights
@@ -56,10 +56,10 @@ class AnchorPoints:
     below it at 0.1 and 43 % at 0.3.
     """
 
-    num_bins: int = whole(15, "cells per side", bounds=(1, 32))  # the soft form's memory
+    num_bins: int = integer(15, "cells per side", bounds=(1, 32))  # the soft form's memory
     window: float | Array = number(10.0, "cells")
     tolerance: float | Array = number(3.0, "cells", learned=True)
-    weight: Weight = named(NAMED_WEIGHTS, "fs", file=SUFFIX)
+    weight: Weight = table_value(NAMED_WEIGHTS, "fs", file=SUFFIX)
     window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
     first: str = choice("query", "candidate")
     include_self: bool = flag(True)

@@ -91,22 +91,16 @@ def number(
 def numbers(
     default: Sequence[float] | None, length: int, unit: str = "", note: str = "", *, bounds: tuple = POSITIVE
 ) -> Any:
-    """Declare a tuple of `length` numbers; None is allowed if it is the default."""
+    """Declare a tuple of `length` numbers, static for the length ANY; None is allowed if it is the default."""
     plain = None if default is None else list(default)
     optional = default is None
-    return _field(default, Parameter(plain, unit, note, bounds=bounds, length=length, optional=optional, swept=False))
+    parameter = Parameter(plain, unit, note, bounds=bounds, length=length, optional=optional, swept=False)
+    return _field(default, parameter, static=length == ANY)
 
 
-def several(default: Sequence[float], unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE) -> Any:
-    """Declare a static tuple of one or more numbers."""
-    parameter = Parameter([*default], unit, note, bounds=bounds, length=ANY, swept=False)
-    return _field(tuple(default), parameter, static=True)
-
-
-def whole(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
+def integer(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
     """Declare a static integer, such as a capacity; None is allowed if it is the default."""
-    optional = default is None
-    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, optional=optional, swept=swept)
+    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, optional=default is None, swept=swept)
     return _field(default, parameter, static=True)
 
 
@@ -120,7 +114,7 @@ def flag(default: bool, note: str = "") -> Any:
     return _field(default, Parameter(default, note=note, choices=(True, False)), static=True)
 
 
-def named(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
+def table_value(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
     """Declare a value of a table, written as its name, or as a file with the suffix `file`."""
     return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from mfvpr.scoring.fields import check_choices, choice, flag, whole
+from mfvpr.scoring.fields import check_choices, choice, flag, integer
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
@@ -36,8 +36,8 @@ class GridAnchors:
             up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
     """
 
-    side: int = whole(40, "cells per side", "as the features have", bounds=(1, 74), swept=False)
-    patch: int | None = whole(None, "cells", "odd; None = 3/4 of the side", bounds=(1, 73))
+    side: int = integer(40, "cells per side", "as the features have", bounds=(1, 74), swept=False)
+    patch: int | None = integer(None, "cells", "odd; None = 3/4 of the side", bounds=(1, 73))
     wrap: bool = flag(True, "flat numbers are compared, as published")
     outside: str = choice("unequal", "zero", note="beyond the grid, of the CPU and of the GPU path")
 

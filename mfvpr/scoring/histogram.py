@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.scoring.fields import SCORE, check_choices, choice, flag, named, number, numbers, several, whole
-from mfvpr.scoring.intervals import mass_interval
+from mfvpr.scoring.fields import ANY, SCORE, check_choices, choice, flag, integer, number, numbers, table_value
 from mfvpr.scoring.lattice import Lattice, bin_scores, climb, map_rows, pool_bins, smooth_tallest, tallest, votes
 from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, where_usable
 from mfvpr.scoring.tallest import tallest_bins
@@ -77,7 +76,7 @@ class HistogramOfShifts:
 
     bin_size: float | Array = number(15.0, "px")
     sigma: float | Array = number(22.5, "px", learned=True)
-    weight: Weight = named(NAMED_WEIGHTS, "fs", file=SUFFIX)
+    weight: Weight = table_value(NAMED_WEIGHTS, "fs", file=SUFFIX)
     truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
     shift_range: tuple[float, float] | None = numbers(
         None, 2, "[x, y] px", "None = all possible shifts", bounds=(0.0, 1e12)
@@ -85,11 +84,11 @@ class HistogramOfShifts:
     align: str = choice("min_edge", "zero_center", "zero_edge")
     sigma_is_variance: bool = flag(False)
     direction: str = choice("candidate_minus_query", "query_minus_candidate")
-    max_bins: int | None = whole(
+    max_bins: int | None = integer(
         None, "capacity per axis", "None = what the image size needs", bounds=(1, MAX_BINS), swept=False
     )
-    scales: tuple[float, ...] = several(
-        (1.0,), "", "of the place, candidate over query; [1] = the paper's", bounds=(0.1, 10.0)
+    scales: tuple[float, ...] = numbers(
+        (1.0,), ANY, "", "of the place, candidate over query; [1] = the paper's", bounds=(0.1, 10.0)
     )
     scale_deviation: float | Array = number(math.inf, "octaves", "of the scales' prior; None = all count alike")
     temperature: float | Array | None = number(
@@ -319,4 +318,31 @@ def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
     scores, lattice, usable, _ = scorer._vote(matches)
-    return jnp.where(usable, mass_interval(scores, lattice, level, sharpness), jnp.nan)
+    return jnp.where(usable, _mass_interval(scores, lattice, level, sharpness), jnp.nan)
+
+
+def _mass_interval(
+    scores: Float[Array, "bins bins"], lattice: Lattice, level: float | Array, sharpness: float | Array
+) -> Float[jax.Array, "2 2"]:
+    """Interval (low, high) of (x, y) with the central mass along each axis.
+
+    The mass of a bin is s_ij^sharpness. Mass is spread evenly within a bin. Without votes all bins have the same mass.
+
+    Args:
+        scores: (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.
+        lattice: positions of the bins.
+        level: share of the mass, between 0 and 1; the rest is split between both sides.
+        sharpness: exponent; the larger, the less mass the lower bins have.
+    """
+    level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
+    heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
+    top = jnp.max(heights)
+    mass = jnp.where(top > 0, (heights / jnp.where(top > 0, top, 1.0)) ** sharpness, in_range)
+    tail = (1 - level) / 2
+    edges = jnp.arange(len(scores) + 1, dtype=scores.dtype) - 0.5  # in bins
+
+    def along(axis: int) -> Array:
+        below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
+        return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], lattice.centers(axis, edges))
+
+    return jnp.stack([along(0), along(1)], axis=1)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring import planes, quads
-from mfvpr.scoring.fields import check_choices, choice, flag, number, whole
+from mfvpr.scoring.fields import check_choices, choice, flag, integer, number
 from mfvpr.scoring.shifts import query_features
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -65,7 +65,7 @@ class Homography:
     refit: bool = flag(False, "count again after least squares")
     few: str = choice("count", "zero", note="less than 4 matches")
     per_feature: bool = flag(False)
-    seed: int = whole(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
+    seed: int = integer(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
 
     __post_init__ = check_choices
 

@@ -27,7 +27,8 @@ def numbers(scorer: Any) -> dict[str, Any]:
 
 def whole_numbers(scorer: Any) -> set[str]:
     """Names of the `numbers` that are integers, such as indices, and must remain integers."""
-    return {name for name, number in numbers(scorer).items() if number is not None and _is_whole(number)}
+    is_whole = lambda number: jnp.issubdtype(jnp.result_type(number), jnp.integer)  # noqa: E731
+    return {name for name, number in numbers(scorer).items() if number is not None and is_whole(number)}
 
 
 def choices(scorer: Any) -> set[str]:
@@ -76,7 +77,3 @@ def _replace(scorer: Any, name: str, value: Any) -> Any:
 def _is_number(value: Any) -> bool:
     scalar = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
     return scalar and (jnp.issubdtype(jnp.result_type(value), jnp.number) or isinstance(value, bool | np.bool_))
-
-
-def _is_whole(number: Any) -> bool:
-    return jnp.issubdtype(jnp.result_type(number), jnp.integer)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.scoring.fields import check_choices, choice, number, whole
+from mfvpr.scoring.fields import check_choices, choice, integer, number
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -31,7 +31,7 @@ class VisualPhrases:
         align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the upper cell.
     """
 
-    length: int = whole(2, "matches of a phrase", bounds=(1, MAX_LENGTH))
+    length: int = integer(2, "matches of a phrase", bounds=(1, MAX_LENGTH))
     cell_size: float | Array = number(15.0, "px")
     align: str = choice("zero_center", "zero_edge")
 

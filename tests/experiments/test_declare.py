@@ -11,7 +11,17 @@ from experiments import build, command_line, data_sets, declare, groups, help_te
 from experiments.settings import CONF
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
-from mfvpr.scoring.fields import check_choices, choice, flag, from_values, named, number, numbers, parameters_of, whole
+from mfvpr.scoring.fields import (
+    check_choices,
+    choice,
+    flag,
+    from_values,
+    integer,
+    number,
+    numbers,
+    parameters_of,
+    table_value,
+)
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
 from mfvpr.tuning.learning.parameters import can_learn, starts
@@ -27,9 +37,9 @@ class Nearness:
 
     radius: float | Array = number(30.0, "px")
     most: float | Array | None = number(None, "px", "None = all", bounds=(1, 500))
-    rounds: int = whole(2, "iterations", bounds=(1, 9))
+    rounds: int = integer(2, "iterations", bounds=(1, 9))
     norm: str = choice("sum", "largest", note="of x and y")
-    weight: Weight = named(NAMED_WEIGHTS, "unit", file=SUFFIX)
+    weight: Weight = table_value(NAMED_WEIGHTS, "unit", file=SUFFIX)
     size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = any")
     strict: bool = flag(False)
     inner: tuple = ()  # no setting

@@ -23,9 +23,8 @@ from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.storage.features import open_store
 from mfvpr.types import Shortlist, per_match, per_pair
 from mfvpr.utils import ragged
-from tests.builders import make_features
+from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
-from tests.matching.arrays import make_shortlist
 
 pytestmark = pytest.mark.thorough
 
@@ -263,14 +262,6 @@ def test_a_querys_matches_are_padded_to_the_capacity(match_set):
         for place, row in enumerate(split_pairs(padded)):
             for name, values in row.items():
                 np.testing.assert_array_equal(values, per_match(padded)[name][place][padded.mask[place]])
-
-
-def test_some_queries(match_set):
-    subset = match_set.take([5, 0])
-    assert len(subset) == 2
-    assert subset.capacity == match_set.capacity
-    for got, query in zip((subset[0], subset[1]), (5, 0), strict=True):
-        jax.tree.map(np.testing.assert_array_equal, got, match_set[query])
 
 
 def test_batches_have_every_pair_with_matches_once(match_set):

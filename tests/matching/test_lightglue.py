@@ -16,8 +16,8 @@ from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.storage.matches import open_match_store
 from mfvpr.types import per_keypoint, per_match
 from mfvpr.utils import ragged, recipe_of
+from tests.builders import make_shortlist, stack
 from tests.golden.make_lightglue import SIZES, SMALL, pair
-from tests.matching.arrays import make_shortlist, stack
 from tests.networks.test_lightglue import match_one, padded, small_network
 
 pytestmark = pytest.mark.thorough

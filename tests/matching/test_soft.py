@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from mfvpr import match, soft_match
 from mfvpr.types import per_keypoint
 from tests import soft_oracles
-from tests.builders import double, make_features
-from tests.matching.arrays import stack
+from tests.builders import double, make_features, stack
 
 pytestmark = pytest.mark.thorough
 

@@ -9,22 +9,16 @@ import pytest
 import mfvpr
 from mfvpr.datasets import ImageFolder
 from mfvpr.datasets.contents import Content, Contents
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.sequence_matching import match_cohort
+from mfvpr.evaluation import match_sequence, stages
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.cohort_normalization import PRIOR, by_hubness, cohort_sequence, hubness
 from mfvpr.storage import FeatureCache
-from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
+from tests.builders import make_shortlist
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 from tests.reranking.conftest import SCORERS, SIFT, VLAD
 
 pytestmark = pytest.mark.thorough
-
-
-def shortlist(rows):
-    rows = np.array(rows)
-    return Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)
 
 
 def by_loops(candidates, scores, database):
@@ -47,53 +41,29 @@ def test_hubness_is_that_of_the_loop(seed):
     scores = np.where(rows >= 0, rng.integers(0, 6, rows.shape) * 7.5, np.nan).astype(np.float32)
     scores[rng.random(scores.shape) < 0.1] = np.nan
     scores[3, 0] = np.inf
-    strengths = hubness(shortlist(rows), scores, 40)
-    np.testing.assert_allclose(strengths, by_loops(shortlist(rows), scores, 40), rtol=1e-12)
+    strengths = hubness(make_shortlist(rows), scores, 40)
+    np.testing.assert_allclose(strengths, by_loops(make_shortlist(rows), scores, 40), rtol=1e-12)
     assert strengths[11] == 1
     assert strengths.max() > 1.1
-    np.testing.assert_allclose(hubness(shortlist(rows), 1000 * scores, 40), strengths, rtol=1e-6)
-
-
-def test_few_scores_say_little():
-    """Three images score twice the usual; more scores of an image make it a surer hub."""
-    rows = np.repeat([0, 1, 2, 3], [1, 10, 100, 1000])[None]
-    strength = hubness(shortlist(rows), np.where(rows == 3, 1.0, 2.0), 5)
-    assert 1 < strength[0] < strength[1] < strength[2] < 2
-    assert strength[3] < 1
-    assert strength[4] == 1
+    np.testing.assert_allclose(hubness(make_shortlist(rows), 1000 * scores, 40), strengths, rtol=1e-6)
 
 
 @pytest.mark.parametrize("scores", [np.zeros((2, 3)), np.full((2, 3), np.nan), np.full((2, 3), np.inf)])
 def test_where_nothing_scores_there_is_no_hub(scores):
-    np.testing.assert_array_equal(hubness(shortlist([[1, 2, -1], [0, 2, -1]]), scores, 4), np.ones(4))
-
-
-def test_a_hub_is_mended_and_an_empty_image_gains_nothing():
-    """Image 0 scores 60 with any query, image 4 next to 0; the other images 20, and 50 with their own place."""
-    usual = np.array([60.0, 20, 20, 20, 0.5])
-    rows = np.tile(np.arange(5), (100, 1))
-    strength = hubness(shortlist(rows), np.tile(usual, (100, 1)).astype(np.float32), 5)
-    queries = np.tile(usual, (3, 1)).astype(np.float32)
-    queries[np.arange(3), np.arange(1, 4)] = 50
-    queries[:, 4] = 3  # one chance match: six times what it has elsewhere
-    assert queries.argmax(axis=1).tolist() == [0, 0, 0]
-    got = by_hubness(shortlist(rows[:3]), queries, strength)
-    assert got.dtype == np.float32
-    assert got.argmax(axis=1).tolist() == [1, 2, 3]
-    assert strength[4] < 0.2
-    np.testing.assert_array_equal(got[:, 1:], queries[:, 1:])
+    np.testing.assert_array_equal(hubness(make_shortlist([[1, 2, -1], [0, 2, -1]]), scores, 4), np.ones(4))
 
 
 def test_each_score_is_divided_by_that_of_its_image():
-    scores = np.array([[8, 6, np.nan], [np.nan, np.inf, 0]], np.float32)
-    got = by_hubness(shortlist([[2, 0, -1], [1, 2, 0]]), scores, np.array([1.5, 1, 2, 3]))
-    np.testing.assert_array_equal(got, np.array([[4, 4, np.nan], [np.nan, np.inf, 0]], np.float32))
+    """Unless that is below 1: an image that matches nothing would gain by every match."""
+    scores = np.array([[8, 6, 3, np.nan], [np.nan, np.inf, 3, 0]], np.float32)
+    got = by_hubness(make_shortlist([[2, 0, 3, -1], [1, 2, 3, 0]]), scores, np.array([1.5, 1, 2, 0.5]))
+    np.testing.assert_array_equal(got, np.array([[4, 4, 3, np.nan], [np.nan, np.inf, 3, 0]], np.float32))
 
 
 @pytest.mark.parametrize(("function", "last"), [(hubness, 2), (by_hubness, np.ones(2))])
 def test_scores_below_0_raise(function, last):
     with pytest.raises(InputError, match=r"cohort: .*from 0, .*got -0.5 of grid"):
-        function(shortlist([[0, 1]]), np.array([[3, -0.5]], np.float32), last, name="grid")
+        function(make_shortlist([[0, 1]]), np.array([[3, -0.5]], np.float32), last, name="grid")
 
 
 def contents(tmp_path, *hashes):
@@ -148,7 +118,8 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, cache_folder, e
     for name, [ranked] in without.systems.items():
         np.testing.assert_array_equal(result.systems[name][0].rows, ranked.rows)
         np.testing.assert_array_equal(result.systems[name][0].scores, ranked.scores)
-    cohort = match_cohort(dataset, 2, SIFT, VLAD, 5, cache=FeatureCache(cache_folder))
+    cache = FeatureCache(cache_folder)
+    cohort = match_sequence(dataset, cohort_sequence(cache.contents(dataset.database), 2), SIFT, VLAD, 5, cache=cache)
     candidates = cohort.candidates
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()
     for name, scores in stages.score(SCORERS, cohort.by_scale, candidates).items():

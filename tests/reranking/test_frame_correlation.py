@@ -50,12 +50,6 @@ def test_agrees_with_the_loop(seed, previous):
     np.testing.assert_array_equal(got[:previous], scores[:previous])
 
 
-def test_a_neighbor_of_the_last_places_overtakes():
-    rows, scores = np.array([[10, 40], [11, 40], [40, 12]], np.int32), np.array([[9, 1], [9, 1], [5, 4]], np.float32)
-    got = FrameCorrelation(2)(Shortlist(rows, scores, rows >= 0), scores)
-    np.testing.assert_allclose(got[2], [5, 4 * (1 + 0.4 * 14 / 15)], rtol=1e-6)
-
-
 def test_nan_stays_nan_and_is_no_place():
     rows, scores = np.array([[3, 9], [3, 9]], np.int32), np.array([[np.nan, 2], [1, 1]], np.float32)
     got = FrameCorrelation(1)(Shortlist(rows, scores, rows >= 0), scores)

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import mfvpr
 from mfvpr.datasets import sequences_dataset
@@ -68,21 +66,6 @@ def test_it_ranks_as_a_balanced_c_and_has_no_unit(unit):
     by_query = np.arange(1, 1 + len(fused))[:, None]  # other units for every query
     scaled = Fusion("zscore")(unit, candidates, {unit: 100 * by_query * scores[unit] - 7 * by_query})
     np.testing.assert_allclose(scaled, fused, rtol=1e-3, atol=1e-3)
-
-
-ROUGH = st.one_of(st.sampled_from([0.0, 3.0, np.nan, np.inf, -np.inf]), st.integers(-20, 20).map(float))
-
-
-@given(st.lists(ROUGH, min_size=10, max_size=10), st.integers(0, 5))
-def test_what_is_not_finite_is_its_candidate_s_alone(values, count):
-    candidates, _ = random_scores(1, 5)
-    candidates = replace(candidates, mask=np.arange(5)[None] < count)
-    first, second = np.array(values, np.float32).reshape(2, 1, 5)
-    fused = BOTH("a", candidates, {"a": first, "count": second})
-    with np.errstate(invalid="ignore"):
-        assert_fused(fused, candidates, [candidates.scores, first, second], [0.5, 1.0, 2.0])
-    finite = candidates.mask & np.isfinite(first) & np.isfinite(second)
-    np.testing.assert_array_equal(np.isfinite(fused), finite)
 
 
 def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():

@@ -44,9 +44,8 @@ def test_combined_score_spans_plain_to_retrieval_order():
     retrieval_scores, scores = jnp.array(rng.random(20), jnp.float32), jnp.array(rng.random(20), jnp.float32)
     np.testing.assert_array_equal(rank(combine(retrieval_scores, scores, c=0.0)), rank(scores))
     np.testing.assert_array_equal(rank(combine(retrieval_scores, scores)), rank(retrieval_scores))
-    np.testing.assert_allclose(
-        combine(retrieval_scores, scores, c=3.0), oracles.combine(retrieval_scores, scores, 3.0), 1e-6
-    )
+    expected = 3.0 * np.asarray(retrieval_scores, float) + np.asarray(scores, float)
+    np.testing.assert_allclose(combine(retrieval_scores, scores, c=3.0), expected, 1e-6)
 
 
 def test_padding_is_no_similarity():
@@ -114,15 +113,6 @@ def test_scales_are_fused_as_in_patch_netvlad(normalize, data):
     np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
 
 
-def test_a_candidate_that_is_not_there_or_no_number_matters_to_itself_alone():
-    scores = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 10.0], [77.0, -99.0]], np.float32)
-    mask = np.array([True, True, True, False])
-    fused = np.asarray(fuse_scales(scores, mask))
-    high = np.std([1.0, 3.0, 5.0])
-    np.testing.assert_allclose(fused[[0, 2]], [-2 / high - 1, 2 / high + 1], rtol=1e-6)
-    assert np.isnan(fused[[1, 3]]).all()
-
-
 def test_no_score_is_no_fault_of_a_program():
     scores, mask = np.ones((3, 2), np.float32), np.array([True, True, False])
     with jax.debug_nans(True):
@@ -147,12 +137,6 @@ def test_scales_of_equal_scores_say_nothing():
     mask = np.ones(49, bool)
     np.testing.assert_array_equal(fuse_scales(scores, mask), fuse_scales(scores[:, 1:], mask))
     np.testing.assert_array_equal(fuse_scales(scores[:, :1], mask), np.zeros(49))
-
-
-def test_one_scale_that_is_not_normalized_is_its_scores():
-    scores = np.random.default_rng(0).normal(size=(3, 5, 1)).astype(np.float32)
-    scores[1, 2] = np.nan
-    np.testing.assert_array_equal(fuse_scales(scores, np.ones((3, 5), bool), normalize="none"), scores[..., 0])
 
 
 def test_queries_and_settings_are_fused_one_by_one():

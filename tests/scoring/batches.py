@@ -1,14 +1,9 @@
-"""Compiled scores, and batches of pairs."""
+"""Compiled scores, pairs of a batch, and tests of several scorers."""
 
 import jax
-import numpy as np
 import pytest
 
 score = jax.jit(lambda scorer, matches: scorer(matches))
-
-
-def stack(pairs):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
 
 
 def pair_of(batch, row=0):

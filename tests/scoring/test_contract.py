@@ -28,10 +28,10 @@ from mfvpr import (
 from mfvpr.scoring.parameters import with_capacity
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import with_static_functions
-from tests.builders import SIZE, per_match, random_matches
+from tests.builders import SIZE, per_match, random_matches, stack
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 from tests.scoring import batches
-from tests.scoring.batches import pair_of, stack
+from tests.scoring.batches import pair_of
 
 pytestmark = pytest.mark.thorough
 
@@ -149,6 +149,9 @@ def test_a_capacity_that_is_too_small_raises_unless_traced():
     with pytest.raises(InputError, match=r"bin_size=0.5: .*1024.*1344"):
         score_candidates(HistogramOfShifts(bin_size=0.5), matches)
     assert np.isnan(_score_all(HistogramOfShifts(max_bins=44), matches)).all()
+    for refine in (False, True):
+        shift = jax.jit(lambda pair: HistogramOfShifts(max_bins=44).dominant_shift(pair, refine=refine))  # noqa: B023
+        assert np.isnan(shift(pair_of(matches))).all()
 
 
 def test_calls_with_other_numbers_compile_nothing(compilations):
@@ -181,7 +184,7 @@ def test_a_function_that_changes_is_not_taken_for_what_it_was():
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
-@pytest.mark.parametrize("field", ["points1", "scores0", "distance", "ratio"])
+@pytest.mark.parametrize("field", ["points0", "points1", "scores0", "distance", "ratio"])
 def test_one_match_that_is_no_number_leaves_no_score(field, broken):
     """For one pair, in a batch, and in a grid; else such a pair would rank somewhere."""
     pair = random_matches(np.random.default_rng(15), 20, capacity=24)
@@ -196,6 +199,10 @@ def test_one_match_that_is_no_number_leaves_no_score(field, broken):
             assert np.isfinite(scores[1])
     assert np.isnan(score(AggregatedScore(weight=weight), pair))
     assert np.isnan(HistogramOfShifts(weight=weight).dominant_shift(pair)).all()
+    rapid = RapidSpatialScore(), RapidSpatialScore(reach="largest_shift")
+    others = *rapid, VisualPhrases(), LostScore(), LostScore("described"), Homography(max_iterations=100.0)
+    for scorer in others if "points" in field else ():
+        assert np.isnan(score(scorer, pair))
 
 
 @library_scorer

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mfvpr import Homography, score_candidates, score_grid
+from mfvpr import Homography, score_candidates
 from mfvpr.scoring import quads
 from mfvpr.utils import NoGradientError
 from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
-from tests.builders import SIZE, make_matches, per_match
-from tests.scoring.batches import stack
+from tests.builders import SIZE, make_matches, per_match, stack
 
 pytestmark = pytest.mark.thorough
 
@@ -189,14 +188,6 @@ def test_far_points_do_not_make_inliers_of_the_others(far):
     assert float(estimate(Homography(8.0), make_matches(points0, points1, capacity=CAPACITY)).score) <= 34
 
 
-def test_a_point_that_is_no_number_is_no_score():
-    matches = pair(9, 40, 0.5)
-    broken = matches.points0.copy()
-    broken[3] = np.nan
-    assert np.isnan(score(replace(matches, points0=broken)))
-    assert np.isfinite(score(replace(matches, points0=broken, mask=matches.mask & (np.arange(CAPACITY) != 3))))
-
-
 def test_a_match_counts_with_its_confidence():
     matches = pair(10, 60, 1.0, noise=0.5)
     confidence = np.zeros(CAPACITY, np.float32)
@@ -229,16 +220,6 @@ def test_distances_in_double_precision_change_no_score(measure):
     with jax.enable_x64(True):
         got = score(replace(matches, distance=matches.distance.astype(np.float64)), 8.0, measure=measure)
     np.testing.assert_allclose(got, expected, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_thresholds_and_iterations_are_swept_in_one_program():
-    batch = stack([pair(seed, 80, 0.3) for seed in range(3)])
-    grid = np.asarray(score_grid(Homography(), batch, threshold=[4.0, 8.0, 24.0], max_iterations=[20, 300]))
-    expected = [[score_candidates(Homography(threshold, iterations), batch) for iterations in (20.0, 300.0)]
-                for threshold in (4.0, 8.0, 24.0)]  # fmt: skip
-    np.testing.assert_array_equal(grid, expected)
-    assert (grid[:, 1] >= grid[:, 0]).all()
 
 
 @pytest.mark.slow

@@ -12,8 +12,7 @@ from mfvpr.matching import MatchSet
 from mfvpr.tuning import sweeps
 from mfvpr.types import Shortlist, per_match
 from mfvpr.utils import InputError
-from tests.builders import make_matches
-from tests.scoring.batches import stack
+from tests.builders import make_matches, stack
 from tests.scoring.test_homography import plane_points
 
 COUNTS = (60, 120, 20)

@@ -13,8 +13,8 @@ from jax.test_util import check_grads
 from mfvpr import AggregatedScore, HistogramOfShifts, InputError, UnitWeight, score_candidates
 from mfvpr.scoring.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
 from mfvpr.scoring.weights import match_weights
-from tests.builders import double, make_matches, per_match, random_matches
-from tests.scoring.batches import pair_of, stack
+from tests.builders import double, make_matches, per_match, random_matches, stack
+from tests.scoring.batches import pair_of
 
 pytestmark = pytest.mark.thorough
 

@@ -24,10 +24,10 @@ from tests.builders import make_matches, random_matches, real
 pytestmark = pytest.mark.thorough
 
 WEIGHTS = {
-    "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: oracles.fs_weight(s0, s1)),
-    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: oracles.dmf_weight(d)),
-    "ratio": (RatioWeight(), lambda d, s0, s1, r: oracles.ratio_weight(r)),
-    "ratio, squared": (RatioWeight(2.0), lambda d, s0, s1, r: oracles.ratio_weight(r, 2)),
+    "fs": (FeatureScoreWeight(), lambda d, s0, s1, r: s0 + s1),
+    "dmf": (DescriptorDistanceWeight(), lambda d, s0, s1, r: 2 - d),
+    "ratio": (RatioWeight(), lambda d, s0, s1, r: 1 - r),
+    "ratio, squared": (RatioWeight(2.0), lambda d, s0, s1, r: (1 - r) ** 2),
     "unit": (UnitWeight(), lambda d, s0, s1, r: np.ones(len(d))),
 }
 dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
@@ -67,16 +67,17 @@ def oracle_inputs(matches, weight):
     return tuple(values[confidence > 0] for values in (points0, points1, weights))
 
 
+@pytest.mark.parametrize("align", ["min_edge", "zero_center", "zero_edge"])
 @given(
-    pairs(),
-    st.sampled_from(list(WEIGHTS)),
-    st.sampled_from(["min_edge", "zero_center", "zero_edge"]),
-    st.sampled_from([(15.0, 22.5), (20.0, 8.0), (11.0, 30.0), (48.0, 5.0)]),
-    st.sampled_from([np.inf, 2.0]),
-    st.sampled_from([None, (100.0, 40.0)]),
-    st.booleans(),
-    st.sampled_from(["candidate_minus_query", "query_minus_candidate"]),
+    matches=pairs(),
+    weight=st.sampled_from(list(WEIGHTS)),
+    parameters=st.sampled_from([(15.0, 22.5), (20.0, 8.0), (11.0, 30.0), (48.0, 5.0)]),
+    truncate=st.sampled_from([np.inf, 2.0]),
+    shift_range=st.sampled_from([None, (100.0, 40.0)]),
+    variance=st.booleans(),
+    direction=st.sampled_from(["candidate_minus_query", "query_minus_candidate"]),
 )
+@settings(max_examples=20)
 def test_histogram(matches, weight, align, parameters, truncate, shift_range, variance, direction):
     bin_size, sigma = parameters
     scorer = HistogramOfShifts(
@@ -100,16 +101,17 @@ def test_histogram(matches, weight, align, parameters, truncate, shift_range, va
     np.testing.assert_allclose(scorer(matches), expected.max() if len(weights) else 0.0, **CLOSE)
 
 
+@pytest.mark.parametrize("cell_weight", ["winner_sum", "cell_sum", "ones"])
 @given(
-    pairs(),
-    st.sampled_from(list(WEIGHTS)),
-    st.sampled_from([(10, 3.0), (9, 1.0), (2, 4.5), (15, 2.0)]),
-    st.sampled_from(["half_floor", "asymmetric", "odd_down", "radius"]),
-    st.sampled_from(["query", "candidate"]),
-    st.booleans(),
-    st.sampled_from(["winner_sum", "cell_sum", "ones"]),
-    st.sampled_from([15, 4]),
+    matches=pairs(),
+    weight=st.sampled_from(list(WEIGHTS)),
+    parameters=st.sampled_from([(10, 3.0), (9, 1.0), (2, 4.5), (15, 2.0)]),
+    window_mode=st.sampled_from(["half_floor", "asymmetric", "odd_down", "radius"]),
+    first=st.sampled_from(["query", "candidate"]),
+    include_self=st.booleans(),
+    num_bins=st.sampled_from([15, 4]),
 )
+@settings(max_examples=20)
 def test_anchor(matches, weight, parameters, window_mode, first, include_self, cell_weight, num_bins):
     window, tolerance = parameters
     options = {
@@ -122,8 +124,8 @@ def test_anchor(matches, weight, parameters, window_mode, first, include_self, c
     np.testing.assert_allclose(got, expected, **CLOSE)
 
 
-@given(pairs(), st.sampled_from(list(WEIGHTS)), st.sampled_from(["unweighted", "weighted", "median"]), st.booleans())
-@settings(max_examples=100)
+@pytest.mark.parametrize("mean", ["unweighted", "weighted", "median"])
+@given(matches=pairs(), weight=st.sampled_from(list(WEIGHTS)), clamp=st.booleans())
 def test_aggregate(matches, weight, mean, clamp):
     points0, points1, weights = oracle_inputs(matches, weight)
     confidence = certainty(matches)

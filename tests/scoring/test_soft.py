@@ -15,13 +15,11 @@ from mfvpr import (
     FeatureScoreWeight,
     HistogramOfShifts,
     UnitWeight,
-    match,
     score_grid,
-    soft_match,
 )
 from tests import soft_oracles
-from tests.builders import SIZE, double, make_features, make_matches, random_matches, real
-from tests.scoring.batches import each_scorer, score, stack
+from tests.builders import SIZE, double, make_matches, random_matches, real, stack
+from tests.scoring.batches import each_scorer, score
 
 pytestmark = pytest.mark.thorough
 
@@ -130,16 +128,6 @@ def test_soft_becomes_hard(scorer, seed):
     assert errors[-1] < 1e-4
 
 
-def test_soft_matching_and_soft_scores_together_become_the_paper():
-    rng = np.random.default_rng(4)
-    pair = make_features(rng, 20, capacity=22), make_features(rng, 25, capacity=26)
-    with jax.enable_x64(True):
-        pair = double(pair)
-        hard = score(AggregatedScore(clamp=True), jax.jit(match)(*pair))
-        soft = score(AggregatedScore(clamp=True, temperature=1e-6), jax.jit(soft_match)(*pair, temperature=1e-7))
-    np.testing.assert_allclose(soft, hard, rtol=1e-6)
-
-
 @each_scorer([HISTOGRAMS[0], ANCHORS[0], SUMS[1]])
 def test_a_grid_of_temperatures_equals_the_loop_and_is_nan_unless_above_zero(scorer):
     matches, temperatures = random_matches(np.random.default_rng(6), 16), [-1.0, 0.0, 0.1, 0.3, 1.0]
@@ -147,13 +135,3 @@ def test_a_grid_of_temperatures_equals_the_loop_and_is_nan_unless_above_zero(sco
     loop = [score(replace(scorer, temperature=t), matches) for t in temperatures]
     np.testing.assert_allclose(grid[:, 0], loop, rtol=1e-5)
     assert np.isnan(loop).tolist() == [True, True, False, False, False]
-
-
-def test_identical_points_and_one_cell_have_closed_forms():
-    """n equal matches at a cell's center, T -> 0 but for the occupancy: one cell, which supports itself."""
-    matches = make_matches(np.full((3, 2), SIZE / 2), np.full((3, 2), SIZE / 2), scores0=[1, 2, 3], scores1=[0, 1, 2])
-    soft = AnchorPoints(3, temperature=0.01)
-    assert score(soft, matches) == pytest.approx(9 * 3.0 * 9 / 9.01, rel=1e-5)
-    assert score(replace(soft, cell_weight="ones"), matches) == pytest.approx(3.0 * (9 / 9.01) ** 2, rel=1e-5)
-    still = score(AggregatedScore(temperature=50.0), matches)
-    assert still == pytest.approx(6 * 2 * SIZE**2 * 0.75, rel=1e-6)

@@ -22,8 +22,8 @@ from mfvpr import (
 from mfvpr.scoring import tallest
 from mfvpr.scoring.lattice import Lattice
 from mfvpr.scoring.tallest import tallest_bins
-from tests.builders import per_match, random_matches
-from tests.scoring.batches import pair_of, stack
+from tests.builders import per_match, random_matches, stack
+from tests.scoring.batches import pair_of
 
 pytestmark = pytest.mark.thorough
 
