@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host, sample
+from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, sample, to_host
 
 RADIUS = 2  # of the detector, px
 LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # before each block: pooling, and size of the image / size of the map
@@ -22,7 +22,7 @@ def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
         points = _refine(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1  # and back, rounded as published
         values = F.grid_sample(score[None], points[None, None], align_corners=True)[0, 0, 0]
         descriptors = _descriptors(w, dense, (points / 2 + 0.5) * corner)
-        extracted.append(on_host((points + 1) / 2 * corner, descriptors, values))
+        extracted.append(to_host((points + 1) / 2 * corner, descriptors, values))
     return extracted
 
 
@@ -60,9 +60,9 @@ def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
     limit = max(height, width) / 4
     offsets = conv(w, f"{name}.offset_conv", x, bias=True, padding=1).clamp(-limit, limit).unflatten(1, (9, 2))
     rows, columns = torch.arange(height, device=x.device), torch.arange(width, device=x.device)
-    down, correct = (step.reshape(9, 1, 1) for step in _neighborhood(1, x.device))
+    down, right = (step.reshape(9, 1, 1) for step in _neighborhood(1, x.device))
     vertical = offsets[:, :, 0] + (rows[:, None] + down)  # [B, 9, h, w]
-    horizontal = offsets[:, :, 1] + (columns + correct)
+    horizontal = offsets[:, :, 1] + (columns + right)
     taps = sample(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
     products = w(f"{name}.regular_conv.weight").flatten(1) @ taps.flatten(3).flatten(1, 2)
     return products.unflatten(2, (height, width))
@@ -85,10 +85,10 @@ def _maxima(scores: Tensor) -> Tensor:
 
 def _refine(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Positions `[n, 2]` (x, y) px of peaks, moved by a soft-argmax of their neighborhoods."""
-    down, correct = _neighborhood(RADIUS, score.device)
-    patches = F.pad(score, (RADIUS,) * 4)[row[:, None] + RADIUS + down, column[:, None] + RADIUS + correct]
+    down, right = _neighborhood(RADIUS, score.device)
+    patches = F.pad(score, (RADIUS,) * 4)[row[:, None] + RADIUS + down, column[:, None] + RADIUS + right]
     weights = ((patches - patches.amax(1, keepdim=True)) / 0.1).exp()
-    residual = weights @ torch.stack([correct, down], 1).float() / weights.sum(1, keepdim=True)
+    residual = weights @ torch.stack([right, down], 1).float() / weights.sum(1, keepdim=True)
     return torch.stack([column, row], 1) + residual
 
 
@@ -107,7 +107,7 @@ def _descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
 
 
 def _neighborhood(radius: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Offsets down and to the correct, row by row."""
+    """Offsets down and to the right, row by row."""
     reach = torch.arange(-radius, radius + 1, device=device)
-    down, correct = torch.meshgrid(reach, reach, indexing="ij")
-    return down.flatten(), correct.flatten()
+    down, right = torch.meshgrid(reach, reach, indexing="ij")
+    return down.flatten(), right.flatten()

@@ -55,7 +55,7 @@ class LocalFeatures(NamedTuple):
     scores: np.ndarray  # [n]
 
 
-def on_host(*tensors: Tensor) -> LocalFeatures:
+def to_host(*tensors: Tensor) -> LocalFeatures:
     """Copy keypoints, descriptors and scores of an image to the host."""
     return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
@@ -118,9 +118,9 @@ def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
 def _derivatives(dense: Tensor) -> tuple[Tensor, ...]:
     """Derivatives di, dj, dii, djj, dij of maps, zeros outside; shifted maps are faster than convolutions."""
     wide = F.pad(dense, (1, 1, 1, 1))
-    up, down, left, correct = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
+    up, down, left, right = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
     corners = wide[..., 2:, 2:] - wide[..., 2:, :-2] - wide[..., :-2, 2:] + wide[..., :-2, :-2]
-    return (down - up) / 2, (correct - left) / 2, up - 2 * dense + down, left - 2 * dense + correct, corners / 4
+    return (down - up) / 2, (right - left) / 2, up - 2 * dense + down, left - 2 * dense + right, corners / 4
 
 
 def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
@@ -132,7 +132,7 @@ def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeat
     inside = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
     position, scores = position[inside].flip(1), dense[channel, row, column][inside]
     descriptors = sample(dense[None], position[None, None])[0, :, 0]
-    return on_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
+    return to_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
 
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
