@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import console, data_sets
-from experiments.errors import refuse
+from experiments import console
+from experiments.launch import refuse
+from experiments.overrides import compose_data_sets
 from experiments.stages import dataset_of
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents
@@ -51,7 +52,7 @@ def list_data(names: list[str]) -> None:
 
 def check(name: str, settings: list[str], sheet: Path | None) -> None:
     """Print image counts beside the published ones and the ground truth's extent; draw image pairs."""
-    [chosen] = data_sets.composed("check", ":".join([name, *settings]))
+    [chosen] = compose_data_sets("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
     cache = FeatureCache(None)
     database, *contents = map(cache.contents, [dataset.database, *(part.images for part in dataset.sequences)])
@@ -107,7 +108,7 @@ def _truth_lines(sequence: QuerySequence, queries: Contents, database: Contents)
         [threshold] = sequence.truth.thresholds(tolerances=[_TOLERANCE], radius=_RADIUS)
         counts = sequence.truth.positives(threshold).counts
         within = threshold_words(sequence.truth.unit, threshold).strip()
-        yield (f"right images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
+        yield (f"correct images of a query{f' ({within})' if within else ''}: {counts.min()} to {counts.max()}, median "
                f"{np.median(counts):g}; {(counts == 0).sum():,} queries have none")  # fmt: skip
     if num_same := sum(map(bool, own_rows(queries, database))):
         yield f"{num_same:,} queries are images of the database"
