@@ -20,7 +20,7 @@ _NOT_OF_SCORER = ("max_distance", "c")
 _BYTES_PER_SETTING = 2000  # Python objects, about
 
 
-def as_final(settings: dict[str, Any]) -> dict[str, Any]:
+def with_final_axis(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings with grid.c = [fusion.c] if the combined score decides and no c is varied."""
     grid = settings["grid"]
     if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
@@ -57,7 +57,7 @@ def axes(settings: dict[str, Any]) -> Axes:
     return Axes(scorer, values, {name: defaults.get(name) for name in values})
 
 
-def searchable(settings: dict[str, Any]) -> Axes:
+def search_axes(settings: dict[str, Any]) -> Axes:
     """The axes of a sweep, if they can be searched here."""
     grid_axes = axes(settings)
     if settings["search"] == "grid":
@@ -71,7 +71,7 @@ def searchable(settings: dict[str, Any]) -> Axes:
     return grid_axes
 
 
-def learnable(settings: dict[str, Any]) -> Axes:
+def learning_axes(settings: dict[str, Any]) -> Axes:
     """The axes that learning searches for comparison, if the scorer can be learned."""
     method = settings["scorer"].get("method")
     known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
@@ -85,7 +85,7 @@ def learnable(settings: dict[str, Any]) -> Axes:
     return grid_axes
 
 
-def own_c(settings: dict[str, Any]) -> float | None:
+def retrieval_weight(settings: dict[str, Any]) -> float | None:
     """The weight of the retrieval score, None = balanced."""
     c = _plain_c(settings)
     return None if c == "auto" else float(c)

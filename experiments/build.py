@@ -100,7 +100,7 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
         return _network_extractor("features", name, options)
     if (kind := options["interpolation"]).startswith("torch"):
         raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
-    return Sift(**_only(options, Sift, "features=sift"))
+    return Sift(**_require_fields(options, Sift, "features=sift"))
 
 
 def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
@@ -116,7 +116,9 @@ def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: D
     if name == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":
-        return Retrieval(Aggregated(local, VladFitting(**_only(options, VladFitting, "retrieval=vlad"))), search)
+        return Retrieval(
+            Aggregated(local, VladFitting(**_require_fields(options, VladFitting, "retrieval=vlad"))), search
+        )
     if name != "same":
         return Retrieval(_network_extractor("retrieval", name, options), search)
     if isinstance(local, FeatureFiles) or not local.vector_size:
@@ -144,7 +146,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
         published = extractor_class.whitening
         replaced = {field.name for field in fields(published)} & options.keys()
         options["whitening"] = replace(published, **{option: options.pop(option) for option in replaced})
-    return extractor_class(model, **_only(options, extractor_class, f"{group}={name}"))
+    return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
 
 
 def matching(settings: dict[str, Any]) -> Matcher:
@@ -152,8 +154,8 @@ def matching(settings: dict[str, Any]) -> Matcher:
     name, options = settings["name"], _without(settings, "name")
     weights = options.pop("weights", None)
     if name == "neighbors":
-        return Matching(**_only(options, Matching, "matching=neighbors"))
-    options = _only(options, LightGlueMatching, "matching=lightglue")
+        return Matching(**_require_fields(options, Matching, "matching=neighbors"))
+    options = _require_fields(options, LightGlueMatching, "matching=lightglue")
     return LightGlueMatching.of(_network("matching", ("lightglue",), weights), **options)
 
 
@@ -245,7 +247,7 @@ def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _only(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
+def _require_fields(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
     """The options, if they all are fields of the extractor; others come from a mixture of two choices."""
     if unknown := options.keys() - {field.name for field in fields(extractor)}:
         raise SettingsError(f"{choice} has no setting {', '.join(sorted(unknown))}; see --help")

@@ -9,7 +9,7 @@ from urllib.request import urlopen
 
 from tqdm import tqdm
 
-from experiments.errors import WEIGHTS, how_to_install, refuse, with_command
+from experiments.launch import WEIGHTS, how_to_install, refuse, with_command
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, weights_folder
 from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, read_manifest
 from mfvpr.checkpoints.registry import Entry

@@ -18,11 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.console import tell
-from experiments.data_sets import compose_program, first_of
-from experiments.errors import on_interrupt, one_line
 from experiments.groups import PROGRAMS, check_choice, choices_with, groups
-from experiments.quoting import PATHS, as_typed
-from experiments.settings import CONF, Program, SettingsError, check, nodes
+from experiments.launch import import_job, on_interrupt, one_line
+from experiments.overrides import PATHS, compose_program, quote, split_first
+from experiments.settings import CONF, SettingsError, check, nodes
 from experiments.wording import in_settings
 
 _MULTIRUN = ("-m", "--multirun")
@@ -39,36 +38,36 @@ _RENAMED = {"store": "cache", "fusion.filter_score": "fusion.retrieval_score"}  
 _MAX_DIGITS = 300  # beyond float64, and Python does not parse thousands of digits
 
 
-def run(program: Program, config: str) -> None:
-    """Call `program()(settings)` once, or with `--multirun` for each combination of values."""
+def run(config: str) -> None:
+    """Run the job of a program once, or with `--multirun` for each combination of values."""
 
     def task(composed: DictConfig) -> None:
-        job = HydraConfig.get()
-        is_multirun = job.mode == RunMode.MULTIRUN
+        hydra_settings = HydraConfig.get()
+        is_multirun = hydra_settings.mode == RunMode.MULTIRUN
         with _multirun_job() if is_multirun else one_line(), _hydra_errors(config):  # in here, or Hydra adds lines
-            for name in sorted(OmegaConf.missing_keys(composed)):
-                raise SettingsError(f"{name}: this setting has no default; give {name}=VALUE")
+            for setting in sorted(OmegaConf.missing_keys(composed)):
+                raise SettingsError(f"{setting}: this setting has no default; give {setting}=VALUE")
             settings: Any = OmegaConf.to_container(composed, resolve=True)
             check(settings)
-            arguments = typed
-            if is_multirun:
-                arguments = [override for override in job.overrides.task if not override.startswith("launcher=")]
-            command = f"python -m experiments.{PROGRAMS[config]} {shlex.join(arguments)}"
-            work = program()
+            overrides = hydra_settings.overrides.task if is_multirun else typed
+            arguments = [override for override in overrides if not override.startswith("launcher=")]
+            command = f"python -m experiments.{name} {shlex.join(arguments)}"
+            job = import_job(job_path)
             _require_device()
             with on_interrupt(signal.default_int_handler), in_settings(settings):
-                work(settings | {"multirun": is_multirun, "command": command})
+                job(settings | {"multirun": is_multirun, "command": command})
 
+    name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     with _hydra_errors(config):
         typed = sys.argv[1:]
         multirun = sorted({*_MULTIRUN} & {*typed})
-        arguments = first_of(typed) if config == "learn" and not multirun else typed
+        arguments = split_first(typed) if config == "learn" and not multirun else typed
         for argument in arguments:
             _check_form(argument, config)
             if argument.startswith("launcher=") and not (multirun and "," not in argument):
                 raise SettingsError(f"{argument}: expected one, and --multirun, which starts jobs with it")
-        quoted = [as_typed(argument, several=bool(multirun)) for argument in arguments if argument not in _MULTIRUN]
+        quoted = [quote(argument, several=bool(multirun)) for argument in arguments if argument not in _MULTIRUN]
         sys.argv[1:] = multirun[:1] + quoted  # Hydra takes no settings before --multirun
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
 

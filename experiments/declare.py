@@ -27,8 +27,9 @@ _VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 def files() -> dict[str, str]:
     """Texts by path below conf/."""
-    scorers = {name: (name, {}) for name in SCORERS} | _VARIANTS
-    texts = {f"scorer/{name}.yaml": "\n".join(_scorer(*variant)) for name, variant in scorers.items()}
+    texts = {f"scorer/{name}.yaml": "\n".join(_scorer(name)) for name in SCORERS}
+    for name, (base, values) in _VARIANTS.items():
+        texts[f"scorer/{name}.yaml"] = "\n".join([f"defaults: [{base}, _self_]", *_values(base, values)])
     every = [name for name in SCORERS if name not in ALONE]
     without_homography = [name for name in every if name != "homography"]
     groups = {
@@ -62,12 +63,17 @@ def write(conf: Path) -> None:
         path.unlink()
 
 
-def _scorer(method: str, values: Mapping[str, Any]) -> Iterator[str]:
+def _scorer(method: str) -> Iterator[str]:
     yield f"# {fields.summary(SCORERS[method])}"
     yield f"method: {method}"
-    for field, parameter in fields.parameters_of(SCORERS[method]).items():
-        comment = "; ".join(filter(None, (parameter.unit, parameter.note, parameter.words)))
-        yield _line(field, values.get(field, parameter.default), comment)
+    yield from _values(method, {name: field.default for name, field in fields.parameters_of(SCORERS[method]).items()})
+
+
+def _values(method: str, values: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of some of a scorer's parameters."""
+    for name, value in values.items():
+        field = fields.parameters_of(SCORERS[method])[name]
+        yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, field.words))))
 
 
 def _axes() -> Iterator[str]:

@@ -55,8 +55,8 @@ def evaluate(settings: dict[str, Any]) -> None:
     if settings["shard"] is not None:
         _fill_store(settings)
         return
-    with run_folder.claimed(settings) as folder:
-        _leave(folder, evaluation_of(settings))
+    with run_folder.claim(settings) as folder:
+        _write_results(folder, evaluation_of(settings))
 
 
 def _fill_store(settings: dict[str, Any]) -> None:
@@ -70,8 +70,8 @@ def _fill_store(settings: dict[str, Any]) -> None:
         print(f"shard {settings['shard']}: {end}; {advice}")
 
 
-def _leave(folder: Path, outcome: Outcome) -> None:
-    run_folder.leave(
+def _write_results(folder: Path, outcome: Outcome) -> None:
+    run_folder.write_results(
         folder, outcome.settings, ground_truth(outcome), text=text(outcome),
         write=lambda new: write(new, outcome), figures=outcome.figures,
     )  # fmt: skip
@@ -84,7 +84,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
-    tools, images = stages.begun(settings, watch)
+    tools, images = stages.prepare(settings, watch)
     figure_queries = query_rows(settings["figures"], images.dataset)
     headline, frames = fusion.system(main) if settings["final"] == "combined" else main, build.frames(settings)
     cohort, fused_systems = settings["cohort"], [main]

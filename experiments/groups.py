@@ -9,14 +9,15 @@ import yaml
 
 from experiments.settings import CONF, SettingsError
 
+# File in conf/ -> the command below `python -m experiments`, and its job for `launch.import_job`.
 PROGRAMS = {
-    "config": "evaluate",
-    "sweep": "sweep",
-    "learn": "learn",
-    "paper": "paper",
-    "map": "map build",
-    "localize": "localize",
-}  # by their file in conf/
+    "config": ("evaluate", "evaluation:evaluate"),
+    "sweep": ("sweep", "search:sweep"),
+    "learn": ("learn", "learning:learn"),
+    "paper": ("paper", "paper.program:paper"),
+    "map": ("map build", "maps:build_map"),
+    "localize": ("localize", "localization:localize"),
+}
 
 
 def defaults(file: Path) -> list[Any]:
@@ -49,11 +50,7 @@ def choices(group: str) -> list[str]:
 def choices_with(group: str, name: str) -> list[str]:
     """The choices of a group that have a setting, without those that combine or vary other choices."""
     files = {choice: CONF / group / f"{choice}.yaml" for choice in choices(group)}
-    return [
-        choice
-        for choice, file in files.items()
-        if name in _read(file) and _read(file).get("method", choice) == choice and not defaults(file)
-    ]
+    return [choice for choice, file in files.items() if name in _read(file) and not defaults(file)]
 
 
 def check_choice(name: str, value: str, config: str) -> None:
@@ -62,9 +59,9 @@ def check_choice(name: str, value: str, config: str) -> None:
     if known and name not in program_groups:
         if name in _read(CONF / f"{config}.yaml"):
             raise SettingsError(f"{name}={value}: this is a group of settings; set one of its members (see --help)")
-        programs = [program for other, program in PROGRAMS.items() if name in groups(other)]
-        typed = " or ".join(f"python -m experiments.{program} {name}={value}" for program in programs)
-        raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config]} has no group {name}; type {typed}")
+        commands = [command for other, (command, _) in PROGRAMS.items() if name in groups(other)]
+        typed = " or ".join(f"python -m experiments.{command} {name}={value}" for command in commands)
+        raise SettingsError(f"{name}={value}: experiments.{PROGRAMS[config][0]} has no group {name}; type {typed}")
     for choice in value.split(",") if known else []:
         if choice not in known:
             nearest = difflib.get_close_matches(choice, known, n=1)

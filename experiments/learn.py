@@ -1,8 +1,6 @@
 """Learn scores, and compare them with hand-set and grid-searched ones on other queries."""
 
-from experiments.launch import launch, program
-
-learn = program("learning", "learn")
+from experiments.launch import launch
 
 if __name__ == "__main__":
-    launch(learn, "learn")
+    launch("learn")

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import build, console, data_sets, run_folder, stages, truth
-from experiments.axes import learnable, own_c
+from experiments import build, console, run_folder, stages, truth
+from experiments.axes import learning_axes, retrieval_weight
+from experiments.overrides import compose_data_sets
 from experiments.settings import SettingsError
 from experiments.stages import Images
 from mfvpr.datasets.sequences import OwnRows, own_rows
@@ -37,14 +38,14 @@ class Prepared(NamedTuple):
 
 def learn(settings: dict[str, Any]) -> None:
     """Learn, search, compare on queries that were not learned on, fill the run folder."""
-    with run_folder.claimed(settings) as folder:
-        axes, options, watch = learnable(settings), _options(settings), Stopwatch()
-        teach = [_prepare(choice, watch) for choice in _each(settings)]
+    with run_folder.claim(settings) as folder:
+        axes, options, watch = learning_axes(settings), _options(settings), Stopwatch()
+        teach = [_prepare(choice, watch) for choice in _settings_by_data_set(settings)]
         report, data = [], teach[0].part
         if settings["report"]:
-            number = len(data_sets.composed("report", settings["report"]))
+            number = len(compose_data_sets("report", settings["report"]))
             teach, report = teach[:-number], teach[-number:]
-            check_apart(teach, report)
+            require_disjoint(teach, report)
             data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
@@ -71,15 +72,15 @@ def learn(settings: dict[str, Any]) -> None:
         figures = comparisons.comparison_figures(comparison)
         by_name = {data_set.part.name: data_set.ground_truth for data_set in report}
         ground_truth = by_name if report else teach[0].ground_truth
-        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=figures)
+        run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 
-def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _settings_by_data_set(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Settings of each data set: those to learn on, then those to report on."""
     if not settings["report"]:
         yield settings
         return
-    more = [data_sets.composed(name, settings[name]) for name in ("also", "report") if settings[name]]
+    more = [compose_data_sets(name, settings[name]) for name in ("also", "report") if settings[name]]
     for dataset in (settings["dataset"], *itertools.chain(*more)):
         yield settings | {"dataset": dataset, "split": None}
 
@@ -87,16 +88,21 @@ def _each(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
-    tools, images = stages.begun(settings, watch)
+    tools, images = stages.prepare(settings, watch)
     protocol = truth.evaluation_protocol(settings, images.dataset)
     matches, candidates = stages.match_data_set(settings, tools, images, watch)
     assert not isinstance(matches, Scales)
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
-    part = Part(data_sets.label(settings["dataset"]), protocol, matches, candidates)
+    part = Part(label(settings["dataset"]), protocol, matches, candidates)
     return Prepared(part, images, recipe, truth.description(settings, images.dataset))
 
 
-def check_apart(teach: list[Prepared], report: list[Prepared]) -> None:
+def label(settings: dict[str, Any]) -> str:
+    """Name of a data set; streets of different seeds get different names."""
+    return f"{settings['name']} {settings['seed']}" if "seed" in settings else settings["name"]
+
+
+def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
     """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
         sides = itertools.product(second.images.contents.values(), first.images.contents.values())
@@ -128,8 +134,8 @@ def _about(data_set: Prepared) -> dict[str, Any]:
 def _options(settings: dict[str, Any]) -> Options:
     names = ("ties", "steps", "every", "patience", "batch", "learning_rate", "hidden", "seed")
     return Options(
-        c=own_c(settings), retrieval_score=settings["fusion"]["retrieval_score"], loss=LOSSES[settings["loss"]],
-        inputs=_INPUTS[settings["inputs"]], **{name: settings[name] for name in names},
+        c=retrieval_weight(settings), retrieval_score=settings["fusion"]["retrieval_score"],
+        loss=LOSSES[settings["loss"]], inputs=_INPUTS[settings["inputs"]], **{name: settings[name] for name in names},
     )  # fmt: skip
 
 

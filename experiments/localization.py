@@ -1,8 +1,9 @@
-"""Localize images in a map; a line of JSON for each."""
+"""Localize images in a map: a line of JSON for each, and figures of some."""
 
 import json
 import time
 from collections.abc import Mapping
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ from jaxtyping import UInt8
 
 from experiments import build, confidences, maps
 from experiments.console import tell
-from experiments.localization_figures import LocalizationFigures
 from experiments.query_images import images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
+from mfvpr.report.file_names import file_names
+from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
 from mfvpr.utils import InputError
 from mfvpr.utils.files import printable
@@ -27,7 +29,7 @@ def localize(settings: dict[str, Any]) -> None:
         build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         memory=settings["memory"],
     )  # fmt: skip
-    drive, figures, failed = _Drive(robot_map, settings), LocalizationFigures(robot_map, settings), 0
+    drive, figures, failed = _Drive(robot_map, settings), _PredictionFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
             tell(f"{len(robot_map):,} images in the map; the first image takes seconds more: programs compile")
@@ -86,6 +88,46 @@ class _Drive:
         return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4)}}
 
 
+class _PredictionFigures:
+    """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
+
+    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+        """Read the settings `figures`, `out` and `root`."""
+        figures, self._map, self._failed = settings["figures"], robot_map, 0
+        self._wanted = set(range(figures) if isinstance(figures, int) else figures)
+        self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
+        self._out, self._root = (settings[name] and build.expand_user(settings[name]) for name in ("out", "root"))
+        if self._root and not self._root.is_dir():
+            raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
+
+    def draw(
+        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Localization
+    ) -> dict[str, Any]:
+        """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
+        names = {number, name, PurePath(name).name}
+        if not self._wanted & names:
+            return {}
+        self._missing -= names
+        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+        path = self._out / f"{file}.png"
+        try:
+            localization_figure(path, self._map, name, pixels, localized, root=self._root)
+        except Exception as error:
+            self._failed += 1
+            tell(f"warning: {path}: not drawn ({error})")
+            return {"figure": None}
+        return {"figure": str(path)}
+
+    def finish(self) -> None:
+        """Raise a SettingsError if a figure could not be drawn, or if an image did not come."""
+        if self._failed:
+            raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
+        if self._missing:
+            names = ",".join(sorted(map(str, self._missing)))
+            raise SettingsError(f"figures=[{names}]: expected rows of images that were answered, from 0, or names as "
+                                "the lines have them, or the last parts of these")  # fmt: skip
+
+
 def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """The confidence of the score that the map was made with."""
     file = confidences.read(settings)
@@ -94,9 +136,9 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     map_settings = maps.read(build.expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
     if name not in file.systems:
-        raise SettingsError(f"confidence={file.path}: expected p of {name}, which the map scores by, got "
+        raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
     if other := confidences.other_settings(file.origin, name, map_settings, map_settings["candidates"]):
-        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: p may mean "
-             "nothing here")  # fmt: skip
+        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "
+             "it may mean nothing here")  # fmt: skip
     return file.systems[name]

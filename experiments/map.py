@@ -3,8 +3,7 @@
 import sys
 from pathlib import Path
 
-from experiments.errors import Parser, run_command
-from experiments.launch import launch, program
+from experiments.launch import Parser, launch, run_command
 
 _MAP = "python -m experiments.map"
 
@@ -13,7 +12,7 @@ def main() -> None:
     """Run the command line's command."""
     if sys.argv[1:2] == ["build"]:
         del sys.argv[1]
-        launch(program("maps", "build_map"), "map")
+        launch("map")
         return
     run_command(_MAP, "Ask a map with python -m experiments.localize. Settings of the first command: "
                 f"{_MAP} build --help.", _add_commands)  # fmt: skip
@@ -24,12 +23,12 @@ def _add_commands(parser: Parser) -> None:
     commands.add_parser("build", help="build map=DIR dataset=...: of the database of a data set")
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
-    command.set_defaults(run=program("maps", "print_map"))
+    command.set_defaults(run="maps:print_map")
     command = commands.add_parser("add", help="add images, one by one; others may ask meanwhile")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")
     command.add_argument("--place", help="where they were taken; by default their names")
-    command.set_defaults(run=program("maps", "add_images"))
+    command.set_defaults(run="maps:add_images")
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import console, data_sets
-from experiments.errors import refuse
+from experiments import console
+from experiments.launch import refuse
+from experiments.overrides import compose_data_sets
 from experiments.stages import dataset_of
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents
@@ -51,7 +52,7 @@ def list_data(names: list[str]) -> None:
 
 def check(name: str, settings: list[str], sheet: Path | None) -> None:
     """Print image counts beside the published ones and the ground truth's extent; draw image pairs."""
-    [chosen] = data_sets.composed("check", ":".join([name, *settings]))
+    [chosen] = compose_data_sets("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
     cache = FeatureCache(None)
     database, *contents = map(cache.contents, [dataset.database, *(part.images for part in dataset.sequences)])

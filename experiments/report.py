@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from experiments.errors import Parser, run_command
-from experiments.launch import program
+from experiments.launch import Parser, run_command
 
 # Functions import what they need: --help and wrong usage need not wait for JAX.
 _COMPARISON = "comparison.html"
@@ -19,7 +18,7 @@ def _add_arguments(parser: Parser) -> None:
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     parser.add_argument("--out", metavar="FILE", type=Path,
                         help=f"by default RUN/report.html of one run, {_COMPARISON} here of several")  # fmt: skip
-    parser.set_defaults(run=program("report", "write"))
+    parser.set_defaults(run="report:write")
 
 
 def write(runs: list[Path], out: Path | None) -> None:

@@ -17,43 +17,38 @@ _NO_SETTINGS = ("multirun", "command")  # added by `command_line`
 
 
 @contextmanager
-def claimed(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
-    """The run folder that the settings name, for this run alone; with options of `runs.claimed`."""
+def claim(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone; with options of `runs.claim_run_folder`."""
     out, name = settings["out"], settings["dataset"]["name"]
     folder = build.expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
-    with ExitStack() as claim:
+    with ExitStack() as stack:
         try:
-            folder = claim.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
+            folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
         except InputError as error:
             raise SettingsError(f"{error} with out=DIR") from error
         yield folder
 
 
-def leave(
-    folder: Path,
-    settings: Mapping[str, Any],
-    ground_truth: Mapping[str, Any],
-    *,
-    text: str,
-    write: Callable[[Path], None],
-    figures: Sequence[Figure],
-) -> None:
+def write_results(
+    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], *,
+    text: str, write: Callable[[Path], None], figures: Sequence[Figure],
+) -> None:  # fmt: skip
     """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
 
     The text is printed even if the files cannot be written; `write` gets the folder for them.
     """
     try:
-        keep(folder, settings, ground_truth, write)
+        write_files(folder, settings, ground_truth, write)
     finally:
         print(f"\n{text}", flush=True)
-    draw(folder, figures)
+    draw_figures(folder, figures)
     print(f"results: {folder}")
 
 
-def keep(
+def write_files(
     folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], write: Callable[[Path], None]
 ) -> None:
-    """Write the files of a run and run.json; arguments as of `leave`."""
+    """Write the files of a run and run.json; arguments as of `write_results`."""
     try:
         with runs.writing(folder) as new:
             write(new)
@@ -71,7 +66,7 @@ def keep(
         ) from error
 
 
-def draw(folder: Path, figures: Sequence[Figure]) -> None:
+def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
     """Draw the figures of a run; warn if one cannot be drawn."""
     for name, draw_figure in console.track("figures")(figures, len(figures)):
         try:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import build, console, run_folder, stages, truth
-from experiments.axes import as_final, require_memory, searchable
+from experiments.axes import require_memory, search_axes, with_final_axis
 from mfvpr.report import runs, sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome
@@ -18,10 +18,10 @@ from mfvpr.utils.versions import versions
 
 def sweep(settings: dict[str, Any]) -> None:
     """Search the settings, print the table, fill the run folder."""
-    settings = as_final(settings)
-    with run_folder.claimed(settings) as folder:
-        axes, watch = searchable(settings), Stopwatch()
-        tools, images = stages.begun(settings, watch)
+    settings = with_final_axis(settings)
+    with run_folder.claim(settings) as folder:
+        axes, watch = search_axes(settings), Stopwatch()
+        tools, images = stages.prepare(settings, watch)
         protocol = truth.evaluation_protocol(settings, images.dataset)
         matches, candidates = stages.match_data_set(settings, tools, images, watch)
         blocks = _block_folder(settings, tools, images, candidates)
@@ -51,8 +51,8 @@ def sweep(settings: dict[str, Any]) -> None:
             runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
             write_text(new / "summary.txt", f"{text}\n")
 
-        ground_truth = truth.description(settings, images.dataset)
-        run_folder.leave(folder, settings, ground_truth, text=text, write=write, figures=sweeps.heat_maps(outcome))
+        ground_truth, figures = truth.description(settings, images.dataset), sweeps.heat_maps(outcome)
+        run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
 

@@ -4,7 +4,7 @@ Hydra checks which settings exist; the values are checked here.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,6 @@ from typing import Any
 from experiments.rules import Rule, any_of, either, list_of, number, one_of, or_list, pattern, whole
 
 CONF = Path(__file__).parent.parent / "conf"
-
-Program = Callable[[], Callable[[dict[str, Any]], None]]  # imports the job, which is slow, and returns it
 
 
 class SettingsError(Exception):
@@ -193,11 +191,11 @@ def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
     rules = {}
     for scorer, limits in yaml.safe_load(file.read_text(encoding="utf-8")).items():
         method = Rule(one_of(scorer).holds, f"{scorer}; choose with scorer={scorer}")
-        rules[scorer] = {"method": method} | {name: _within(**limit) for name, limit in limits.items()}
+        rules[scorer] = {"method": method} | {name: _limit_rule(**limit) for name, limit in limits.items()}
     return rules
 
 
-def _within(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
+def _limit_rule(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
     """The rule of `mfvpr.scoring.fields.Parameter.limits`."""
     [(kind, values)] = limits.items()
     rule = {"choices": one_of, "whole": whole, "number": number}[kind](*values)

@@ -57,7 +57,7 @@ class Tools:
     where: Mapping[str, Any]  # memory and devices
 
 
-def begun(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
+def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
     """The tools and the data set that the settings name.
 
     The tools come first, since their errors should come before anything slow, unless they need files about the images.

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from experiments.errors import WEIGHTS, Parser, run_command
-from experiments.launch import program
+from experiments.launch import WEIGHTS, Parser, run_command
 
 
 def main() -> None:
@@ -15,17 +14,17 @@ def main() -> None:
 def _add_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
-    command.set_defaults(run=program("checkpoints", "list_weights"))
+    command.set_defaults(run="checkpoints:list_weights")
     command = commands.add_parser("convert", help="install an official checkpoint")
     command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
     command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
-    command.set_defaults(run=program("checkpoints", "convert"))
+    command.set_defaults(run="checkpoints:convert")
     command = commands.add_parser("verify", help="check what is installed, byte by byte")
     command.add_argument("names", metavar="NAME", nargs="*", help="by default all that are there")
-    command.set_defaults(run=program("checkpoints", "verify"))
+    command.set_defaults(run="checkpoints:verify")
     command = commands.add_parser("download", help="fetch an official checkpoint whose hash is published")
     command.add_argument("name", metavar="NAME")
-    command.set_defaults(run=program("checkpoints", "download"))
+    command.set_defaults(run="checkpoints:download")
 
 
 if __name__ == "__main__":

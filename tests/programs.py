@@ -68,7 +68,7 @@ def small(root, *more):
 
 def matches_path(settings):
     """The folder in which a program keeps the matches of its data set, and their recipe."""
-    tools, images = stages.begun(settings, stages.Stopwatch())
+    tools, images = stages.prepare(settings, stages.Stopwatch())
     recipe = stages.recipe(tools, images, settings["candidates"])
     return store_path(tools.cache.root, "matches", recipe, MATCHES), recipe
 
@@ -87,7 +87,7 @@ def typed(monkeypatch, capsys, program, *arguments):
         if hasattr(module, "main"):  # of commands
             module.main()
         else:
-            launch(getattr(module, program), config)
+            launch(config)
     except SystemExit as left:
         code = left.code
     finally:

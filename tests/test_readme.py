@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import data_sets
-from experiments.quoting import as_typed
+from experiments import overrides
 from experiments.settings import CONF, RULES, check, scorer_rules
 from mfvpr.datasets import image_folder
 from mfvpr.features import Sift
@@ -84,10 +83,10 @@ def test_commands_of_sweeps_and_learning_are_settings(program):
         ]
         if "-m" in arguments:  # the first of several values
             chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", argument) for argument in chosen]
-        settings = composed(*map(as_typed, data_sets.first_of(chosen)), config=program)
+        settings = composed(*map(overrides.quote, overrides.split_first(chosen)), config=program)
         check(settings)
         for name in ("also", "report"):
-            assert not settings.get(name) or data_sets.composed(name, settings[name])
+            assert not settings.get(name) or overrides.compose_data_sets(name, settings[name])
 
 
 @pytest.mark.slow

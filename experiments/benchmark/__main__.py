@@ -8,8 +8,9 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from experiments.errors import Parser, run_command
+from experiments.launch import Parser, refuse, run_command
 
+PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out, **options)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
@@ -26,7 +27,7 @@ OPTIONS = {"stores": "scale", "data": "real"}  # option -> the only benchmark th
 
 def main() -> None:
     """Run the chosen benchmark."""
-    run_command("python -m experiments.benchmark", str(__doc__), add_arguments)
+    run_command(PROGRAM, str(__doc__), add_arguments)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -40,17 +41,18 @@ def add_arguments(parser: Parser) -> None:
         "--stores", type=Path, help="for scale: folder that keeps its features (default: 6 GB, deleted)"
     )
     parser.add_argument("--data", type=Path, help="for real: folder with grief_season and corridor")
+    parser.set_defaults(run="benchmark.__main__:run")
 
-    def run(benchmark: str, rounds: int | None, out: Path | None, **options: Path | None) -> None:
-        paths = {option: path for option, path in options.items() if path}
-        for option in paths:
-            if OPTIONS[option] != benchmark:
-                parser.error(f"--{option} is for {OPTIONS[option]} alone")
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-        module = import_module(f"experiments.benchmark.{benchmark}")
-        module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **paths)
 
-    parser.set_defaults(run=lambda: run)
+def run(benchmark: str, rounds: int | None, out: Path | None, **options: Path | None) -> None:
+    """Run a benchmark with the options that it takes."""
+    paths = {option: path for option, path in options.items() if path}
+    for option in paths:
+        if OPTIONS[option] != benchmark:
+            refuse(f"--{option} is for {OPTIONS[option]} alone; see {PROGRAM} --help")
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
+    module = import_module(f"experiments.benchmark.{benchmark}")
+    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **paths)
 
 
 def positive_int(text: str) -> int:

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.benchmark.harness import write_report
-from experiments.benchmark.scale import CANDIDATES, MEMORY, Answer, Counted, median_seconds, peak_bytes, rerank
-from experiments.benchmark.synthetic_features import BATCH, GLOBAL, MadeUp
+from experiments.benchmark.scale import CANDIDATES, MEMORY, Counted, Rankings, median_seconds, peak_bytes, rerank
+from experiments.benchmark.synthetic_features import BATCH, GLOBAL, SyntheticSet
 from experiments.console import bar
 from mfvpr.datasets import Positives
 from mfvpr.evaluation import recall_at_k
@@ -20,12 +20,11 @@ from mfvpr.features import FeatureSet
 from mfvpr.report import Table
 from mfvpr.reranking import rank
 from mfvpr.retrieval.search import EXACT
-from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store
-from mfvpr.storage.manifest import store_path
+from mfvpr.storage.features import FeatureStore, forecast_bytes
 from mfvpr.storage.rows import require_space
 from mfvpr.types import Shortlist
 
-DATA = MadeUp(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that retrieval often fails
+DATA = SyntheticSet(100_000, 200, 700, 128, views=1, likeness=0.18)  # so that retrieval often fails
 ROUNDS = 3
 WHOLE, ASKED, MACHINES = 2_800_000, 1000, (1, 8, 64)  # images of San Francisco XL, and queries of the forecast
 # Seconds per image on 2 cores from experiments/results.md: MixVPR one by one, and the local features of `localize`.
@@ -75,7 +74,7 @@ def run(rounds: int | None, out: Path) -> None:
     write_report(out, title, parts, content)
 
 
-def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
+def measure(data: SyntheticSet, root: Path, rounds: int) -> dict[str, Any]:
     """Cost of all steps for all queries: medians after a warm-up, except for the features, which are made once.
 
     `steps` has a `Step` by name, `reranking` the seconds of its parts. `made` is the number of images whose features
@@ -95,7 +94,7 @@ def measure(data: MadeUp, root: Path, rounds: int) -> dict[str, Any]:
     store, making = make_features(data, root, np.unique(candidates.indices[candidates.mask]))
     source = Counted(store)
     database = FeatureSet(source, {})
-    predictions: list[Answer] = []
+    predictions: list[Rankings] = []
     _, reranking = repeat("re-ranking", rounds, lambda: predictions.append(rerank(queries, database, candidates)))
     num_images, written, rows_read = int(store.done.sum()), store.size_bytes, source.rows / len(predictions)
     positives = Positives.from_rows(data.similar(), data.images)
@@ -127,10 +126,9 @@ def merge(candidates: Shortlist, machines: int) -> np.ndarray:
     return np.asarray(rank(np.tile(candidates.scores, machines)))[:, : candidates.scores.shape[1]]
 
 
-def make_features(data: MadeUp, root: Path, rows: np.ndarray) -> tuple[FeatureStore, dict[str, Step]]:
+def make_features(data: SyntheticSet, root: Path, rows: np.ndarray) -> tuple[FeatureStore, dict[str, Step]]:
     """Store the features of some rows of the database below `root`; also the cost of making and of storing them."""
-    recipe = {"made_up": "city"} | asdict(data)
-    store = open_store(store_path(root, "city", recipe), recipe, num_images=data.images)
+    store = data.open_store(root, "city", data.images)
     require_space(root, forecast_bytes(len(rows), data.keypoints, data.dimension))
     queries, making, storing = data.query_by_row(), [], []
     batches = np.split(rows, range(BATCH, len(rows), BATCH))
@@ -149,7 +147,7 @@ def _sum(steps: list[Step]) -> Step:
     return Step(sum(seconds), sum(cpu), max(peaks))
 
 
-def rates_of(data: MadeUp, measured: Mapping[str, Any], extracting: float) -> dict[str, float]:
+def rates_of(data: SyntheticSet, measured: Mapping[str, Any], extracting: float) -> dict[str, float]:
     """Seconds and bytes on this machine, where the local features of an image take `extracting` seconds."""
     steps = measured["steps"]
     return {
@@ -183,7 +181,7 @@ def forecast(rates: Mapping[str, float], images: int, queries: int, candidates: 
     }
 
 
-def _steps_table(data: MadeUp, measured: Mapping[str, Any]) -> Table:
+def _steps_table(data: SyntheticSet, measured: Mapping[str, Any]) -> Table:
     images = {"making": measured["made"], "storing": measured["made"], "re-ranking": measured["rows_read"]}
     sizes = {"storing": measured["written"], "re-ranking": measured["read"]}
     lines = [
@@ -195,7 +193,7 @@ def _steps_table(data: MadeUp, measured: Mapping[str, Any]) -> Table:
     return Table(["step", "seconds", "CPU s", "ms / query", "images", "MB", "peak GB"], lines)
 
 
-def _remarks(data: MadeUp, measured: Mapping[str, Any]) -> Iterator[str]:
+def _remarks(data: SyntheticSet, measured: Mapping[str, Any]) -> Iterator[str]:
     yield "re-ranking: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in measured["reranking"].items())
     recall = measured["recall"]
     yield f"R@1: retrieval {recall['retrieval']:.3f}, re-ranking {recall['re-ranking']:.3f}; " + (

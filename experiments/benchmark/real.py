@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from omegaconf import OmegaConf
 
 from experiments import build
 from experiments.benchmark.harness import duration, write_report
 from experiments.console import tell, track
-from experiments.groups import defaults
-from experiments.settings import CONF
+from experiments.overrides import compose_program
 from mfvpr.checkpoints import load_model
 from mfvpr.datasets import folder_dataset
 from mfvpr.evaluation import estimate, hits, match_sequence, stages
@@ -51,9 +50,8 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
 
 def compared_scorers() -> dict[str, Scorer]:
     """The scorers of `scorer=compared`, by name."""
-    group = CONF / "scorer"
-    names = [entry.partition("@")[2] for entry in defaults(group / "compared.yaml")]
-    return build.scorers({name: yaml.safe_load((group / f"{name}.yaml").read_text(encoding="utf-8")) for name in names})
+    settings: Any = OmegaConf.to_container(compose_program("config", ["scorer=compared"]).scorer)
+    return build.scorers(settings)
 
 
 def extractors() -> dict[str, Extractor]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.benchmark.harness import write_report
-from experiments.benchmark.synthetic_features import MadeUp
+from experiments.benchmark.synthetic_features import SyntheticSet
 from experiments.console import bar
 from mfvpr import HistogramOfShifts
 from mfvpr.evaluation import stages
@@ -27,7 +27,7 @@ from mfvpr.types import Features, Shortlist
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
-    MadeUp(images, QUERIES, KEYPOINTS, dimension)
+    SyntheticSet(images, QUERIES, KEYPOINTS, dimension)
     for images, dimension in ((1000, 128), (2000, 128), (4000, 128), (10_000, 128), (4000, 512))
 )
 CANDIDATES = 50
@@ -37,7 +37,7 @@ ROUNDS = 3
 STEPS = ("retrieval", "matching", "scoring", "ranking")
 
 
-class Answer(NamedTuple):
+class Rankings(NamedTuple):
     """Ranking of all queries: database rows and their shortlist's scores `[Q, C]`, and seconds by step."""
 
     rows: np.ndarray
@@ -91,7 +91,7 @@ def _next_turn(*arguments: Any) -> Any:
     return next(_measurements[0])
 
 
-def _measure(data: MadeUp, root: Path, rounds: int, start: float) -> Iterator[dict[str, Any] | None]:
+def _measure(data: SyntheticSet, root: Path, rounds: int, start: float) -> Iterator[dict[str, Any] | None]:
     """Rank a first query, rank all queries in each round, and yield the numbers of the process that began at `start`.
 
     Seconds are per query: `total` of each round, medians of the `steps`, `cpu` of all threads, `reading` of the thread
@@ -104,7 +104,7 @@ def _measure(data: MadeUp, root: Path, rounds: int, start: float) -> Iterator[di
     database = FeatureSet(source, {})
     rank_queries(FeatureSet.of([queries[0]]), database, (vectors[0][:1], vectors[1]))
     first, source.rows, source.seconds = time.monotonic() - start, 0, 0.0
-    predictions, cpu = list[Answer](), 0.0
+    predictions, cpu = list[Rankings](), 0.0
     yield None
     for _ in range(rounds):
         before = time.process_time()
@@ -142,7 +142,7 @@ def peak_bytes() -> int:
 def rank_queries(
     queries: FeatureSet, database: FeatureSet, vectors: tuple[np.ndarray, np.ndarray],
     *, memory: float | None = MEMORY,
-) -> Answer:  # fmt: skip
+) -> Rankings:  # fmt: skip
     """Retrieve by the global descriptors `vectors` of both sides, and re-rank."""
     start = time.perf_counter()
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
@@ -153,7 +153,7 @@ def rank_queries(
 
 def rerank(
     queries: FeatureSet, database: FeatureSet, candidates: Shortlist, *, memory: float | None = MEMORY
-) -> Answer:
+) -> Rankings:
     """Match, score and rank the candidates."""
     times = [time.perf_counter()]
     matches = stages.match(queries, database, candidates, memory=memory)
@@ -163,29 +163,17 @@ def rerank(
     order = rank_shortlist(candidates, scores)
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
-    return Answer(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
+    return Rankings(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
 
 
-def median_seconds(predictions: list[Answer]) -> dict[str, float]:
+def median_seconds(predictions: list[Rankings]) -> dict[str, float]:
     """Medians over the rounds, by step."""
-    return {
-        name: float(np.median([prediction.seconds[name] for prediction in predictions]))
-        for name in predictions[0].seconds
-    }
+    steps = predictions[0].seconds
+    return {step: float(np.median([prediction.seconds[step] for prediction in predictions])) for step in steps}
 
 
 def _table(results: dict[str, dict[str, Any]]) -> Table:
-    header = [
-        "database",
-        "ms / query",
-        *STEPS,
-        "(reading)",
-        "rows read",
-        "CPU ms",
-        "peak GB",
-        "first prediction s",
-        "R@1",
-    ]
+    columns = ["database", "ms / query", *STEPS, "(reading)", "rows read", "CPU ms", "peak GB", "first query s", "R@1"]
     lines = []
     for title, result in results.items():
         seconds = [np.median(result["total"]), *result["steps"].values(), result["reading"]]
@@ -193,7 +181,7 @@ def _table(results: dict[str, dict[str, Any]]) -> Table:
             title, *(f"{1e3 * value:.1f}" for value in seconds), f"{result['rows']:.1f}", f"{1e3 * result['cpu']:.1f}",
             f"{result['peak']:.2f}", f"{result['first']:.1f}", f"{100 * result['recall']:.0f}",
         ])  # fmt: skip
-    return Table(header, lines)
+    return Table(columns, lines)
 
 
 def _remarks(results: dict[str, dict[str, Any]]) -> Iterator[str]:

@@ -23,7 +23,7 @@ BATCH = 50  # images that are stored at a time
 
 
 @dataclass(frozen=True)
-class MadeUp:
+class SyntheticSet:
     """A synthetic data set; equal fields give equal data."""
 
     images: int  # M, of the database
@@ -80,10 +80,13 @@ class MadeUp:
             self._complete_store(root, "database", self.images, lambda row: self.image(row, queries.get(row))),
         )
 
-    def _complete_store(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:
+    def open_store(self, root: Path, side: str, total: int) -> FeatureStore:
+        """The store below `root` for the features of `total` images."""
         recipe = {"made_up": side} | asdict(self)
-        store = open_store(store_path(root, side, recipe), recipe, num_images=total)
-        with store:
+        return open_store(store_path(root, side, recipe), recipe, num_images=total)
+
+    def _complete_store(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:
+        with self.open_store(root, side, total) as store:
             missing_rows = np.flatnonzero(~store.done)
             require_space(store.folder, forecast_bytes(len(missing_rows), self.keypoints, self.dimension))
             features = ordered_map(make, missing_rows.tolist(), workers=2)

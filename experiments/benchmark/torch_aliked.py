@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, on_host, sample
+from experiments.benchmark.torch_networks import LocalFeatures, Weights, batch_norm, conv, sample, to_host
 
 RADIUS = 2  # of the detector, px
 LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # before each block: pooling, and size of the image / size of the map
@@ -22,7 +22,7 @@ def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
         points = _refine(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1  # and back, rounded as published
         values = F.grid_sample(score[None], points[None, None], align_corners=True)[0, 0, 0]
         descriptors = _descriptors(w, dense, (points / 2 + 0.5) * corner)
-        extracted.append(on_host((points + 1) / 2 * corner, descriptors, values))
+        extracted.append(to_host((points + 1) / 2 * corner, descriptors, values))
     return extracted
 
 

@@ -55,7 +55,7 @@ class LocalFeatures(NamedTuple):
     scores: np.ndarray  # [n]
 
 
-def on_host(*tensors: Tensor) -> LocalFeatures:
+def to_host(*tensors: Tensor) -> LocalFeatures:
     """Copy keypoints, descriptors and scores of an image to the host."""
     return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
@@ -132,7 +132,7 @@ def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeat
     inside = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
     position, scores = position[inside].flip(1), dense[channel, row, column][inside]
     descriptors = sample(dense[None], position[None, None])[0, :, 0]
-    return on_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
+    return to_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
 
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:

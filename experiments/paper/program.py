@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments import build, truth
 from experiments.console import tell
-from experiments.errors import how_to_install
+from experiments.launch import how_to_install
 from experiments.paper import runs, systems, timing
 from experiments.paper.figures import paper_figures
 from experiments.paper.pages import write_pages

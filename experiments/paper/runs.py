@@ -106,16 +106,16 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
 
 def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
-    with run_folder.claimed(settings, own=True) as folder:
+    with run_folder.claim(settings, own=True) as folder:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
             evaluation.write(new, outcome)
             write_json(new / INPUTS, dict(inputs))
             write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
-            run_folder.draw(new, outcome.figures)  # before results.json, after which the run counts as finished
+            run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
 
-        run_folder.keep(folder, settings, evaluation.ground_truth(outcome), write)
+        run_folder.write_files(folder, settings, evaluation.ground_truth(outcome), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.errors import one_line
+from experiments.launch import one_line
 from experiments.weights import main
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save

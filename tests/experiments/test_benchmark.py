@@ -13,7 +13,7 @@ import pytest
 from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.checkpoints.networks import NETWORKS, Network
 from mfvpr.checkpoints.tables import SELAVPR
-from mfvpr.features import Description, Sift
+from mfvpr.features import Sift
 from mfvpr.networks import SelaVpr
 from mfvpr.scoring import MatchCount
 
@@ -41,28 +41,23 @@ def contest(tmp_path_factory):
         out = tmp_path_factory.mktemp("benchmark") / "networks.json"
         results = networks.run(1, out)
     torch.set_num_threads(threads)
-    by_step = {}
-    for (step, name), result in results.items():
-        by_step.setdefault(step, {})[name] = result
-    return by_step, json.loads(out.read_text())
+    return results, json.loads(out.read_text())
 
 
-def peers(results):
-    """Result of mfvpr, and those of torch."""
-    theirs = dict(results)
-    ours = theirs.pop("mfvpr")
-    if isinstance(ours[0], Description):
-        ours = [image.features if image.local else image.vector for image in ours]
-    assert len(theirs) == 3  # two memory layouts, and one by one
-    return ours, theirs.values()
+def peers(contest, step):
+    """Result of mfvpr for a batch of 2, and those of torch."""
+    by_name = {name: result for (title, name), result in contest[0].items() if title == f"{step}, batch 2"}
+    ours = by_name.pop("mfvpr")
+    assert len(by_name) == 3  # two memory layouts, and one by one
+    return ours, by_name.values()
 
 
 @pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
 def test_keypoints_are_the_same(contest, step):
-    ours, all_theirs = peers(contest[0][f"{step} features, batch 2"])
+    ours, all_theirs = peers(contest, f"{step} features")
     assert len(ours) == 2
     for theirs in all_theirs:
-        for features, expected in zip(ours, theirs, strict=True):
+        for features, expected in zip((image.features for image in ours), theirs, strict=True):
             assert len(features.keypoints) > 10
             assert abs(len(features.keypoints) - len(expected.keypoints)) <= 0.02 * len(features.keypoints)
             distance = np.linalg.norm(features.keypoints[:, None] - expected.keypoints, axis=2)
@@ -75,7 +70,7 @@ def test_keypoints_are_the_same(contest, step):
 
 
 def test_dense_maps_are_the_same(contest):
-    ours, all_theirs = peers(contest[0]["D2-Net dense map, batch 2"])
+    ours, all_theirs = peers(contest, "D2-Net dense map")
     ours = np.concatenate([np.asarray(dense) for dense in ours]).transpose(0, 3, 1, 2)
     for theirs in all_theirs:
         np.testing.assert_allclose(ours, np.stack([np.asarray(dense) for dense in theirs]), atol=1e-4 * ours.max())
@@ -83,9 +78,9 @@ def test_dense_maps_are_the_same(contest):
 
 @pytest.mark.parametrize("step", ["MixVPR descriptor", "NetVLAD descriptor", "generalized mean of ResNet-50"])
 def test_global_descriptors_are_the_same(contest, step):
-    ours, all_theirs = peers(contest[0][f"{step}, batch 2"])
+    ours, all_theirs = peers(contest, step)
     for theirs in all_theirs:
-        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+        np.testing.assert_allclose([image.vector for image in ours], theirs, atol=1e-5)
 
 
 @pytest.mark.parametrize("step", [
@@ -93,10 +88,8 @@ def test_global_descriptors_are_the_same(contest, step):
     "SelaVPR features",
 ])  # fmt: skip
 def test_local_descriptors_are_the_same(contest, step):
-    results = dict(contest[0][f"{step}, batch 2"])
-    ours = results.pop("mfvpr")
-    assert len(results) == 3
-    for theirs in results.values():
+    ours, all_theirs = peers(contest, step)
+    for theirs in all_theirs:
         for description, (vector, *local) in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(description.vector, vector, atol=1e-5)
             for features, expected in zip(description.local, local, strict=True):
@@ -104,9 +97,8 @@ def test_local_descriptors_are_the_same(contest, step):
 
 
 def test_report_has_everyone(contest):
-    by_step, written = contest
-    names = {(entry["step"], entry["name"]) for entry in written["results"]}
-    assert names == {(step, name) for step, results in by_step.items() for name in results}
+    results, written = contest
+    assert {(entry["step"], entry["name"]) for entry in written["results"]} == results.keys()
     assert all(entry["median_ms"] > 0 for entry in written["results"])
     remarks = "\n".join(written["remarks"])
     for wanted in ("detection adds", "aliked-n16 features, batch 2: keypoints per image: mfvpr", "RTX 2080 Ti"):
@@ -115,9 +107,9 @@ def test_report_has_everyone(contest):
 
 def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, capsys):
     from experiments.benchmark import scale
-    from experiments.benchmark.synthetic_features import MadeUp
+    from experiments.benchmark.synthetic_features import SyntheticSet
 
-    data = MadeUp(60, 3, 60, 16)
+    data = SyntheticSet(60, 3, 60, 16)
     monkeypatch.setattr(scale, "SETS", [data])
     scale.run(1, tmp_path / "out.json", tmp_path / "stores")
     stores = {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}

@@ -7,9 +7,7 @@ import pytest
 
 from experiments.benchmark import city
 from experiments.benchmark.city import forecast
-from experiments.benchmark.synthetic_features import MadeUp
-from mfvpr.storage.features import open_store
-from mfvpr.storage.manifest import store_path
+from experiments.benchmark.synthetic_features import SyntheticSet
 
 pytestmark = pytest.mark.slow
 
@@ -42,21 +40,20 @@ def test_no_more_features_are_made_than_there_are_images():
 
 
 def test_features_are_made_of_the_images_that_are_asked_for(tmp_path):
-    data = MadeUp(300, 4, 30, 16, views=1)
+    data = SyntheticSet(300, 4, 30, 16, views=1)
     rows = np.unique([*range(0, 120, 2), *data.similar()[:, 0]])
     store, steps = city.make_features(data, tmp_path, rows)
     np.testing.assert_array_equal(np.flatnonzero(store.done), rows)
     assert len(list(tmp_path.rglob("*.npz"))) == len(rows)
     assert min(steps["making"].seconds, steps["storing"].seconds) > 0
-    recipe = {"made_up": "city"} | vars(data)
-    again = open_store(store_path(tmp_path, "city", recipe), recipe, num_images=300)
+    again = data.open_store(tmp_path, "city", 300)
     for query, row in enumerate(data.similar()[:, 0].tolist()):
         [(_, features)] = again.read([row])
         np.testing.assert_array_equal(features.keypoints, data.image(row, query).keypoints)
 
 
 def test_a_small_city_is_measured(tmp_path, monkeypatch, capsys):
-    data = MadeUp(400, 6, 60, 16, views=1, likeness=0.12)
+    data = SyntheticSet(400, 6, 60, 16, views=1, likeness=0.12)
     monkeypatch.setattr(city, "DATA", data)
     monkeypatch.setattr(city, "CANDIDATES", 8)
     monkeypatch.setattr(city, "WHOLE", 1000)

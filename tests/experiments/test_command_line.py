@@ -8,14 +8,14 @@ import pytest
 
 from experiments import groups
 from experiments.launch import version
-from experiments.quoting import as_typed
+from experiments.overrides import quote
 from experiments.settings import CONF
 from tests.programs import ROOT, composed, run
 
 pytestmark = pytest.mark.thorough
 
 OWN = ("dataset=folder", "dataset.database=a", "dataset.queries=b")
-PROGRAMS = {program: config for config, program in groups.PROGRAMS.items()}
+PROGRAMS = {command: config for config, (command, _) in groups.PROGRAMS.items()}
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
@@ -43,7 +43,7 @@ def test_help_has_every_setting_and_the_comments_of_conf(succeed, program):
     ("candidates=5,10", "candidates=5,10", "candidates=5,10"),
 ])  # fmt: skip
 def test_a_comma_is_part_of_a_path_unless_several_runs_are_asked_for(argument, alone, in_multirun):
-    assert (as_typed(argument), as_typed(argument, several=True)) == (alone, in_multirun)
+    assert (quote(argument), quote(argument, several=True)) == (alone, in_multirun)
 
 
 def test_help_is_of_the_groups_that_were_chosen(succeed):
@@ -65,9 +65,9 @@ def test_help_is_of_the_groups_that_were_chosen(succeed):
      ["numpy", "jax", "mfvpr"]),
 ])  # fmt: skip
 def test_help_and_wrong_settings_do_not_wait_for_slow_imports(argument, code, error, modules):
-    script = ("import sys; from experiments.launch import launch; from experiments.evaluate import evaluate\n"
+    script = ("import sys; from experiments.launch import launch\n"
               f"sys.argv, code = ['evaluate', {argument!r}], None\n"
-              "try: launch(evaluate)\n"
+              "try: launch('config')\n"
               "except SystemExit as left: code = left.code\n"
               f"assert (code, {{*{modules}}} & {{*sys.modules}}) == ({code}, set())")  # fmt: skip
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -83,7 +83,6 @@ def test_version(succeed, program):
 
 @pytest.mark.parametrize(("program", "arguments", "words"), [
     ("evaluate", ["experiment=histogram"], "type python -m experiments.sweep experiment=histogram"),
-    ("learn", ["experiment=anchor"], "experiments.learn has no group experiment"),
     ("sweep", ["system=mix_hist_5"], "the nearest is mix_hist_50"),
     ("sweep", ["system=null"], "leave it out for none"),
     ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
@@ -95,19 +94,13 @@ def test_version(succeed, program):
     ("evaluate", ["fusion.c=zscores"], "(at most 1e12), or auto, zscore"),
     ("evaluate", ["fusion.weights={retrieval: 2}"], "{'retrieval': 2}: expected fusion.c=zscore"),
     ("evaluate", ["system=mfvpr", "fusion.c=auto"], "1}: expected fusion.c=zscore"),
-    *(
-        ("evaluate", ["system=mfvpr", f"fusion.weights.retrieval={wrong}"], f".retrieval={wrong}: expected a number")
-        for wrong in (0, -1, "nan", "inf", "x")
-    ),
+    ("evaluate", ["system=mfvpr", "fusion.weights.retrieval=0"], ".retrieval=0: expected a number"),
     ("evaluate", ["fusion.weights.retrieval=2"], "the nearest is fusion.weights"),
-    ("evaluate", ["fusion.weights=[2]"], "fusion.weights=[2]: expected weights"),
     ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected retrieval"),
     ("evaluate", ["system=mfvpr", "scorer=histogram"], "(histogram), got anchor; choose scorer=all"),
     ("evaluate", ["=5"], "=5: expected name=value"),
-    ("evaluate", [".=5"], ".=5: expected name=value"),
     ("evaluate", ["candidates =5"], "candidates =5: expected name=value"),
     ("evaluate", ["ü=5"], "ü=5: expected name=value"),
-    ("evaluate", ["candidates:5"], "expected name=value"),
     ("evaluate", ["--cfg", "job"], "--cfg: unknown option"),
     ("evaluate", [f"candidates={'9' * 5000}"], "candidates=99999999999999999999...: expected"),
     ("evaluate", [f"scorer.histogram.sigma={'9' * 299}"], "...: expected a number above 0"),
@@ -123,20 +116,13 @@ def test_version(succeed, program):
     ("evaluate", ["cache=${oc.env:NOPE}"], "cache=${oc.env:NOPE}: expected a path"),
     ("evaluate", ["cache='${x}'"], "cache: Interpolation key 'x' not found"),
     ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
-    ("evaluate", ["scorer.histogram.max_bins=100000"], "a whole number from 1 to 1024"),
     ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least retrieval.num_words=64"),
-    ("evaluate", ["matching.max_distance=3"], "matching.max_distance=3: expected a number above 0"),
     ("evaluate", ["matching=mutual"], "matching=mutual: expected one of lightglue, neighbors"),
-    ("evaluate", ["matching=lightglue", "matching.filter_threshold=2"], "filter_threshold=2: expected a number"),
     ("evaluate", ["matching=lightglue", "matching.cross_check=none"], "matching=neighbors has"),
     ("evaluate", ["matching=lightglue", "matching.weights=d2_tf"], "weights=d2_tf: expected weights of lightglue"),
-    ("sweep", ["grid.max_distance=[1,3]"], "grid.max_distance=[1, 3]: expected a list"),
     ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),
     ("sweep", ["grid=[1]"], "grid=[1]: this is a group of settings"),
     ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
-    ("evaluate", ["features=aliked", "features.weights=d2_tf"], "weights=d2_tf: expected weights of aliked"),
-    ("evaluate", ["scorer.sgma=3"], "the nearest is scorer.histogram.sigma"),
-    ("evaluate", ["scorer=histogram", "scorer.sgma=3"], "the nearest is scorer.sigma"),
     ("evaluate", ["candidats=3"], "the nearest is candidates"),
     ("evaluate", ["dataset.database=a"], "dataset=folder and dataset=sequences have dataset."),
     ("evaluate", ["scorer=sum", "scorer.sigma=15"], "scorer=histogram has scorer.sigma"),
@@ -144,9 +130,7 @@ def test_version(succeed, program):
     ("evaluate", ["scorer.sigma=15"], "the nearest is scorer.histogram.sigma"),
     ("evaluate", ["retrieval=pairs", "retrieval.file=a"], "the nearest is retrieval.queries"),
     ("evaluate", ["features.num_words=9"], "the nearest is retrieval.num_words"),
-    ("evaluate", ["features.image_size=[336]"], "features.image_size=[336]: expected a list of 2"),
     ("evaluate", ["dataset=folder"], "dataset.database: this setting has no default"),
-    ("evaluate", ["dataset=grief_season"], "dataset.root: this setting has no default"),
     ("evaluate", ["scorer=histgram"], "sum; the nearest is histogram"),
     ("evaluate", [*OWN], "dataset.ground_truth: "),
     ("evaluate", [*OWN, "dataset.bits=7"], "whole number from 8 to 16, or"),
@@ -157,8 +141,6 @@ def test_version(succeed, program):
     ("evaluate", ["features=null"], "aliked, d2net, import, patch_netvlad, selavpr, sift, ssm"),
     ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
     ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number above 0"),
-    ("evaluate", ["scorer.histogram=3"], "scorer.histogram=3: this is a group of settings"),
-    ("evaluate", ["features.name=superpoint"], "features.name=superpoint: expected one of sift"),
     ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),
     ("evaluate", ["scorer=histogram", "scorer.method=sum"], "scorer=sum has no setting"),
     ("evaluate", ["hydra.foo=1"], "hydra.foo: unknown setting; see --help"),

@@ -53,13 +53,13 @@ def content(confidence):
 def test_a_run_says_how_sure_its_answers_are(evaluate):
     out, _, stdout = evaluate("first", "figures=1")
     assert "ECE" not in stdout  # said in files, until it is asked for
-    gains, predictions = csv_rows(out / "gains.csv"), csv_rows(out / "top_predictions.csv")
+    gains, top = csv_rows(out / "gains.csv"), csv_rows(out / "top_predictions.csv")
     hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
-    predictions = [line for line in csv_rows(out / "predictions.csv") if line["rank"] == "1"]
-    assert [(line["query"], line["prediction"], line["score"], line["correct"]) for line in predictions] == [
-        (line["query"], line["database"], line["score"], line["correct"]) for line in predictions
+    first = [line for line in csv_rows(out / "predictions.csv") if line["rank"] == "1"]
+    assert [[line[name] for name in ("query", "prediction", "score", "correct")] for line in top] == [
+        [line[name] for name in ("query", "database", "score", "correct")] for line in first
     ]
-    probability = np.array([float(line["confidence"]) for line in predictions])
+    probability = np.array([float(line["confidence"]) for line in top])
     assert len(np.unique(probability)) > QUERIES / 2
     table = {line["system"]: line for line in csv_rows(out / "confidence.csv")}
     assert tuple(table) == SYSTEMS
@@ -97,37 +97,31 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert "other settings" not in stderr
     header = stdout[stdout.index("AP by score") :].splitlines()[0]
     assert header.endswith("correct  incorrect  refused  of these correct")
-    predictions = csv_rows(out / "top_predictions.csv")
-    probability, score = (np.array([float(line[name]) for line in predictions]) for name in ("confidence", "score"))
+    top = csv_rows(out / "top_predictions.csv")
+    probability, score = (np.array([float(line[name]) for line in top]) for name in ("confidence", "score"))
     refused = probability < 0.4
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
-    assert [line["prediction"] == "no place" for line in predictions] == refused.tolist()
-    assert [line["reason"] for line in predictions] == np.where(refused, "low confidence", "").tolist()
-    assert {line["in_database"] for line in predictions} == {"1"}
+    assert [line["prediction"] == "no place" for line in top] == refused.tolist()
+    assert [line["reason"] for line in top] == np.where(refused, "low confidence", "").tolist()
+    assert {line["in_database"] for line in top} == {"1"}
     correct = np.array([line["histogram"] == "1" for line in csv_rows(out / "gains.csv")])
-    assert [line["correct"] for line in predictions] == correct.astype(int).astype(str).tolist()
+    assert [line["correct"] for line in top] == correct.astype(int).astype(str).tolist()
     line = next(line for line in csv_rows(out / "confidence.csv") if line["system"] == "histogram")
     counts = [int(line[name]) for name in ("correct", "incorrect", "refused", "of these correct")]
     assert counts == [(correct & ~refused).sum(), (~correct & ~refused).sum(), refused.sum(), (correct & refused).sum()]
     assert line["ECE"] == f"{100 * reliability(probability, correct).calibration_error:.1f}"
     predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
-    assert [line["query"] for line in none] == [
-        line["query"] for line in predictions if line["prediction"] == "no place"
+    assert [(line["query"], line["rank"], line["score"], line["correct"]) for line in none] == [
+        (line["query"], "1", line["score"], line["correct"]) for line in top if line["prediction"] == "no place"
     ]
-    assert [(line["rank"], line["score"], line["correct"]) for line in none] == [
-        ("1", line["score"], line["correct"]) for line in predictions if line["prediction"] == "no place"
-    ]
-    every = csv_rows(out / "predictions" / "histogram.csv")
     refusing = {line["query"] for line in none}
-    assert [line for line in predictions if line not in none] == [
-        line for line in every if line["query"] not in refusing
-    ]
+    rest = [line for line in csv_rows(out / "predictions" / "histogram.csv") if line["query"] not in refusing]
+    assert [line for line in predictions if line not in none] == rest
     unknown, *_ = evaluate("third", *threshold, "dataset.ground_truth=none", "dataset.index_file=null")
-    assert [{**line, "correct": "", "in_database": ""} for line in predictions] == csv_rows(
-        unknown / "top_predictions.csv"
-    )
+    expected = [{**line, "correct": "", "in_database": ""} for line in top]
+    assert csv_rows(unknown / "top_predictions.csv") == expected
     assert not (unknown / "confidence.csv").exists()
 
 
@@ -207,7 +201,7 @@ def test_a_single_candidate_leaves_nothing_to_say(evaluate, refused):
     assert line["AP by score"]
     assert {line[name] for name in line if " by confidence" in name or "ECE" in name or name == "by chance"} == {""}
     error = refused("candidates=1", f"confidence={first}/confidence.json")
-    assert "expected p of systems, got none" in error
+    assert "expected confidences of systems, got none" in error
 
 
 @pytest.mark.parametrize("origin", [
@@ -235,4 +229,4 @@ def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_pa
     content["systems"]["histogram"]["weights"] = [0.0, 0.0]
     (tmp_path / "flat.json").write_text(json.dumps(content))
     _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json")
-    assert "flat.json cannot tell correct predictions from incorrect ones" in stderr
+    assert "flat.json has the same confidence for all predictions" in stderr

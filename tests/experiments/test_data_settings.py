@@ -149,7 +149,7 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
 
 def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path):
     settings = composed(*folder(small_street, f"cache={tmp_path}/store"))
-    first, second = (stages.begun(settings, stages.Stopwatch())[1] for _ in range(2))
+    first, second = (stages.prepare(settings, stages.Stopwatch())[1] for _ in range(2))
     assert first.fingerprints == second.fingerprints
     assert first.reading == second.reading
     assert len(list((tmp_path / "store" / "contents").iterdir())) == 2
@@ -162,7 +162,7 @@ def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     if value is None:
         monkeypatch.delenv("MFVPR_CACHE")
     calls, root = [], value or "~/.cache/mfvpr"
-    monkeypatch.setattr("experiments.evaluate.evaluate", lambda: calls.append)
+    monkeypatch.setattr("experiments.evaluation.evaluate", calls.append)
     succeed("evaluate")
     assert (calls[0]["cache"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
     assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")

@@ -177,13 +177,8 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
     assert files <= {path.name for path in folder.iterdir()}
     figures = [*(folder / "figures").iterdir()]
-    assert {path.stem.split("_")[0] for path in figures} == {
-        "correct",
-        "incorrect",
-        "precision",
-        "reliability",
-        "rerank",
-    }
+    kinds = {"correct", "incorrect", "precision", "reliability", "rerank"}
+    assert {path.stem.split("_")[0] for path in figures} == kinds
     for path in figures:
         image = np.asarray(Image.open(path).convert("L"))
         assert image.shape[0] > 300

@@ -46,21 +46,6 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
 
 
-def test_of_retrieval_and_score_it_ranks_as_auto(root, tmp_path):
-    places = {}
-    for c in ("auto", "zscore"):
-        more = ("scorer=histogram", f"fusion.c={c}", "figures=0", f"out={tmp_path}/{c}")
-        evaluation.evaluate(composed(*small(root), *more))
-        places[c] = ranked(tmp_path / c, "histogram_retrieval")
-        row = json.loads((tmp_path / c / "results.json").read_text())[-1]
-        assert (row["system"], row["parameters"]["c"], row["parameters"]["weights"]) == (
-            "histogram + retrieval",
-            c,
-            None,
-        )
-    assert [line[:2] for line in places["auto"]] == [line[:2] for line in places["zscore"]]
-
-
 def test_our_system_fuses_two_scores_and_retrieval():
     for arguments, features, side, weight in (
         ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.retrieval=1"], "sift", 336, 1),
@@ -75,7 +60,7 @@ def test_our_system_fuses_two_scores_and_retrieval():
     alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
     config = composed("system=mfvpr", *alone, config="sweep")
     settings.check(config)
-    assert axes.searchable(axes.as_final(config)).grid() == [{"sigma": 10}]
+    assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]
 
 
 def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):

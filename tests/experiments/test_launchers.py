@@ -7,8 +7,7 @@ from hydra.core.plugins import Plugins
 
 from experiments.groups import choices
 from experiments.settings import CONF
-from tests.experiments.test_shards_program import tables
-from tests.programs import composed, run, small
+from tests.programs import composed
 
 PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers
 EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "slurm": "slurm"}
@@ -59,16 +58,3 @@ def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
     assert "\nhydra:\n  # An array of Slurm" in stdout
     assert "\n  launcher:\n    name: mfvpr\n    array_parallelism: 64  # tasks" in stdout
     assert "@" not in stdout[stdout.index("hydra:") : stdout.index("scorer:")]
-
-
-@pytest.mark.slow
-def test_shards_are_one_command_line(tmp_path, succeed):
-    settings = [setting for setting in small(tmp_path) if "cache=" not in setting] + ["figures=0"]
-    succeed("evaluate", *settings, f"cache={tmp_path}/other", f"out={tmp_path}/plain")
-    launcher = ("-m", "launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/jobs")
-    for _ in range(2):
-        done = run(*settings, *launcher, "shard=0/2,1/2", f"cache={tmp_path}/store")
-        assert done.returncode == 0, done.stderr
-    assert done.stdout.count("are done; when all shards are") == 2
-    succeed("evaluate", *settings, f"cache={tmp_path}/store", f"out={tmp_path}/out")
-    assert tables(tmp_path / "out") == tables(tmp_path / "plain")

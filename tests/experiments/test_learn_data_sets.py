@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments import data_sets, evaluation, learning
+from experiments import evaluation, learning, overrides
 from mfvpr.datasets.streets import streets_folder
 from tests.programs import QUERIES, composed, results, small
 
@@ -41,7 +41,7 @@ def learned(root, streets, tmp_path_factory):
 
 def test_the_reported_set_is_reported_as_it_is_alone(root, streets, learned, tmp_path):
     content = learned[1]
-    [alone] = data_sets.composed("report", streets[2])
+    [alone] = overrides.compose_data_sets("report", streets[2])
     settings = composed(*small(root), "scorer=sum", "figures=0", f"out={tmp_path}/alone")
     evaluation.evaluate(settings | {"dataset": alone})
     rows = {row["score"]: row for row in content["rows"]}
@@ -72,16 +72,19 @@ def test_the_table_names_the_sets(learned):
 
 
 def test_several_sets_as_they_are_typed(streets):
-    typed_so = data_sets.first_of([f"dataset={streets[0]},{streets[1]}", "report=corridor:root=/a,b:c", "steps=3"])
+    typed_so = overrides.split_first([f"dataset={streets[0]},{streets[1]}", "report=corridor:root=/a,b:c", "steps=3"])
     assert typed_so[:2] == ["dataset=folder", "dataset.name=street0"]
     assert typed_so[-3:] == [f"also={streets[1]}", "report=corridor:root=/a,b:c", "steps=3"]
-    assert data_sets.first_of(["dataset=streets", "dataset.root=/a:b,c"]) == ["dataset=streets", "dataset.root=/a:b,c"]
-    assert data_sets.first_of(["dataset=streets:seed=3"]) == ["dataset=streets", "dataset.seed=3"]
-    [named] = data_sets.parse("report", "corridor:root=/a,b:c")
+    assert overrides.split_first(["dataset=streets", "dataset.root=/a:b,c"]) == [
+        "dataset=streets",
+        "dataset.root=/a:b,c",
+    ]
+    assert overrides.split_first(["dataset=streets:seed=3"]) == ["dataset=streets", "dataset.seed=3"]
+    [named] = overrides.parse_data_sets("report", "corridor:root=/a,b:c")
     assert named == ["corridor", "root=/a,b:c"]
-    [corridor, drawn] = data_sets.composed("report", "corridor:root=/a,b:c,streets:seed=4")
+    [corridor, drawn] = overrides.compose_data_sets("report", "corridor:root=/a,b:c,streets:seed=4")
     assert corridor["database"] == "/a,b:c/ref"
-    assert (drawn["name"], data_sets.label(drawn)) == ("streets", "streets 4")
+    assert (drawn["name"], learning.label(drawn)) == ("streets", "streets 4")
 
 
 def test_images_that_were_learned_on_are_not_reported_on_and_queries_count_once(root, streets, tmp_path, refuse):
@@ -98,14 +101,14 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
     """Other queries of the same database: no set of blocks knows that they show the same places."""
     several = []
     for name, of_queries in (("there", 1), ("back", 2)):
-        database, queries = (data_sets.composed("report", streets[number])[0] for number in (1, of_queries))
+        database, queries = (overrides.compose_data_sets("report", streets[number])[0] for number in (1, of_queries))
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
-        _, images = learning.stages.begun(settings, evaluation.Stopwatch())
+        _, images = learning.stages.prepare(settings, evaluation.Stopwatch())
         several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
-    learning.check_apart([], several)
+    learning.require_disjoint([], several)
     assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
-    learning.check_apart([], several[:1])
+    learning.require_disjoint([], several[:1])
     assert "there and back" not in capsys.readouterr().err
 
 
@@ -123,6 +126,6 @@ def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, t
             line for line in stderr.splitlines() if "was learned" in line
         ]
         assert stderr.count("was learned") == len(warns)
-    [reported] = data_sets.composed("report", streets[2])
-    learning.stages.begun(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
+    [reported] = overrides.compose_data_sets("report", streets[2])
+    learning.stages.prepare(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
     assert "was learned" not in capsys.readouterr().err

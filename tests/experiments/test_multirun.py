@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 
 import pytest
 
@@ -83,21 +82,3 @@ def test_jobs_in_several_processes(root, tmp_path):
     assert done.stdout.count("results: runs/folder/") == 2
     assert {results(path)["candidates"] for path in (tmp_path / "runs" / "folder").iterdir()} == {4, 8}
     assert "error" not in done.stderr
-
-
-def test_who_waits_for_a_store_says_so_and_gets_it(tmp_path):
-    messages, got, sizes = [], [], {"num_queries": 1, "num_candidates": 2}
-
-    def another():
-        with match_store.open_match_store(tmp_path / "s", {}, **sizes, waiting=messages.append) as store:
-            got.append(store.done.tolist())
-
-    other = threading.Thread(target=another)
-    with match_store.open_match_store(tmp_path / "s", {}, **sizes):
-        other.start()
-        while not messages and other.is_alive():
-            time.sleep(0.01)
-        assert not got
-    other.join(timeout=30)
-    assert [message.partition("; ")[0] for message in messages] == [f"{tmp_path}/s: in use by process {os.getpid()}"]
-    assert got == [[False]]

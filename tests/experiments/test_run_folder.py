@@ -165,7 +165,7 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     assert max(height for name, height in heights.items() if name.startswith("correct")) < 600
 
     page = page_of(outcome)
-    [ranked], correct = outcome.evaluation.result.systems["histogram"], outcome.evaluation.is_correct("histogram", 0)
+    [ranked], correct = outcome.report.result.systems["histogram"], outcome.report.is_correct("histogram", 0)
     query_by_case = {bool(correct[query].any()): query for query in np.flatnonzero(~correct[:, 0])}
     names = outcome.images.dataset.database.names
     query = query_by_case[True]
@@ -181,15 +181,15 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
 
 
 def page_of(outcome, **changes):
-    result = outcome.evaluation.result
+    result = outcome.report.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
-    evaluation = replace(outcome.evaluation, result=replace(result, dataset=dataset))
+    evaluation = replace(outcome.report, result=replace(result, dataset=dataset))
     return SequenceFigures(evaluation, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
     """If the nearest image is excluded, the page shows another correct image, or none."""
-    correct = outcome.evaluation.is_correct("histogram", 0)
+    correct = outcome.report.is_correct("histogram", 0)
     query = int(np.flatnonzero(~correct.any(axis=1))[0])
     names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
     excluded = np.zeros((len(outcome.images.dataset.queries), len(names)), bool)
@@ -199,7 +199,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
         return [prediction.caption for prediction in page.correct_candidates(query)]
 
-    other = int(np.argmax(outcome.evaluation.positives[0].dense()[query] & ~excluded[query]))
+    other = int(np.argmax(outcome.report.positives[0].dense()[query] & ~excluded[query]))
     assert predictions(excluded) == [f"correct: {names[other]}, not among the 3 candidates"]
     assert predictions(np.ones_like(excluded)) == []
 
@@ -291,23 +291,23 @@ def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
     assert list(tmp_path.rglob("*-*")) == []
 
 
-# --- what goes incorrect at the end ----------------------------------------------------------------------------------
+# --- what goes wrong at the end ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def limited(monkeypatch):
     """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
-    before, leave = resource.getrlimit(resource.RLIMIT_FSIZE), run_folder.leave
+    before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), run_folder.write_results
 
     def limit(size):
         def limited(*arguments, **named):
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
             try:
-                leave(*arguments, **named)
+                write_results(*arguments, **named)
             finally:  # at once: the log of the tests is a file, too
                 resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-        monkeypatch.setattr(run_folder, "leave", limited)
+        monkeypatch.setattr(run_folder, "write_results", limited)
 
     return limit
 
@@ -328,7 +328,7 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
     limited(30_000)
     stdout, stderr = succeed("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
-    warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/wrong_")]
+    warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/incorrect_")]
     assert len(warnings) == 2
     assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
     assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()

@@ -233,22 +233,11 @@ SIGMA = "grid.sigma=[10]"
     (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
     (["grid.sgma=[1]"], "the nearest is grid.sigma"),
     (["grid.window=[3]"], "it has bin_size, sigma"),
-    (["grid.sigma=[10,nan]"], "grid.sigma=[10, nan]: expected a list"),
-    (["grid.sigma=[-1]"], "grid.sigma=[-1]: expected"),
-    (["grid.sigma=3"], "grid.sigma=3: expected a list"),
-    (["grid.align=[middle]"], "each one of min_edge, zero_center, zero_edge"),
-    (["grid.c=[automatic]"], "grid.c=['automatic']: expected"),
-    (["scorer=anchor", "grid.num_bins=[33]"], "each a whole number from 1 to 32"),
     (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
     (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
     (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
-    (["scorer=count", SIGMA], "it has single, max_distance, c"),
     ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-    ([SIGMA, "search=random"], "search=random: expected one of grid, optuna"),
-    ([SIGMA, "split=half"], "split=half: expected one of null"),
-    ([SIGMA, "chunk.settings=0"], "chunk.settings=0: expected a whole number above 0"),
     ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
-    ([SIGMA, "experiment=histogam"], "the nearest is histogram"),
     ([SIGMA, "features=sift,aliked"], "add --multirun"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
@@ -260,7 +249,6 @@ def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, 
     ("sweep", [SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
     ("sweep", ["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
     ("evaluate", ["scorer=histogram", "scorer.bin_size=0.01"], "bin_size=0.01: expected at most 1024 bins"),
-    ("evaluate", ["scorer=histogram", "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
 ])  # fmt: skip
 def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, program, arguments, words):
     assert refuse(program, *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
@@ -332,5 +320,5 @@ def test_a_lost_ctrl_c_comes_again():
     """An exception in a garbage collection callback cannot be caught; it must come again at once, even in a sleep."""
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        launch.keep_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
+        launch.resend_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
     assert time.monotonic() - start < 10

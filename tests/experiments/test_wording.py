@@ -64,7 +64,7 @@ ORDER = "dataset.ground_truth=order"
 def test_what_is_refused_says_which_setting_mends_it(images, tmp_path, monkeypatch, refuse, arguments, words):
     monkeypatch.chdir(tmp_path)
     sides = [f"dataset.{side}={images}/{side}" for side in ("database", "queries")]
-    defaults = ("dataset=folder", *sides, "store=null", "candidates=2", "scorer=count")
+    defaults = ("dataset=folder", *sides, "cache=null", "candidates=2", "scorer=count")
     typed_here = [argument.replace("ROOT", str(images)) for argument in arguments]
     names = {argument.partition("=")[0] for argument in typed_here}
     settings = [default for default in defaults if default.partition("=")[0] not in names]
@@ -77,4 +77,4 @@ def test_a_sweep_says_how_one_sequence_is_chosen(images, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     several = ("dataset=sequences", f"dataset.database={images}/database", ORDER,
                f"dataset.queries=[{images}/queries,{images}/database]", "scorer=sum", "grid.clamp=[true]")  # fmt: skip
-    assert "got 2; give one folder as dataset.queries=[DIR]" in refuse("sweep", *several, "store=null")
+    assert "got 2; give one folder as dataset.queries=[DIR]" in refuse("sweep", *several, "cache=null")
