@@ -29,7 +29,7 @@ def localize(settings: dict[str, Any]) -> None:
         build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         memory=settings["memory"],
     )  # fmt: skip
-    drive, figures, failed = _Drive(robot_map, settings), _PredictionFigures(robot_map, settings), 0
+    drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
             tell(f"{len(robot_map):,} images in the map; the first image takes seconds more: programs compile")
@@ -88,7 +88,7 @@ class _Drive:
         return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4)}}
 
 
-class _PredictionFigures:
+class _LocalizationFigures:
     """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
 
     def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
@@ -124,7 +124,7 @@ class _PredictionFigures:
             raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
         if self._missing:
             names = ",".join(sorted(map(str, self._missing)))
-            raise SettingsError(f"figures=[{names}]: expected rows of images that were answered, from 0, or names as "
+            raise SettingsError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
                                 "the lines have them, or the last parts of these")  # fmt: skip
 
 
