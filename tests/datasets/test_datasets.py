@@ -10,7 +10,7 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.datasets import folder_dataset, image_folder
-from mfvpr.utils.files import printable, replacing, write_text
+from mfvpr.utils.files import printable, write_text
 from tests.builders import fill
 from tests.io.checks import one_line_error
 
@@ -116,18 +116,3 @@ def test_names_that_are_not_utf8(tmp_path):
     (tmp_path / "gt.csv").write_bytes(b"query,database\ncaf\xe9.png,0\n")  # as a shell writes it
     truth = folder_dataset(folder, folder, ground_truth="index", index_file=tmp_path / "gt.csv").truth
     assert truth.place(0) == 0
-
-
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "deep" / "x.txt"
-    write_text(path, "old")
-
-    def interrupted():
-        with replacing(path) as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert path.read_text() == "old"
-    assert [p.name for p in path.parent.iterdir()] == ["x.txt"]
