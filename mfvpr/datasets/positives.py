@@ -39,7 +39,10 @@ class Positives:
         is_in_range = not len(rows) or 0 <= rows.min() <= rows.max() <= last
         if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_in_range:
             raise InputError(f"positives: expected rows from 0 to {last}, and offsets that grow from 0 to {len(rows)}")
-        if not _ascending(rows, offsets):
+        is_ascending = rows[1:] > rows[:-1]
+        starts = offsets[(offsets > 0) & (offsets < len(rows))]
+        is_ascending[starts - 1] = True  # the first row of a query may be any
+        if not is_ascending.all():
             raise InputError("positives: expected rows that ascend for each query; from_rows takes them in any order")
 
     @classmethod
@@ -201,14 +204,6 @@ def radius_positives(
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
     return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
-
-
-def _ascending(rows: np.ndarray, offsets: np.ndarray) -> bool:
-    """Whether the rows of each query ascend strictly."""
-    ascending = rows[1:] > rows[:-1]
-    starts = offsets[(offsets > 0) & (offsets < len(rows))]  # the first row of a query may be any
-    ascending[starts - 1] = True
-    return bool(ascending.all())
 
 
 def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> csr_array:

@@ -16,7 +16,6 @@ from tests.io.checks import one_line_error
 
 
 def test_names_are_relative_in_natural_order_and_distinct(tmp_path):
-    fill(tmp_path, ["._img10.png", "sub/.hidden.jpg"])
     names = ["img2.png", "img10.png", "sub/img2.png", "a b/ü@1.png", "IMG3.JPG", "img02.png"]
     folder = image_folder(fill(tmp_path, names))
     assert set(folder.names) == set(names)
@@ -65,7 +64,7 @@ def test_links_in_circles_or_to_nothing_are_errors(tmp_path, place, target, word
 
 
 def test_what_is_no_image_is_ignored(tmp_path):
-    folder = fill(tmp_path, ["0.png", ".hidden/1.png", "a.png/2.png", "empty.png/.x.png"])
+    folder = fill(tmp_path, ["0.png", "._1.png", ".hidden/1.png", "a.png/2.png", "empty.png/.x.png"])
     (folder / "notes.txt").write_text("no image")
     (folder / ".#lock").symlink_to("nowhere")
     os.mkfifo(folder / "pipe")
