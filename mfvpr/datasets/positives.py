@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Integer, Num
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array, vstack
 from scipy.spatial import KDTree
 
 from mfvpr.utils.errors import InputError
@@ -39,7 +39,10 @@ class Positives:
         is_in_range = not len(rows) or 0 <= rows.min() <= rows.max() <= last
         if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_in_range:
             raise InputError(f"positives: expected rows from 0 to {last}, and offsets that grow from 0 to {len(rows)}")
-        if not _ascending(rows, offsets):
+        is_ascending = rows[1:] > rows[:-1]
+        starts = offsets[(offsets > 0) & (offsets < len(rows))]
+        is_ascending[starts - 1] = True  # the first row of a query may be any
+        if not is_ascending.all():
             raise InputError("positives: expected rows that ascend for each query; from_rows takes them in any order")
 
     @classmethod
@@ -158,15 +161,12 @@ class Positives:
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries and databases of independent data sets."""
-    starts = np.cumsum([0, *(part.num_database for part in parts)])
-    rows = np.concatenate([part.rows + int(start) for part, start in zip(parts, starts[:-1], strict=True)])
-    return Positives(rows.astype(np.int32), _offsets(np.concatenate([part.counts for part in parts])), int(starts[-1]))
+    return Positives._from_csr(block_diag([part._csr() for part in parts], format="csr"))
 
 
 def stack_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries of the same database."""
-    rows = np.concatenate([part.rows for part in parts])
-    return Positives(rows, _offsets(np.concatenate([part.counts for part in parts])), parts[0].num_database)
+    return Positives._from_csr(vstack([part._csr() for part in parts], format="csr"))
 
 
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
@@ -203,18 +203,7 @@ def radius_positives(
     query_xy: Num[np.ndarray, "queries 2"], database_xy: Num[np.ndarray, "database 2"], *, radius: float = 25.0
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
-    positives = np.zeros((len(query_xy), len(database_xy)), bool)
-    for row, near in zip(positives, rows_within(query_xy, database_xy, radius), strict=True):
-        row[near] = True
-    return positives
-
-
-def _ascending(rows: np.ndarray, offsets: np.ndarray) -> bool:
-    """Whether the rows of each query ascend strictly."""
-    ascending = rows[1:] > rows[:-1]
-    starts = offsets[(offsets > 0) & (offsets < len(rows))]  # the first row of a query may be any
-    ascending[starts - 1] = True
-    return bool(ascending.all())
+    return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
 
 
 def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> csr_array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
 from mfvpr.datasets.truth import Truth
+from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
@@ -106,9 +107,9 @@ def _labels(path: Path, names: Sequence[str]) -> list[str]:
         if row is None:
             several = any(PurePosixPath(image).name == name.strip() for image in names)
             mend = "several images have this name, give their paths" if several else "no image has this name, remove it"
-            raise InputError(f"{path}: entry {number}: got {_clip(name)!r}; {mend}")
+            raise InputError(f"{path}: entry {number}: got {shorten(name)!r}; {mend}")
         if row in labels:
-            raise InputError(f"{path}: entry {number}: {_clip(name)!r} has a label already; keep one of them")
+            raise InputError(f"{path}: entry {number}: {shorten(name)!r} has a label already; keep one of them")
         labels[row] = label.strip()
     _require_all(path, "images", names, labels)
     return [labels[row] for row in range(len(names))]
@@ -124,7 +125,7 @@ def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[s
                 first, second = map(names.index, pair)
                 padding = [""] * len(names)  # missing cells at the end of a line are empty
                 return [((line + padding)[first], (line + padding)[second]) for line in lines if line]
-    got = _clip(",".join(names)) or "no header"
+    got = shorten(",".join(names)) or "no header"
     raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
 
 
@@ -174,10 +175,5 @@ def _row(path: Path, line: int, side: str, value: Any, table: dict[str, int], co
         return int(text)
     raise InputError(
         f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got "
-        f"{_clip(text)!r}"
+        f"{shorten(text)!r}"
     )
-
-
-def _clip(text: str) -> str:
-    """Shorten text from a file for an error message."""
-    return text if len(text) <= 60 else f"{text[:40]}... ({len(text)} characters)"

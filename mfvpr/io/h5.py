@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.io.containers import Container, Contents, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing, require_file
+from mfvpr.utils.files import printable, replacing
 
 
 class H5File(Container):
@@ -21,7 +21,6 @@ class H5File(Container):
     transposed = True
 
     def __init__(self, path: Path) -> None:
-        require_file(path)
         h5py = _h5py(path)
         self.path = path
         with reading(path), h5py.File(path, "r") as file:

@@ -3,9 +3,7 @@
 import hashlib
 import os
 import shutil
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -125,20 +123,6 @@ def test_damaged_records_cost_time_only(folder, cache, damage):
     record(cache).write_bytes(damage(intact))
     assert fingerprint(folder, cache) == first
     assert record(cache).read_bytes() == intact
-
-
-def test_many_writers_of_one_record(folder, cache):
-    settle()
-    first, start = fingerprint(folder), threading.Barrier(8)
-
-    def run(_):
-        start.wait()
-        return {fingerprint(folder, cache) for _ in range(5)}
-
-    with ThreadPoolExecutor(8) as pool:
-        assert set.union(*pool.map(run, range(8))) == {first}
-    assert len(list(cache.iterdir())) == 1
-    assert fingerprint(folder, cache) == first
 
 
 def test_a_cache_that_cannot_be_written_costs_time_only(folder, tmp_path):

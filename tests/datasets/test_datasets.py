@@ -10,13 +10,12 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.datasets import folder_dataset, image_folder
-from mfvpr.utils.files import printable, replacing, write_text
+from mfvpr.utils.files import printable, write_text
 from tests.builders import fill
 from tests.io.checks import one_line_error
 
 
 def test_names_are_relative_in_natural_order_and_distinct(tmp_path):
-    fill(tmp_path, ["._img10.png", "sub/.hidden.jpg"])
     names = ["img2.png", "img10.png", "sub/img2.png", "a b/ü@1.png", "IMG3.JPG", "img02.png"]
     folder = image_folder(fill(tmp_path, names))
     assert set(folder.names) == set(names)
@@ -65,7 +64,7 @@ def test_links_in_circles_or_to_nothing_are_errors(tmp_path, place, target, word
 
 
 def test_what_is_no_image_is_ignored(tmp_path):
-    folder = fill(tmp_path, ["0.png", ".hidden/1.png", "a.png/2.png", "empty.png/.x.png"])
+    folder = fill(tmp_path, ["0.png", "._1.png", ".hidden/1.png", "a.png/2.png", "empty.png/.x.png"])
     (folder / "notes.txt").write_text("no image")
     (folder / ".#lock").symlink_to("nowhere")
     os.mkfifo(folder / "pipe")
@@ -116,18 +115,3 @@ def test_names_that_are_not_utf8(tmp_path):
     (tmp_path / "gt.csv").write_bytes(b"query,database\ncaf\xe9.png,0\n")  # as a shell writes it
     truth = folder_dataset(folder, folder, ground_truth="index", index_file=tmp_path / "gt.csv").truth
     assert truth.place(0) == 0
-
-
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "deep" / "x.txt"
-    write_text(path, "old")
-
-    def interrupted():
-        with replacing(path) as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert path.read_text() == "old"
-    assert [p.name for p in path.parent.iterdir()] == ["x.txt"]

@@ -40,7 +40,7 @@ def check_error(name, root, words, **options):
 
 @pytest.fixture
 def ssm(tmp_path):
-    put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(12)), *(f"Live/image{i:04d}.jpg" for i in range(3)))
+    put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(12)), *(f"Live/image{i:05d}.jpg" for i in range(3)))
     (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n10,1\n4,2\n")
     return tmp_path
 
@@ -55,15 +55,9 @@ def test_ssm_vprs_are_right_around_the_named_image(ssm, name):
     assert dataset.truth.thresholds(tolerances=[1, 2, 5], radius=25) == [1, 2, 5]
 
 
-def test_ssm_vprs_have_five_digits_beyond_9999_files(tmp_path):
-    put(tmp_path, *(f"Reference/image{i:05d}.png" for i in range(11)), "Live/image00000.png")
-    (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n10,0\n")
-    assert rows(published_dataset("nordland_1415", tmp_path), 0) == [[10]]
-
-
 @pytest.mark.parametrize(("side", "number"), [("Reference", 5), ("Live", 1), ("Reference", 0)])
 def test_a_gap_is_an_error_because_the_table_counts_numbers(ssm, side, number):
-    next((ssm / side).glob(f"image{number:04d}.*")).unlink()
+    next((ssm / side).glob(f"*{number:04d}.*")).unlink()
     check_error("gardens_point", ssm, f"{ssm / side}: expected images numbered from 0 without gaps")
 
 
@@ -441,6 +435,6 @@ def test_numbers_of_images_are_compared_with_the_published(ssm):
         "12 database images where 85 are published",
         "3 queries in berlin_a100 where 81 are published",
     ]
-    put(ssm, *(f"Reference/image{i:04d}.png" for i in range(85)), *(f"Live/image{i:04d}.jpg" for i in range(81)))
+    put(ssm, *(f"Reference/image{i:04d}.png" for i in range(85)), *(f"Live/image{i:05d}.jpg" for i in range(81)))
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n" + "".join(f"0,{i}\n" for i in range(81)))
     assert list(differences(published_dataset("berlin_a100", ssm))) == []

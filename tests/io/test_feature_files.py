@@ -41,14 +41,6 @@ def test_padding_is_left_out_and_rows_may_be_few(tmp_path, file):
     np.testing.assert_array_equal(features.descriptors, padded.descriptors[:9])
 
 
-def test_what_is_read_is_written_again(tmp_path):
-    """From one layout to the next and back: the same file of hloc."""
-    write_features(tmp_path / "0.h5", NAMES, enumerate(features_of(3)))
-    for before, after in (("0.h5", "1.npz"), ("1.npz", "2"), ("2", "3.h5")):
-        write_features(tmp_path / after, NAMES, open_features(tmp_path / before, NAMES).read())
-    assert (tmp_path / "0.h5").read_bytes() == (tmp_path / "3.h5").read_bytes()
-
-
 def test_hloc_reads_what_is_written(tmp_path):
     written = feature(0)
     write_features(tmp_path / "f.h5", ["a/b.jpg"], [(0, written)], half=True)

@@ -206,20 +206,19 @@ def test_lengths_of_descriptors(path):
 
 
 def test_a_file_that_changes_after_it_was_opened(path):
-    write_hloc(path, ["a.jpg"])
+    parts, longer = hloc_parts(feature(0)), hloc_parts(feature(0, count=31))
+    append_hloc(path, "a.jpg", parts)
     source = open_features(path, ["a.jpg"])
-    path.unlink()
-    write_hloc(path, ["a.jpg"], [feature(0, count=31)])
-    with pytest.raises(InputError, match=r"a\.jpg: .*30 keypoints .*changed"):
-        list(source.read())
-    path.unlink()
-    append_hloc(path, "a.jpg", {name: part for name, part in hloc_parts(feature(0)).items() if name != "scores"})
-    with pytest.raises(InputError, match="changed since it was opened"):
-        list(source.read())
-    path.unlink()
-    write_hloc(path, ["b.jpg"])
-    with pytest.raises(InputError, match="cannot be read"):
-        list(source.read())
+    del parts["scores"]
+    for name, changed, words in (
+        ("a.jpg", longer, r"a\.jpg: .*30 keypoints .*changed"),
+        ("a.jpg", parts, "changed since it was opened"),
+        ("b.jpg", longer, "cannot be read"),
+    ):
+        path.unlink()
+        append_hloc(path, name, changed)
+        with pytest.raises(InputError, match=words):
+            list(source.read())
 
 
 def test_opening_and_reading_take_the_memory_of_what_is_read(path):

@@ -110,10 +110,3 @@ def test_truncated_at_any_place(tmp_path, path):
     for length in (0, 10, 100, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:length])
         check_refused(path, "cannot be read")
-
-
-def test_not_a_file(tmp_path):
-    for name in ("x.h5", "x.txt", "x"):
-        check_refused(tmp_path / name, "got nothing")
-    (tmp_path / "x.txt").write_text("")
-    check_refused(tmp_path / "x.txt", r"\.h5, \.hdf5, \.npz, got \.txt")

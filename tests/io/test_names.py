@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError, Shortlist
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.io.names import match_names, require_all
+from mfvpr.io.names import match_names
 from tests.io.checks import one_line_error
 from tests.io.other_programs import feature
 
@@ -82,11 +82,6 @@ def test_a_name_twice(tmp_path, names):
         with pytest.raises(InputError, match=r"names, got (a|\\udcff)\.jpg twice"):
             use()
     assert not list(tmp_path.iterdir())
-
-
-def test_missing_images_are_counted():
-    with pytest.raises(InputError, match=r"all 3 images, got 1; .*b\.jpg"):
-        require_all(FILE, ["a.jpg", "b.jpg", "c.jpg"], ["a.jpg", None, None], "features")
 
 
 paths = st.lists(st.sampled_from(["a", "b", "1.png", "1.jpg", "1.1", "2"]), min_size=1, max_size=3).map("/".join)

@@ -84,25 +84,20 @@ def test_only_what_is_asked_for_is_read(tmp_path):
 
 
 def test_pipes_are_not_waited_for(tmp_path):
-    written, names = feature(0), ["1.jpg", "2.jpg"]
-    np.savez(tmp_path / "1.jpg.npz", **parts_of(written))
-    os.mkfifo(tmp_path / "2.jpg.npz")
-    for path, wanted in ((tmp_path, names), (tmp_path / "2.jpg.npz", names)):
-        with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
-            open_features(path, wanted)
-    [(_, features)] = open_features(tmp_path, names[:1]).read()
-    assert_equal(features, written)
-    (tmp_path / "2.jpg.npz").unlink()
-    np.savez(tmp_path / "2.jpg.npz", **parts_of(written))
+    names, pipe = ["1.jpg", "2.jpg"], tmp_path / "2.jpg.npz"
+    for name in names:
+        np.savez(tmp_path / f"{name}.npz", **parts_of(feature(0)))
     source = open_features(tmp_path, names)
-    (tmp_path / "2.jpg.npz").unlink()
-    os.mkfifo(tmp_path / "2.jpg.npz")
-    with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
-        list(source.read([1]))
-    for name in ("a.h5", "a.npy"):
-        os.mkfifo(tmp_path / name)
-        with pytest.raises(InputError, match="got a pipe"):
-            read_global_descriptors(tmp_path / name, names)
+    pipe.unlink()
+    for path in (pipe, tmp_path / "a.h5", tmp_path / "a.npy"):
+        os.mkfifo(path)
+        with pytest.raises(InputError, match=f"{path.name}: .*a pipe"):
+            read_global_descriptors(path, names)
+    for use in (lambda: open_features(tmp_path, names), lambda: list(source.read([1]))):
+        with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
+            use()
+    [(_, features)] = open_features(tmp_path, names[:1]).read()
+    assert_equal(features, feature(0))
 
 
 def test_an_array_twice(tmp_path):
@@ -128,17 +123,15 @@ def test_pickles_are_never_loaded(tmp_path):
         def __reduce__(self):
             return exec, ("raise SystemExit('executed')",)
 
-    parts = parts_of(feature(0))
-    np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": np.array([Trap()], object)}))
-    np.savez(tmp_path / "all.npz", **{"1.jpg/keypoints": np.array([Trap()], object)})
-    for path in (tmp_path / "all.npz", tmp_path):
-        with pytest.raises(InputError, match=r"npz: .*array of numbers .*got objects"):
-            list(open_features(path, ["1.jpg"]).read())
-    records = np.zeros(30, np.dtype([("x", "f4")]))
-    np.savez(tmp_path / "1.jpg.npz", **(parts | {"scores": records}))
-    (tmp_path / "all.npz").unlink()
-    with pytest.raises(InputError, match="got objects"):
-        list(open_features(tmp_path, ["1.jpg"]).read())
+    parts, trap = parts_of(feature(0)), np.array([Trap()], object)
+    for number, scores in enumerate((trap, np.zeros(30, [("x", "f4")]))):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        np.savez(folder / "1.jpg.npz", **(parts | {"scores": scores}))
+        np.savez(tmp_path / "all.npz", **{"1.jpg/keypoints": scores})
+        for path in (tmp_path / "all.npz", folder):
+            with pytest.raises(InputError, match=r"npz: .*array of numbers .*got objects"):
+                list(open_features(path, ["1.jpg"]).read())
 
 
 def test_truncated_at_any_place(tmp_path):

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 import cv2
 import numpy as np
@@ -25,15 +24,6 @@ SIGHT = 100.0  # panels farther away are not drawn, meters
 Progress = Callable[[int, int], None]
 
 
-class DrawingOptions(TypedDict, total=False):
-    """Optional arguments of `draw_streets` and `draw_seasons`."""
-
-    seed: int
-    num_frames: int
-    image_size: tuple[int, int]
-    progress: Progress | None
-
-
 @dataclass(frozen=True)
 class Drive:
     """The images of one folder: a camera and the name of a weather per frame, and the seed of the images.
@@ -46,39 +36,6 @@ class Drive:
     weathers: list[str]
     seed: tuple[int, ...]
     ground_truth: Path | None = None
-
-
-def streets_folder(cache: Path | str, **options: Unpack[DrawingOptions]) -> Path:
-    """The folder of the synthetic street inside `cache`, drawn if it is missing; options as in `draw_streets`."""
-    return cached_folder(cache, "streets", draw_streets, **options)
-
-
-def cached_folder(
-    cache: Path | str,
-    kind: str,
-    draw: Callable[..., None],
-    *,
-    seed: int = 0,
-    num_frames: int = 100,
-    image_size: tuple[int, int] = (448, 336),
-    progress: Progress | None = None,
-) -> Path:
-    """The folder inside `cache` that `draw` makes, drawn if it is missing.
-
-    It is drawn under another name and renamed when complete, so that a killed run leaves nothing that looks complete.
-    """
-    folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
-    if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
-            drawing = Path(temporary) / folder.name
-            draw(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
-            try:
-                os.replace(drawing, folder)
-            except OSError:
-                if not folder.exists():  # otherwise another process was faster, with the same result
-                    raise
-    return folder
 
 
 def draw_streets(
@@ -120,6 +77,35 @@ def draw_streets(
         Drive(folder / "queries", queries, weathers, (seed, 8), folder / "ground_truth.csv"),
     ]
     draw_drives(drives, seed, SPACING * num_frames, progress)
+
+
+def streets_folder(
+    cache: Path | str,
+    *,
+    kind: str = "streets",
+    draw: Callable[..., None] = draw_streets,
+    seed: int = 0,
+    num_frames: int = 100,
+    image_size: tuple[int, int] = (448, 336),
+    progress: Progress | None = None,
+) -> Path:
+    """The folder of the synthetic street inside `cache`, drawn if it is missing; other options as in `draw_streets`.
+
+    `draw` draws it under another name. It is renamed when complete, so that a killed run leaves nothing that looks
+    complete.
+    """
+    folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
+            drawing = Path(temporary) / folder.name
+            draw(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
+            try:
+                os.replace(drawing, folder)
+            except OSError:
+                if not folder.exists():  # otherwise another process was faster, with the same result
+                    raise
+    return folder
 
 
 def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Progress | None) -> None:

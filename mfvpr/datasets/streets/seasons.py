@@ -1,18 +1,13 @@
 """The synthetic street by day and in seven other conditions, those of RobotCar Seasons."""
 
+from functools import partial
 from pathlib import Path
-from typing import Unpack
 
 from mfvpr.datasets.streets.camera import SPACING, plan_drives, plan_return
-from mfvpr.datasets.streets.drawing import DrawingOptions, Drive, Progress, cached_folder, draw_drives
+from mfvpr.datasets.streets.drawing import Drive, Progress, draw_drives, streets_folder
 
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")
 TRUTH = "ground_truth.csv"  # in the folder of each condition
-
-
-def seasons_folder(cache: Path | str, **options: Unpack[DrawingOptions]) -> Path:
-    """The folder of the synthetic street's seasons inside `cache`, drawn if it is missing; see `draw_seasons`."""
-    return cached_folder(cache, "seasons", draw_seasons, **options)
 
 
 def draw_seasons(
@@ -38,3 +33,6 @@ def draw_seasons(
         cameras, place = plan_return(seed, number, num_frames, image_size), folder / condition
         drives.append(Drive(place, cameras, [condition] * num_frames, (seed, 10, number + 1), place / TRUTH))
     draw_drives(drives, seed, SPACING * (num_frames + 1), progress)
+
+
+seasons_folder = partial(streets_folder, kind="seasons", draw=draw_seasons)  # the folder of `draw_seasons` in a cache
