@@ -23,7 +23,7 @@ from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
 from tests.networks.checkpoints import fill
 from tests.programs import results
-from tests.random_checkpoints import netvlad_checkpoint
+from tests.random_checkpoints import netvlad_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
 
@@ -41,7 +41,7 @@ SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
 
 @pytest.fixture(scope="module")
 def model():
-    return fill(partial(VggNetVlad, 4, 16), NETVLAD, netvlad_checkpoint(4, 16))
+    return fill(partial(VggNetVlad, 4, 16), NETVLAD, random_checkpoint(netvlad_shapes(4, 16)))
 
 
 @pytest.fixture(scope="module")

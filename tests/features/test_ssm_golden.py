@@ -8,7 +8,7 @@ import mfvpr
 from mfvpr import GridAnchors, Shortlist
 from mfvpr.datasets import resize
 from mfvpr.features import WindowFitting
-from mfvpr.features.network import local_features
+from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation

@@ -16,7 +16,7 @@ from mfvpr.networks.netvlad import CHANNELS
 from mfvpr.utils import InputError
 from tests.golden.make_netvlad import CASES, GEM, MATLAB, PATCHES, image, name, samples
 from tests.networks.checkpoints import fill, fill_published
-from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+from tests.random_checkpoints import gem_shapes, matlab_netvlad, netvlad_shapes, random_checkpoint, write_matlab
 
 pytestmark = pytest.mark.thorough
 
@@ -32,7 +32,9 @@ def assert_close(actual, expected):
 @pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
 def test_descriptors_and_patches_are_the_public_codes(golden, case):
     clusters, outputs, size, seed = case
-    network = fill(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
+    network = fill(
+        partial(VggNetVlad, clusters, outputs), NETVLAD, random_checkpoint(netvlad_shapes(clusters, outputs), seed)
+    )
     sizes = PATCHES.get(outputs, ())
     with_patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)
     descriptors, patches = with_patches(network, network.preprocess(image(size)), sizes)
@@ -62,7 +64,7 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
 @pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
 def test_generalized_means_are_cosplaces(golden, case):
     backbone, outputs, size, seed = case
-    model = fill_published(f"cosplace_{backbone}_{outputs}", gem_checkpoint(backbone, outputs, seed))
+    model = fill_published(f"cosplace_{backbone}_{outputs}", random_checkpoint(gem_shapes(backbone, outputs), seed))
     extractor = GlobalDescriptor(model, size)
     assert (extractor.vector_size, extractor.scales) == (outputs, ())
     assert_close(extractor(image(size))[0].vector, golden[name("gem", *case)])
@@ -118,7 +120,7 @@ def test_the_generalized_mean_is_its_definition(power, unit):
 
 @pytest.fixture(scope="module")
 def small():
-    return fill(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
+    return fill(partial(VggNetVlad, 4, 8), NETVLAD, random_checkpoint(netvlad_shapes(4, 8)))
 
 
 @pytest.mark.slow
@@ -150,6 +152,6 @@ def test_what_cannot_be_is_refused(small, options, words):
         GlobalDescriptor(small, **options)
     with pytest.raises(InputError, match="expected images of 64 x 48 px, got 48 x 64"):
         GlobalDescriptor(small, (64, 48))(np.zeros((1, 64, 48, 3), np.uint8))
-    unprojected = fill(partial(VggNetVlad, 4, None), NETVLAD, netvlad_checkpoint(4, None))
+    unprojected = fill(partial(VggNetVlad, 4, None), NETVLAD, random_checkpoint(netvlad_shapes(4, None)))
     with pytest.raises(InputError, match=r"components=3: expected None.*whitening"):
         GlobalDescriptor(unprojected, components=3)
