@@ -28,11 +28,6 @@ score = jax.jit(lambda scorer, matches: scorer(matches))
 match = jax.jit(mfvpr.match, static_argnames="cross_check")
 
 
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(make_ssm.GOLDEN))
-
-
 def described(maps, stage, num_database):
     """Whitened windows `[V, D']` of maps, learned from the first, those of the database."""
     positions, how = Windows(maps.shape[1:], SIZES[stage - 1]), FITTINGS[stage - 1]
