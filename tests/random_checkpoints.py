@@ -7,7 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -149,7 +149,16 @@ def layered(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray
 
 def random_checkpoint(shapes: Shapes, seed: int = 0) -> dict[str, np.ndarray]:
     """Plausible weights: each depends on its name, its shape and the seed alone."""
-    return {name: _random(name, shape, seed) for name, shape in shapes.items()}
+    return {name: _as_published(name, _random(name, shape, seed)) for name, shape in shapes.items()}
+
+
+def _as_published(name: str, tensor: np.ndarray) -> np.ndarray:
+    """The tensor; NetVLAD assigns more decidedly, positions and registers count as much as patches do."""
+    if name.endswith("aggregation.1.p"):
+        return np.float32([2.875])
+    if name.endswith(("pos_embed", "register_tokens")):
+        return tensor / tensor.std() / 2
+    return 40 * tensor if name == "pool.conv.weight" else tensor
 
 
 def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
@@ -173,8 +182,8 @@ def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
     yield "vgg16_places365", random_checkpoint(places365_shapes(full=False))
-    yield "patchnetvlad_mapillary_128", netvlad_checkpoint(16, 128)
-    yield "cosplace_vgg16_512", gem_checkpoint("vgg16", 512)
+    yield "patchnetvlad_mapillary_128", random_checkpoint(netvlad_shapes(16, 128))
+    yield "cosplace_vgg16_512", random_checkpoint(gem_shapes("vgg16", 512))
     for path in sorted([*ALIKED.glob("*.pth"), *LIGHTGLUE.parent.glob(LIGHTGLUE.name)]):
         yield path.stem, read_checkpoint(path)
 
@@ -219,17 +228,6 @@ def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> Shapes:
     return shapes | (with_biases({"WPCA.0": (outputs, 512 * clusters, 1, 1)}) if outputs else {})
 
 
-def netvlad_checkpoint(clusters: int = 16, outputs: int | None = 4096, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random weights that assign as decidedly as published ones."""
-    tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
-    return tensors | {"pool.conv.weight": 40 * tensors["pool.conv.weight"]}
-
-
-def gem_checkpoint(backbone: str = "resnet50", outputs: int = 2048, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random weights with a power as of published ones."""
-    return random_checkpoint(gem_shapes(backbone, outputs), seed) | {"aggregation.1.p": np.float32([2.875])}
-
-
 def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> Shapes:
     """The tensors of CosPlace's checkpoints."""
     channels = {"vgg16": 512, "resnet50": 2048}[backbone]
@@ -268,17 +266,6 @@ def selavpr_shapes(width: int = 1024, depth: int = 24, registers: int = 0, prefi
     return backbone | {f"{prefix}{name}": shape for name, shape in head.items()}
 
 
-def transformer_checkpoint(shapes: Shapes, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random weights of these tensors, in which positions and registers count as much as the patches do."""
-    tensors = random_checkpoint(shapes, seed)
-    for name, tensor in tensors.items():
-        if name.endswith(("pos_embed", "register_tokens")):
-            tensors[name] = tensor / tensor.std() / 2
-        if name.endswith("aggregation.1.p"):
-            tensors[name] = np.float32([2.875])
-    return tensors
-
-
 def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> Shapes:
     """The arrays of the original's files, as they are read."""
     weights = {}
@@ -292,7 +279,7 @@ def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> Shapes:
 
 def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> dict[str, Any]:
     """Content of the original's files, as SciPy writes it: `net.layers{i}.weights{j}` and the average image."""
-    tensors = netvlad_checkpoint(clusters, outputs, seed)
+    tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
     weights = {position: [tensors[f"encoder.{position}.weight"].transpose(2, 3, 1, 0),
                           tensors[f"encoder.{position}.bias"][None]] for position in _VGG16}  # fmt: skip
     weights[30] = [tensors["pool.conv.weight"][:, :, 0, 0].T, -tensors["pool.centroids"].T]
@@ -361,6 +348,27 @@ def lightglue_shapes(inputs: int = 128, width: int = 256, layers: int = 9, heads
                    (("final_proj", width), ("matchability", 1))}  # fmt: skip
     linear |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
     return shapes | with_biases(linear)
+
+
+def aliked_shapes(widths: tuple[int, ...] = (8, 16, 32, 64), dimension: int = 64, positions: int = 16) -> Shapes:
+    """The tensors of ALIKED's checkpoints, by default of aliked-t16."""
+    shapes, biased = {}, {}
+    for block, (inputs, outputs) in enumerate(pairwise((3, *widths)), start=1):
+        for place, channels in ((1, inputs), (2, outputs)):
+            conv = f"block{block}.conv{place}"
+            if block > 2:
+                biased[f"{conv}.offset_conv"] = (18, channels, 3, 3)
+                conv += ".regular_conv"
+            shapes |= {f"{conv}.weight": (outputs, channels, 3, 3)} | _norm(f"block{block}.bn{place}", outputs)
+        if block > 1:
+            biased[f"block{block}.downsample"] = (outputs, inputs, 1, 1)
+        shapes[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
+    for place, size in {0: (8, dimension, 1, 1), 2: (4, 8, 3, 3), 4: (4, 4, 3, 3), 6: (1, 4, 3, 3)}.items():
+        shapes[f"score_head.{place}.weight"] = size
+    head, moves = "desc_head", 2 * positions
+    biased |= {f"{head}.offset_conv.0": (moves, dimension, 3, 3), f"{head}.offset_conv.2": (moves, moves, 1, 1)}
+    shapes[f"{head}.sf_conv.weight"] = (dimension, dimension, 1, 1)
+    return shapes | {f"{head}.agg_weights": (positions, dimension, dimension)} | with_biases(biased)
 
 
 def _norm(prefix: str, width: int) -> Shapes:

@@ -1,6 +1,7 @@
 """Tables from the keys of published checkpoints to the parameters of our networks."""
 
 from collections.abc import Mapping
+from functools import partial
 from itertools import chain
 
 from mfvpr.checkpoints.conversion import Layout, Rule, Table
@@ -12,8 +13,7 @@ def _linear(source: str, target: str, layout: Layout = Layout.LINEAR) -> tuple[R
     return Rule(rf"{source}\.weight", f"{target}.kernel", layout), Rule(rf"{source}\.bias", f"{target}.bias")
 
 
-def _convolution(source: str, target: str) -> tuple[Rule, ...]:
-    return _linear(source, target, Layout.CONV)
+_convolution = partial(_linear, layout=Layout.CONV)
 
 
 def _norm(source: str, target: str) -> tuple[Rule, ...]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,12 +12,11 @@ from jax import Array
 from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compile_network, in_batches, local_features, require_size
+from mfvpr.features.extractor import Description, Scale, local_features
+from mfvpr.features.network import compile_network, in_batches, require_at_least, require_size
 from mfvpr.networks.aliked import Aliked
 from mfvpr.networks.aliked_detection import RADIUS, Detections
 from mfvpr.types import Features
-from mfvpr.utils.errors import InputError
 
 _SMALLEST = 2 * RADIUS + 1  # px: one pixel within the border, which has no keypoints
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
@@ -51,9 +50,7 @@ class AlikedFeatures:
     batch_size: int = field(default=8, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
-        if min(self.image_size) < _SMALLEST:
-            width, height = self.image_size
-            raise InputError(f"ALIKED: expected images of {_SMALLEST} x {_SMALLEST} px or more, got {width} x {height}")
+        require_at_least("ALIKED", self.image_size, _SMALLEST)
 
     @property
     def scales(self) -> tuple[Scale, ...]:
@@ -72,10 +69,12 @@ class AlikedFeatures:
         require_size("ALIKED", images, self.image_size)
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         extracted = in_batches(self._program(usual), images, self.batch_size)
-        crowded = [row for row, (detections, _) in enumerate(extracted) if detections.count > usual]
+        counts = [int(detections.count) for detections, _ in extracted]
+        crowded = [row for row, count in enumerate(counts) if count > usual]
         if crowded and usual < self._limit:
-            most = max(int(extracted[row][0].count) for row in crowded)
-            capacity = min(self._limit, 1 << (most - 1).bit_length())  # powers of two: few programs for all images
+            capacity = min(
+                self._limit, 1 << (max(counts) - 1).bit_length()
+            )  # powers of two: few programs for all images
             again = in_batches(self._program(capacity), images[crowded], self.batch_size)
             for row, result in zip(crowded, again, strict=True):
                 extracted[row] = result
@@ -90,13 +89,10 @@ class AlikedFeatures:
     def _program(self) -> Callable[[int], Callable[[Any], Any]]:
         """The compiled network for a number of keypoint slots."""
 
-        def program(capacity: int) -> Callable[[Any], Any]:
-            def extract(model: Aliked, images: Array) -> tuple[Detections, Array]:
-                return model.extract(images.astype(jnp.float32) / 255, self.threshold, capacity)
+        def extract(model: Aliked, images: Array, *, capacity: int) -> tuple[Detections, Array]:
+            return model.extract(images.astype(jnp.float32) / 255, self.threshold, capacity)
 
-            return compile_network(self.model, extract)
-
-        return cache(program)
+        return cache(lambda capacity: compile_network(self.model, partial(extract, capacity=capacity)))
 
     def _features(self, detections: Detections, descriptors: Float[np.ndarray, "slots dimensions"]) -> Features:
         keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Num
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compile_network, in_batches, local_features, require_size
+from mfvpr.features.extractor import Description, Scale, local_features
+from mfvpr.features.network import compile_network, in_batches, require_at_least, require_size
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.types import Features
-from mfvpr.utils.errors import InputError
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth
 _SMALLEST_MAP = 2
@@ -50,12 +49,7 @@ class D2NetFeatures:
 
     def __post_init__(self) -> None:
         smallest = round((_SMALLEST_MAP + 1) * STRIDE / min(self._network_scales))
-        if min(self.image_size) < smallest:
-            width, height = self.image_size
-            scales = ", multi-scale" if self.multiscale else ""
-            raise InputError(
-                f"D2-Net{scales}: expected images of {smallest} x {smallest} px or more, got {width} x {height}"
-            )
+        require_at_least("D2-Net, multi-scale" if self.multiscale else "D2-Net", self.image_size, smallest)
 
     @property
     def scales(self) -> tuple[Scale, ...]:

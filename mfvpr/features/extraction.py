@@ -2,8 +2,8 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 
+import jax
 import numpy as np
 from jaxtyping import Num
 
@@ -108,6 +108,4 @@ def _readable_images(
 
 
 def _is_finite(description: Description) -> bool:
-    arrays = [getattr(local, part.name) for local in description.local for part in fields(local)]
-    arrays += [] if description.vector is None else [description.vector]
-    return all(np.isfinite(array).all() for array in arrays)
+    return all(np.isfinite(array).all() for array in jax.tree.leaves(description))

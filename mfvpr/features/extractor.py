@@ -48,6 +48,22 @@ class Description(NamedTuple):
         return self.local[0]
 
 
+def local_features(
+    keypoints: Num[np.ndarray, "keypoints 2"],
+    descriptors: Float[np.ndarray, "keypoints dimensions"],
+    image_size: Sequence[int],
+    scores: Float[np.ndarray, " keypoints"] | None = None,
+) -> Features:
+    """Features of one image without padding, from keypoints (x, y) px; scores are 1 by default."""
+    return Features(
+        keypoints=keypoints.astype(np.float32),
+        descriptors=descriptors,
+        scores=np.ones(len(keypoints), np.float32) if scores is None else scores,
+        mask=np.ones(len(keypoints), bool),
+        image_size=np.array(image_size, np.float32),
+    )
+
+
 @runtime_checkable
 class Extractor(Protocol):
     """Images, uint8 RGB -> a Description of each.

@@ -81,7 +81,7 @@ class GlobalDescriptor:
             InputError: the images do not have `image_size`.
         """
         require_size(type(self.model).__name__, images, self.image_size)
-        return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
+        return [Description(vector) for vector in in_batches(self._program, images, self.batch_size)]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

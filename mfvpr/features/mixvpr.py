@@ -43,7 +43,7 @@ class MixVprDescriptor:
             InputError: the images have another size.
         """
         require_size("MixVPR", images, IMAGE_SIZE)
-        return [Description(np.asarray(vector)) for vector in in_batches(self._program, images, self.batch_size)]
+        return [Description(vector) for vector in in_batches(self._program, images, self.batch_size)]
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

@@ -6,9 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 from flax import nnx
-from jaxtyping import Float, Num
+from jaxtyping import Num
 
-from mfvpr.types import Features
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import device_bytes
@@ -36,20 +35,10 @@ def require_size(name: str, images: Num[np.ndarray, "images height width 3"], si
         raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
 
 
-def local_features(
-    keypoints: Num[np.ndarray, "keypoints 2"],
-    descriptors: Float[np.ndarray, "keypoints dimensions"],
-    image_size: tuple[int, int],
-    scores: Float[np.ndarray, " keypoints"] | None = None,
-) -> Features:
-    """Features of one image without padding, from keypoints (x, y) px; scores are 1 by default."""
-    return Features(
-        keypoints=keypoints.astype(np.float32),
-        descriptors=descriptors,
-        scores=np.ones(len(keypoints), np.float32) if scores is None else scores,
-        mask=np.ones(len(keypoints), bool),
-        image_size=np.array(image_size, np.float32),
-    )
+def require_at_least(name: str, size: tuple[int, int], smallest: int) -> None:
+    """Raise an InputError if images of this (width, height) are smaller than `smallest` px."""
+    if min(size) < smallest:
+        raise InputError(f"{name}: expected images of {smallest} x {smallest} px or more, got {size[0]} x {size[1]}")
 
 
 def in_batches(

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compile_network, in_batches, local_features, require_network, require_size
+from mfvpr.features.extractor import Description, Scale, local_features
+from mfvpr.features.network import compile_network, in_batches, require_network, require_size
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
 from mfvpr.types import Features

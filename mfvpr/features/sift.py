@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
+from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.types import Features
 
 
@@ -50,13 +50,7 @@ class Sift:
         strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
         keypoints = np.array([keypoint.pt for keypoint in detections], np.float32).reshape(-1, 2)
         descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
-        return Features(
-            keypoints=keypoints[strongest],
-            descriptors=_root(descriptors[strongest]),
-            scores=scores[strongest],
-            mask=np.ones(len(strongest), bool),
-            image_size=np.array(gray.shape[::-1], np.float32),
-        )
+        return local_features(keypoints[strongest], _root(descriptors[strongest]), gray.shape[::-1], scores[strongest])
 
 
 def _root(descriptors: Float[np.ndarray, "keypoints 128"]) -> Float[np.ndarray, "keypoints 128"]:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description, Scale
-from mfvpr.features.network import compile_network, in_batches, local_features
+from mfvpr.features.extractor import Description, Scale, local_features
+from mfvpr.features.network import compile_network, in_batches
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
@@ -73,6 +73,18 @@ class SsmMaps:
         return compile_network(self.model, self.compute)
 
 
+def _whitening_program(extractor: "SsmWindows | SsmCells") -> Callable[..., Any]:
+    """Compile images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
+    maps, windows = extractor.maps, extractor.windows
+    convolution = jax.device_put(kernels(learned_whitening(extractor), windows))
+
+    def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
+        return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
+
+    program = compile_network(extractor.model, describe)
+    return lambda images: program(images, *convolution)
+
+
 @dataclass(frozen=True)
 class SsmWindows:
     """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
@@ -118,9 +130,7 @@ class SsmWindows:
         """
         return [Description(vectors.reshape(-1)) for vectors in in_batches(self._program, images, self.batch_size)]
 
-    @cached_property
-    def _program(self) -> Callable[..., Any]:
-        return _whitening_program(self)
+    _program = cached_property(_whitening_program)
 
 
 @dataclass(frozen=True)
@@ -184,18 +194,4 @@ class SsmCells:
             for descriptors in in_batches(self._program, images, self.batch_size)
         ]
 
-    @cached_property
-    def _program(self) -> Callable[..., Any]:
-        return _whitening_program(self)
-
-
-def _whitening_program(extractor: SsmWindows | SsmCells) -> Callable[..., Any]:
-    """Compile images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
-    maps, windows = extractor.maps, extractor.windows
-    convolution = jax.device_put(kernels(learned_whitening(extractor), windows))
-
-    def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
-        return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
-
-    program = compile_network(extractor.model, describe)
-    return lambda images: program(images, *convolution)
+    _program = cached_property(_whitening_program)

@@ -5,8 +5,6 @@ concatenated: a feature for each pixel. Descriptors are sampled from the feature
 Four small convolutions turn the features into a score map, whose peaks are the keypoints (`aliked_detection`).
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,19 +23,11 @@ _POOLING = (1, 2, 4, 4)  # factors before the blocks
 _PIXELS = 4  # per step of `_narrow`; divides STRIDE
 
 
-class Variant(NamedTuple):
-    """Sizes of a published network: widths of its blocks, numbers and sampling positions of a descriptor."""
-
-    widths: tuple[int, int, int, int]
-    dimension: int
-    positions: int
-
-
-VARIANTS = {
-    "aliked-t16": Variant((8, 16, 32, 64), 64, 16),
-    "aliked-n16": Variant((16, 32, 64, 128), 128, 16),
-    "aliked-n16rot": Variant((16, 32, 64, 128), 128, 16),
-    "aliked-n32": Variant((16, 32, 64, 128), 128, 32),
+VARIANTS = {  # published networks: widths of the blocks, numbers and sampling positions of a descriptor
+    "aliked-t16": ((8, 16, 32, 64), 64, 16),
+    "aliked-n16": ((16, 32, 64, 128), 128, 16),
+    "aliked-n16rot": ((16, 32, 64, 128), 128, 16),
+    "aliked-n32": ((16, 32, 64, 128), 128, 32),
 }
 
 

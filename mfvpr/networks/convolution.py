@@ -68,16 +68,12 @@ class Conv3x3(nnx.Module):
             x: the input.
             uniform: whether equal neighborhoods must give equal bits, which takes 1.5 times as long.
         """
-
-        def direct(x: Array, kernel: Array) -> Array:
-            return _convolve(x, kernel, self.dilation, self.dilation, self.precision)
+        kernel, options = self.kernel[...], {"dilation": self.dilation, "precision": self.precision}
+        direct, on_cpu = partial(_convolve, above=self.dilation, **options), partial(winograd, **options)
 
         def fast(x: Array, kernel: Array) -> Array:
-            return lax.cond(
-                uniform, direct, partial(winograd, dilation=self.dilation, precision=self.precision), x, kernel
-            )
+            return lax.cond(uniform, direct, on_cpu, x, kernel)
 
-        kernel = self.kernel[...]
         is_wide = x.shape[-1] >= _WIDE
         product = lax.platform_dependent(x, kernel, cpu=fast, default=direct) if is_wide else direct(x, kernel)
         return product + self.bias[...][None, None, None]

@@ -1,6 +1,5 @@
 """Generalized mean pooling (Radenovic et al., TPAMI 2019) on VGG16 or ResNet-50, as in CosPlace (CVPR 2022)."""
 
-from functools import partial
 from typing import Literal
 
 import jax.numpy as jnp
@@ -52,7 +51,7 @@ class Gem(nnx.Module):
         self.has_components = False
 
     require = staticmethod(require_position)
-    preprocess = staticmethod(partial(preprocess, preprocessing="torch"))
+    preprocess = staticmethod(preprocess)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""

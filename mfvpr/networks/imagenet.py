@@ -16,7 +16,7 @@ Pixels = Num[Array, "batch height width 3"]  # RGB, 0 .. 255, uint8 or float32
 Images = Float[Array, "batch height width 3"]  # inputs of networks
 
 
-def preprocess(images: Pixels, preprocessing: Preprocessing) -> Images:
+def preprocess(images: Pixels, preprocessing: Preprocessing = "torch") -> Images:
     """RGB images from 0 to 255 -> inputs of the network, float32.
 
     "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, divided by the standard deviation. Results

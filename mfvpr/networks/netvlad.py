@@ -102,7 +102,7 @@ class VggNetVlad(nnx.Module):
         """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         if self.original:
             return images.astype(jnp.float32) - self.average[...][None, None, None]
-        return preprocess(images, "torch")
+        return preprocess(images)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""

@@ -33,14 +33,11 @@ class AdaptedBlock(Block):
         super().__init__(width, heads, precision=precision, rngs=rngs)
         self.serial, self.parallel = (Adapter(width, precision=precision, rngs=rngs) for _ in range(2))
 
-    def attention_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        """z + adapter(z), with the attention's output z."""
-        output = super().attention_update(x)
-        return output + self.serial(output)
-
-    def perceptron_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        """perceptron(x) + 0.2 adapter(x)."""
-        return super().perceptron_update(x) + _PARALLEL * self.parallel(x)
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
+        scale1, attended = self.scale1[...][None, None], self.attention(self.norm1(x))
+        x = x + scale1 * (attended + self.serial(attended))
+        scale2, normalized = self.scale2[...][None, None], self.norm2(x)
+        return x + scale2 * (self.perceptron(normalized) + _PARALLEL * self.parallel(normalized))
 
 
 class Upsampling(nnx.Module):

@@ -7,7 +7,7 @@ before their ReLU. Pooling rounds sizes up, so a map has ceil(H / stride) x ceil
 from flax import nnx
 from jaxtyping import Float
 
-from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, preprocess
+from mfvpr.networks.imagenet import Images, preprocess
 from mfvpr.networks.vgg import Vgg16
 from mfvpr.types import Array
 
@@ -25,6 +25,8 @@ class SsmVgg(nnx.Module):
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
         self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
 
+    preprocess = staticmethod(preprocess)  # published with "torch", although the weights were trained with "caffe"
+
     def __call__(self, images: Images) -> tuple[Float[Array, "batch _ _ 512"], Float[Array, "batch _ _ 512"]]:
         """`stage1` and `stage2` of the same images, in one pass."""
         first, second = self.vgg.maps(images, (STAGE1_LAYER, STAGE2_LAYER))
@@ -38,11 +40,3 @@ class SsmVgg(nnx.Module):
         """The second map of preprocessed images."""
         (second,) = self.vgg.maps(images, (STAGE2_LAYER,))
         return second
-
-    @staticmethod
-    def preprocess(images: Pixels, preprocessing: Preprocessing = "torch") -> Images:
-        """RGB images from 0 to 255 -> inputs of the stages, float32; see `mfvpr.networks.imagenet`.
-
-        The published code uses "torch", although its weights were trained with "caffe".
-        """
-        return preprocess(images, preprocessing)

@@ -1,6 +1,5 @@
 """Vision transformers (Dosovitskiy et al., ICLR 2021) as in DINOv2 (Oquab et al., TMLR 2024)."""
 
-from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -80,7 +79,7 @@ class Perceptron(nnx.Module):
 
 
 class Block(nnx.Module):
-    """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x)); subclasses may override both terms."""
+    """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x))."""
 
     def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
         self.norm1, self.norm2 = (_norm(width, rngs) for _ in range(2))
@@ -89,16 +88,8 @@ class Block(nnx.Module):
         self.scale1, self.scale2 = (nnx.Param(jnp.ones(width, jnp.float32)) for _ in range(2))
 
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        x = x + self.scale1[...][None, None] * self.attention_update(self.norm1(x))
-        return x + self.scale2[...][None, None] * self.perceptron_update(self.norm2(x))
-
-    def attention_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        """Attention of normalized tokens, before the scale."""
-        return self.attention(x)
-
-    def perceptron_update(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        """Perceptron of normalized tokens, before the scale."""
-        return self.perceptron(x)
+        x = x + self.scale1[...][None, None] * self.attention(self.norm1(x))
+        return x + self.scale2[...][None, None] * self.perceptron(self.norm2(x))
 
 
 class VisionTransformer(nnx.Module):
@@ -131,7 +122,7 @@ class VisionTransformer(nnx.Module):
         self.width = width
         self.precision = precision
 
-    preprocess = staticmethod(partial(preprocess, preprocessing="torch"))
+    preprocess = staticmethod(preprocess)
 
     def __call__(self, images: Images) -> Tokens:
         """Normalized tokens of preprocessed images."""

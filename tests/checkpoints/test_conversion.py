@@ -20,6 +20,9 @@ PUBLIC = {
     "d2_tf": d2net_shapes(),
     "mixvpr_4096": mixvpr_shapes(1024, 4), "mixvpr_512": mixvpr_shapes(256, 2), "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
+    "aliked-t16": checkpoints.aliked_shapes(),
+    **{f"aliked-n{kind}": checkpoints.aliked_shapes((16, 32, 64, 128), 128, positions)
+       for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))},
     "aliked_lightglue": checkpoints.lightglue_shapes(),
     **{f"patchnetvlad_mapillary_{outputs}": checkpoints.netvlad_shapes(16, outputs) for outputs in (4096, 512, 128)},
     **{f"patchnetvlad_pitts_{outputs}": checkpoints.netvlad_shapes(64, outputs) for outputs in (4096, 512, 128)},

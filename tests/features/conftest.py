@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from tests.networks.conftest import golden  # noqa: F401  (a fixture)
 from tests.programs import typed
 
 

@@ -10,7 +10,6 @@ import pytest
 import mfvpr
 from experiments import stages
 from mfvpr.checkpoints.networks import plan_network
-from mfvpr.checkpoints.tables import NETVLAD
 from mfvpr.datasets import folder_dataset
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
@@ -21,9 +20,8 @@ from mfvpr.utils import InputError
 from tests.features.conftest import read_rows
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
-from tests.networks.checkpoints import fill
+from tests.networks.checkpoints import fill_netvlad
 from tests.programs import results
-from tests.random_checkpoints import netvlad_checkpoint
 
 pytestmark = pytest.mark.thorough
 
@@ -41,7 +39,7 @@ SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
 
 @pytest.fixture(scope="module")
 def model():
-    return fill(partial(VggNetVlad, 4, 16), NETVLAD, netvlad_checkpoint(4, 16))
+    return fill_netvlad(4, 16)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from mfvpr.checkpoints import networks
 from mfvpr.checkpoints.tables import DINOV2, SELAVPR
 from mfvpr.networks import SelaVpr, VisionTransformer
 from tests.features.conftest import read_rows
-from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint, write_zip
+from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes, write_zip
 
 
 def training(tensors):
@@ -40,7 +40,7 @@ def program(run_program, street_settings, tmp_path, monkeypatch):
 
 
 def checkpoint(folder, name="SelaVPR_msls", registers=0):
-    tensors = transformer_checkpoint(selavpr_shapes(64, 1, registers))
+    tensors = random_checkpoint(selavpr_shapes(64, 1, registers))
     return write_zip(folder / f"{name}.pth", training(tensors))
 
 
@@ -80,7 +80,7 @@ def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("pooling", ["cls", "gem"])
 def test_dinov2_is_a_retriever(program, tmp_path, pooling):
-    tensors = transformer_checkpoint(dinov2_shapes(64, 1))
+    tensors = random_checkpoint(dinov2_shapes(64, 1))
     program("weights", "convert", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
     options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
     small = "features.max_keypoints=50", "candidates=5", "figures=0"
@@ -91,7 +91,7 @@ def test_dinov2_is_a_retriever(program, tmp_path, pooling):
 
 
 def test_wrong_weights_are_told(program, tmp_path):
-    path = write_zip(tmp_path / "SelaVPR_msls.pth", transformer_checkpoint(dinov2_shapes(64, 1)))
+    path = write_zip(tmp_path / "SelaVPR_msls.pth", random_checkpoint(dinov2_shapes(64, 1)))
     assert "expected the keys of another network, got those of dinov2" in program("weights", "convert", path, code=2)
     stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf", code=2)
     assert "features.weights=d2_tf: expected weights of selavpr: one of selavpr_pitts30k" in stderr

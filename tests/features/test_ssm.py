@@ -14,7 +14,7 @@ from mfvpr.datasets import ImageFolder, folder_dataset, sequences_dataset
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
-from mfvpr.features.network import local_features
+from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matching import Matching

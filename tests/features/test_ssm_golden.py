@@ -8,7 +8,7 @@ import mfvpr
 from mfvpr import GridAnchors, Shortlist
 from mfvpr.datasets import resize
 from mfvpr.features import WindowFitting
-from mfvpr.features.network import local_features
+from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation
@@ -26,11 +26,6 @@ SIZES = 9, 3
 project = jax.jit(whiten_windows, static_argnames="stride")
 score = jax.jit(lambda scorer, matches: scorer(matches))
 match = jax.jit(mfvpr.match, static_argnames="cross_check")
-
-
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(make_ssm.GOLDEN))
 
 
 def described(maps, stage, num_database):

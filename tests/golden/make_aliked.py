@@ -1,4 +1,4 @@
-"""Makes aliked.npz: what the public code finds. `python -m tests.golden.make_aliked CLONE WEIGHTS IMAGES`
+"""Makes aliked.npz: what the public code finds. `python -m tests.golden aliked CLONE WEIGHTS IMAGES`
 
 CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of its files, IMAGES that of grief_season.
 What the public code uses of torchvision and of its own compiled operator is written out here.
@@ -14,7 +14,7 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.datasets import read_image, resize
 from tests.golden.make_d2net import projections, samples, texture
 from tests.golden.torch_networks import fill, replace_module
-from tests.random_checkpoints import random_checkpoint
+from tests.random_checkpoints import aliked_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "aliked.npz"
 
@@ -47,38 +47,9 @@ REAL = (
 DRAWN = Case("aliked-t16", 300, 200, None, 0.99)
 
 
-def smallest_shapes() -> dict[str, tuple[int, ...]]:
-    """The tensors of aliked-t16's checkpoint."""
-    widths, positions, dimension = (8, 16, 32, 64), 16, 64
-    tensors: dict[str, tuple[int, ...]] = {}
-    for block, (inputs, outputs) in enumerate(zip((3, *widths), widths, strict=False), start=1):
-        for place, channels in ((1, inputs), (2, outputs)):
-            conv = f"block{block}.conv{place}"
-            if block > 2:
-                tensors |= {f"{conv}.offset_conv.weight": (18, channels, 3, 3), f"{conv}.offset_conv.bias": (18,)}
-                conv += ".regular_conv"
-            tensors[f"{conv}.weight"] = (outputs, channels, 3, 3)
-            names = ("weight", "bias", "running_mean", "running_var")
-            tensors |= {f"block{block}.bn{place}.{name}": (outputs,) for name in names}
-            tensors[f"block{block}.bn{place}.num_batches_tracked"] = ()
-        if block > 1:
-            tensors[f"block{block}.downsample.weight"] = (outputs, inputs, 1, 1)
-            tensors[f"block{block}.downsample.bias"] = (outputs,)
-        tensors[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
-    for place, size in {0: (8, dimension, 1, 1), 2: (4, 8, 3, 3), 4: (4, 4, 3, 3), 6: (1, 4, 3, 3)}.items():
-        tensors[f"score_head.{place}.weight"] = size
-    head = "desc_head.offset_conv"
-    tensors |= {f"{head}.0.weight": (2 * positions, dimension, 3, 3), f"{head}.0.bias": (2 * positions,)}
-    tensors |= {f"{head}.2.weight": (2 * positions, 2 * positions, 1, 1), f"{head}.2.bias": (2 * positions,)}
-    return tensors | {
-        "desc_head.sf_conv.weight": (dimension, dimension, 1, 1),
-        "desc_head.agg_weights": (positions, dimension, dimension),
-    }
-
-
 def checkpoint(case: Case, weights: Path) -> dict[str, np.ndarray]:
     """The case's weights, by the public names."""
-    return read_checkpoint(weights / f"{case.variant}.pth") if case.image else random_checkpoint(smallest_shapes())
+    return read_checkpoint(weights / f"{case.variant}.pth") if case.image else random_checkpoint(aliked_shapes())
 
 
 def picture(case: Case, images: Path) -> np.ndarray:
@@ -141,7 +112,7 @@ def _stubs() -> None:
     torch.cuda.synchronize = lambda *_: None
 
 
-def main(clone: str, weights: str, images: str) -> None:
+def main(clone: str, weights: str, images: str) -> dict[str, np.ndarray]:
     sys.path.insert(0, clone)
     _stubs()
     import torch
@@ -165,8 +136,4 @@ def main(clone: str, weights: str, images: str) -> None:
             f"{case}/projections": projections(result["descriptors"]),
         }
         print(f"{case}: {len(result['scores'])} keypoints")
-    np.savez_compressed(GOLDEN, **golden)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    return golden

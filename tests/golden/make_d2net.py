@@ -1,4 +1,4 @@
-"""Makes d2net.npz: what the public code finds with random weights. `python -m tests.golden.make_d2net CLONE`
+"""Makes d2net.npz: what the public code finds with random weights. `python -m tests.golden d2net CLONE`
 
 CLONE is a clone of https://github.com/mihaidusmanu/d2-net.
 """
@@ -87,7 +87,7 @@ def projections(descriptors: np.ndarray) -> np.ndarray:
     return (descriptors @ (directions / np.linalg.norm(directions, axis=0))).astype(np.float32)
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     sys.path.insert(0, clone)
     import torch
     from lib.model_test import D2Net
@@ -110,8 +110,4 @@ def main(clone: str) -> None:
             f"{case}/projections": projections(descriptors),
         }
         print(f"{case}: {len(scores)} keypoints")
-    np.savez_compressed(GOLDEN, **golden)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+    return golden

@@ -1,4 +1,4 @@
-"""Makes lightglue.npz: what the public code computes. `python -m tests.golden.make_lightglue CLONE WEIGHTS`
+"""Makes lightglue.npz: what the public code computes. `python -m tests.golden lightglue CLONE WEIGHTS`
 
 CLONE is a clone of https://github.com/cvg/LightGlue, whose matcher is run in float64 without pruning: small networks of
 random weights, and the published ones for ALIKED, WEIGHTS.
@@ -47,7 +47,7 @@ def pair(counts: tuple[int, int], inputs: int, seed: int) -> tuple[Features, Fea
     return first, second
 
 
-def main(clone: str, weights: str) -> None:
+def main(clone: str, weights: str) -> dict[str, np.ndarray]:
     golden = {}
     for seed in SEEDS:
         for counts in SIZES:
@@ -60,7 +60,7 @@ def main(clone: str, weights: str) -> None:
     real = read_checkpoint(Path(weights))
     for counts in REAL:
         golden[f"real/{counts}"] = _computed(clone, real, pair(counts, 128, 0))[0].astype(np.float32)
-    np.savez_compressed(GOLDEN, **golden)
+    return golden
 
 
 def _computed(clone, tensors, features, **options) -> tuple[np.ndarray, int]:
@@ -99,7 +99,3 @@ def as_tensors(features):
 
     sides = [{name: getattr(image, name) for name in ("keypoints", "descriptors", "image_size")} for image in features]
     return [{name: torch.tensor(array)[None].double() for name, array in side.items()} for side in sides]
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

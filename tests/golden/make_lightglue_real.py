@@ -1,13 +1,12 @@
 """Makes lightglue_real.npz: ALIKED's features of photographs, and what the public code matches.
 
-    python -m tests.golden.make_lightglue_real CLONE WEIGHTS DATA
+    python -m tests.golden lightglue_real CLONE WEIGHTS DATA
 
 CLONE is a clone of https://github.com/cvg/LightGlue, WEIGHTS the published ones for ALIKED, DATA a folder that has
 grief_season and corridor; aliked-n16 is installed. The file has features, no image. The matcher runs in float64
 without pruning.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,7 @@ def features(golden: dict[str, np.ndarray], pair: str) -> list[Features]:
     return images
 
 
-def main(clone: str, weights: str, data: str) -> None:
+def main(clone: str, weights: str, data: str) -> dict[str, np.ndarray]:
     extractor = AlikedFeatures(load_model("aliked-n16"), image_size=SIZE, max_keypoints=KEYPOINTS)  # pyright: ignore[reportArgumentType]
     network, golden = public(clone, read_checkpoint(Path(weights))), {}
     for pair in PAIRS:
@@ -52,8 +51,4 @@ def main(clone: str, weights: str, data: str) -> None:
         result = network({"image0": matched[0], "image1": matched[1]})
         golden[f"{pair}/matches"] = result["matches"][0].numpy().astype(np.int32)
         golden[f"{pair}/scores"] = result["scores"][0].numpy().astype(np.float32)
-    np.savez_compressed(GOLDEN, **golden)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    return golden

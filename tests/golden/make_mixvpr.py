@@ -1,4 +1,4 @@
-"""Makes mixvpr.npz: what the public code computes with random weights. `python -m tests.golden.make_mixvpr CLONE`
+"""Makes mixvpr.npz: what the public code computes with random weights. `python -m tests.golden mixvpr CLONE`
 
 CLONE is a clone of https://github.com/amaralibey/MixVPR, whose aggregator is run, on top of a ResNet-50 in plain torch;
 both in float64, so that the file holds no rounding errors but its own.
@@ -32,7 +32,7 @@ def faint_maps() -> np.ndarray:
     return ((row * (channel % 13 + 1) + column * (channel % 7 + 2)) % 17).astype(np.float32)[None] / 8192
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     import torch
 
     golden = {}
@@ -40,7 +40,7 @@ def main(clone: str) -> None:
         for channels, rows in SIZES:
             checkpoint = random_checkpoint(mixvpr_shapes(channels, rows))
             golden |= _computed(clone, channels, rows, {key: torch.tensor(array) for key, array in checkpoint.items()})
-    np.savez_compressed(GOLDEN, **{name: array.astype(np.float32) for name, array in golden.items()})
+    return {name: array.astype(np.float32) for name, array in golden.items()}
 
 
 def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict[str, np.ndarray]:
@@ -69,7 +69,3 @@ def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict
             mixed = mixer(mixed)
             golden[f"mixer{place}"] = samples(mixed.numpy())
     return {name: np.asarray(array) for name, array in golden.items()}
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -1,6 +1,6 @@
 """Makes netvlad.npz: global descriptors and patches of public codes with random weights, in float64.
 
-`python -m tests.golden.make_netvlad PATCHNETVLAD HLOC COSPLACE TORCHVISION` with clones of
+`python -m tests.golden netvlad PATCHNETVLAD HLOC COSPLACE TORCHVISION` with clones of
 https://github.com/QVPR/Patch-NetVLAD, https://github.com/cvg/Hierarchical-Localization and
 https://github.com/gmberton/CosPlace, and a folder that holds torchvision's package, of which Python's files are enough.
 """
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tests.golden.torch_networks import fill, replace_module
-from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+from tests.random_checkpoints import gem_shapes, matlab_netvlad, netvlad_shapes, random_checkpoint, write_matlab
 
 GOLDEN = Path(__file__).parent / "netvlad.npz"
 SAMPLES = 1000
@@ -49,7 +49,7 @@ def name(*case: Any) -> str:
     return "/".join(map(str, case))
 
 
-def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None:
+def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> dict[str, np.ndarray]:
     import torch
 
     _torchvision(torchvision)
@@ -58,7 +58,7 @@ def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> None
         golden = dict(_patches(patch_netvlad)) | dict(_positions())
         golden[name("matlab", *MATLAB)] = _matlab(hloc)
         golden |= {name("gem", *case): _gem(cosplace, *case) for case in GEM}
-    np.savez_compressed(GOLDEN, **{key: array.astype(np.float32) for key, array in golden.items()})
+    return {key: array.astype(np.float32) for key, array in golden.items()}
 
 
 def _torchvision(folder: str) -> None:
@@ -102,7 +102,7 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
         }  # fmt: skip
         channels, encoder = get_backend()
         model = get_model(encoder, channels, config["global_params"], append_pca_layer=outputs is not None)
-        fill(model, netvlad_checkpoint(clusters, outputs, seed)).double()
+        fill(model, random_checkpoint(netvlad_shapes(clusters, outputs), seed)).double()
         torch.set_default_dtype(torch.float64)
         encoded = model.pool(model.encoder(normalized(size)))  # pyright: ignore
         torch.set_default_dtype(torch.float32)
@@ -155,9 +155,5 @@ def _gem(clone: str, backbone: str, outputs: int, size: tuple[int, int], seed: i
     from cosplace_model.cosplace_network import GeoLocalizationNet
 
     public = {"vgg16": "VGG16", "resnet50": "ResNet50"}[backbone]
-    model = fill(GeoLocalizationNet(public, outputs), gem_checkpoint(backbone, outputs, seed))
+    model = fill(GeoLocalizationNet(public, outputs), random_checkpoint(gem_shapes(backbone, outputs), seed))
     return model.double()(normalized(size)).numpy()[0]
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

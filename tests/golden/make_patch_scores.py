@@ -1,6 +1,6 @@
 """Makes patch_scores.npz: how Patch-NetVLAD's code scores pairs by patches of three sizes, and ranks candidates.
 
-`python -m tests.golden.make_patch_scores CLONE` with a clone of https://github.com/QVPR/Patch-NetVLAD.
+`python -m tests.golden patch_scores CLONE` with a clone of https://github.com/QVPR/Patch-NetVLAD.
 """
 
 import sys
@@ -38,9 +38,9 @@ def descriptors(patch: int) -> tuple[np.ndarray, np.ndarray]:
     return every[0], every[1:]
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     sys.path.insert(0, clone)
-    np.savez_compressed(GOLDEN, **dict(_scores()))
+    return dict(_scores())
 
 
 def _scores() -> Iterator[tuple[str, np.ndarray]]:
@@ -65,7 +65,3 @@ def _scores() -> Iterator[tuple[str, np.ndarray]]:
         yield f"{name}/scales", scores
         yield f"{name}/pairs", np.array([apply_patch_weights(of_pair, len(PATCHES), WEIGHTS) for of_pair in scores])
         yield f"{name}/fused", normalise_func(scores, len(PATCHES), WEIGHTS)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Makes relatives.npz: scores of public codes. `python -m tests.golden.make_relatives PATCHNETVLAD RERANKING LOSTX`
+"""Makes relatives.npz: scores of public codes. `python -m tests.golden relatives PATCHNETVLAD RERANKING LOSTX`
 
 The arguments are clones of https://github.com/QVPR/Patch-NetVLAD, https://github.com/gbarbarani/re-ranking-for-VPR and
 https://github.com/oravus/lostX, whose functions are called with the inputs below.
@@ -64,9 +64,9 @@ def layouts() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return reference, query, dense, blended
 
 
-def main(patch_netvlad: str, reranking: str, lostx: str) -> None:
+def main(patch_netvlad: str, reranking: str, lostx: str) -> dict[str, np.ndarray]:
     golden = {"patch_netvlad": _patch_netvlad(patch_netvlad), "reranking": _reranking(reranking)}
-    np.savez_compressed(GOLDEN, **golden, **_lost(lostx))
+    return golden | _lost(lostx)
 
 
 def _patch_netvlad(clone: str) -> np.ndarray:
@@ -128,7 +128,3 @@ def _lost(clone: str) -> dict[str, np.ndarray]:
                 )  # fmt: skip
                 golden[f"lost/{form}/{mirrored}"] = matrix[0, 1]
     return golden
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

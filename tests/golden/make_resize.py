@@ -1,4 +1,4 @@
-"""Makes resize.npz: what torch's resampling gives. `python -m tests.golden.make_resize`"""
+"""Makes resize.npz: what torch's resampling gives. `python -m tests.golden resize`"""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def image() -> np.ndarray:
     return ((row * 7919 + column * 104729 + channel * 1299709) ** 2 // 1009 % 256).astype(np.uint8)
 
 
-def main() -> None:
+def main() -> dict[str, np.ndarray]:
     import torch
     from torch.nn.functional import interpolate
 
@@ -23,8 +23,4 @@ def main() -> None:
     bilinear = interpolate(batch.float(), SIZE[::-1], mode="bilinear", antialias=True)
     plain = interpolate(batch.float(), SIZE[::-1], mode="bilinear", antialias=False)
     golden = {"pil_bicubic": bicubic, "torch_bilinear": bilinear, "torch_no_antialias": plain}
-    np.savez_compressed(GOLDEN, **{name: result[0].permute(1, 2, 0).numpy() for name, result in golden.items()})
-
-
-if __name__ == "__main__":
-    main()
+    return {name: result[0].permute(1, 2, 0).numpy() for name, result in golden.items()}

@@ -1,6 +1,6 @@
 """Makes selavpr.npz: what SelaVPR's code gives with random weights, in float64.
 
-`python -m tests.golden.make_selavpr CLONE` with a clone of https://github.com/Lu-Feng/SelaVPR.
+`python -m tests.golden selavpr CLONE` with a clone of https://github.com/Lu-Feng/SelaVPR.
 """
 
 import sys
@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.golden.make_netvlad import name, normalized, samples
 from tests.golden.torch_networks import fill
-from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
+from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes
 
 GOLDEN = Path(__file__).parent / "selavpr.npz"
 SIZE = (224, 224)
@@ -39,14 +39,14 @@ def maps(side: int, candidates: int, seed: int) -> tuple[np.ndarray, np.ndarray]
     return query.astype(np.float32), similar.astype(np.float32)
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     import torch
 
     sys.path.insert(0, clone)
     torch.Tensor.cuda = lambda self: self  # pyright: ignore  (its scores ask for a GPU)
     with torch.inference_mode():
         golden = dict(_networks()) | dict(_backbones()) | dict(_scores())
-    np.savez_compressed(GOLDEN, **{key: array.astype(np.float32) for key, array in golden.items()})
+    return {key: array.astype(np.float32) for key, array in golden.items()}
 
 
 def _transformer(width: int, depth: int, heads: int, registers: int) -> Any:
@@ -68,7 +68,7 @@ def _networks() -> Iterator[tuple[str, np.ndarray]]:
 
     for depth, registers, seed in NETWORKS:
         network.get_backbone = lambda _, depth=depth, registers=registers: _transformer(1024, depth, 16, registers)
-        checkpoint = transformer_checkpoint(selavpr_shapes(1024, depth, registers, prefix=""), seed)
+        checkpoint = random_checkpoint(selavpr_shapes(1024, depth, registers, prefix=""), seed)
         model = fill(network.GeoLocalizationNet(types.SimpleNamespace()), checkpoint)
         local, global_descriptor = model.double()(normalized(SIZE))
         case = name("network", depth, registers, seed)
@@ -81,7 +81,7 @@ def _backbones() -> Iterator[tuple[str, np.ndarray]]:
     """Normalized tokens; without adapters theirs add nothing."""
     for depth, registers, adapted, size, seed in BACKBONES:
         model = _transformer(WIDTH, depth, 4, registers)
-        checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=adapted), seed)
+        checkpoint = random_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=adapted), seed)
         adapters = {key: value.shape for key, value in model.state_dict().items() if "adapter" in key}
         zeros = {key: np.zeros(shape, np.float32) for key, shape in adapters.items()}
         tokens = fill(model, zeros | checkpoint).double()(normalized(size))
@@ -98,7 +98,3 @@ def _scores() -> Iterator[tuple[str, np.ndarray]]:
     for case in MATCHES:
         query, candidates = (torch.from_numpy(values) for values in maps(*case))
         yield name("scores", *case), local_sim(query, candidates).numpy()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Makes ssm.npz: what SSM-VPR's program computes on made-up maps and images. `python -m tests.golden.make_ssm CLONE`
+"""Makes ssm.npz: what SSM-VPR's program computes on made-up maps and images. `python -m tests.golden ssm CLONE`
 
 CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose program is run without its windows (torch, scikit-learn,
 scikit-image, on the CPU): its database, its candidates, its spatial matching, its scores.
@@ -50,7 +50,7 @@ def picture(row: int, query: bool) -> np.ndarray:
     return ((stripes + 80 * (circles < 300) + 20 * query) % 256).astype(np.uint8)
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     golden: dict[str, np.ndarray] = {}
     program = _program(clone)
     cases = {case: (seed, None, DATABASE, QUERIES) for case, seed in MAPS.items()} | IMAGES
@@ -58,7 +58,7 @@ def main(clone: str) -> None:
         golden |= {f"{case}/{name}": array for name, array in _run(program, *settings).items()}
         if case in IMAGES:
             del golden[f"{case}/cells"]  # hundreds of kB
-    np.savez_compressed(GOLDEN, **golden)
+    return golden
 
 
 def _run(program: type, seed: int, pixels: int | None, num_database: int, num_queries: int) -> dict[str, np.ndarray]:
@@ -225,7 +225,3 @@ def _without_windows() -> None:
 
     transforms = replace_module("torchvision.transforms", Compose=compose, **steps)
     replace_module("torchvision", transforms=transforms, models=replace_module("torchvision.models"))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Makes ssm_maps.npz: SSM-VPR's maps with random weights. `python -m tests.golden.make_ssm_maps CLONE`
+"""Makes ssm_maps.npz: SSM-VPR's maps with random weights. `python -m tests.golden ssm_maps CLONE`
 
 CLONE is a clone of https://github.com/Chicone/SSM-VPR, whose network is run in float64, so that the file holds no
 rounding errors but its own.
@@ -47,7 +47,7 @@ def checkpoint(seed: int) -> dict[str, np.ndarray]:
     return random_checkpoint(places365_shapes(full=False), seed)
 
 
-def main(clone: str) -> None:
+def main(clone: str) -> dict[str, np.ndarray]:
     sys.path.insert(0, clone)
     import torch
     import vgg16_model
@@ -69,8 +69,4 @@ def main(clone: str) -> None:
                 f"{case}/stage{stage}/shape": np.array(dense.shape),
             }
             print(f"{case}, stage {stage}: {dense.shape}, largest {np.abs(dense).max():.3g}")
-    np.savez_compressed(GOLDEN, **golden)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1])
+    return golden

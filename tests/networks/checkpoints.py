@@ -1,7 +1,12 @@
 """Networks with the tensors of checkpoints, through the published keys."""
 
+from functools import partial
+
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import NETWORKS, plan_network
+from mfvpr.checkpoints.tables import NETVLAD
+from mfvpr.networks import VggNetVlad
+from tests.random_checkpoints import netvlad_shapes, random_checkpoint
 
 
 def fill(build, table, tensors):
@@ -13,3 +18,9 @@ def fill(build, table, tensors):
 def fill_published(name, tensors):
     """The network of a name in the registry."""
     return fill(NETWORKS[name].builder(), NETWORKS[name].table, tensors)
+
+
+def fill_netvlad(clusters, outputs, seed=0):
+    """NetVLAD's network with random tensors."""
+    tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
+    return fill(partial(VggNetVlad, clusters, outputs), NETVLAD, tensors)

@@ -8,15 +8,15 @@ import pytest
 from flax import nnx
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.tables import NETVLAD, NETVLAD_MATLAB
+from mfvpr.checkpoints.tables import NETVLAD_MATLAB
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
 from mfvpr.networks.gem import GeneralizedMean
 from mfvpr.networks.netvlad import CHANNELS
 from mfvpr.utils import InputError
 from tests.golden.make_netvlad import CASES, GEM, MATLAB, PATCHES, image, name, samples
-from tests.networks.checkpoints import fill, fill_published
-from tests.random_checkpoints import gem_checkpoint, matlab_netvlad, netvlad_checkpoint, write_matlab
+from tests.networks.checkpoints import fill, fill_netvlad, fill_published
+from tests.random_checkpoints import gem_shapes, matlab_netvlad, random_checkpoint, write_matlab
 
 pytestmark = pytest.mark.thorough
 
@@ -27,12 +27,23 @@ def assert_close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=RELATIVE * np.abs(expected).max())
 
 
+def assert_separate_images(extractor, compilations):
+    """Images of a batch do not see each other, and one program is compiled."""
+    upright = image(extractor.image_size)
+    images = np.concatenate([upright, upright[:, ::-1]])
+    compilations.reset()
+    both = [description.vector for description in extractor(images)]
+    np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
+    assert compilations.count == 1
+    assert np.abs(both[0] - both[1]).max() > 1e-3
+
+
 @pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", CASES, ids=map(str, CASES))
 def test_descriptors_and_patches_are_the_public_codes(golden, case):
     clusters, outputs, size, seed = case
-    network = fill(partial(VggNetVlad, clusters, outputs), NETVLAD, netvlad_checkpoint(clusters, outputs, seed))
+    network = fill_netvlad(clusters, outputs, seed)
     sizes = PATCHES.get(outputs, ())
     with_patches = nnx.jit(VggNetVlad.with_patches, static_argnums=2)
     descriptors, patches = with_patches(network, network.preprocess(image(size)), sizes)
@@ -62,7 +73,7 @@ def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path
 @pytest.mark.parametrize("case", GEM, ids=map(str, GEM))
 def test_generalized_means_are_cosplaces(golden, case):
     backbone, outputs, size, seed = case
-    model = fill_published(f"cosplace_{backbone}_{outputs}", gem_checkpoint(backbone, outputs, seed))
+    model = fill_published(f"cosplace_{backbone}_{outputs}", random_checkpoint(gem_shapes(backbone, outputs), seed))
     extractor = GlobalDescriptor(model, size)
     assert (extractor.vector_size, extractor.scales) == (outputs, ())
     assert_close(extractor(image(size))[0].vector, golden[name("gem", *case)])
@@ -118,7 +129,7 @@ def test_the_generalized_mean_is_its_definition(power, unit):
 
 @pytest.fixture(scope="module")
 def small():
-    return fill(partial(VggNetVlad, 4, 8), NETVLAD, netvlad_checkpoint(4, 8))
+    return fill_netvlad(4, 8)
 
 
 @pytest.mark.slow
@@ -131,13 +142,7 @@ def test_fewer_components_are_the_first_of_all(small):
 
 @pytest.mark.optimized
 def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(small, compilations):
-    extractor = GlobalDescriptor(small, (64, 48))
-    images = np.concatenate([image((64, 48)), image((64, 48))[:, ::-1]])
-    compilations.reset()
-    both = [description.vector for description in extractor(images)]
-    np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
-    assert compilations.count == 1
-    assert np.abs(both[0] - both[1]).max() > 1e-3
+    assert_separate_images(GlobalDescriptor(small, (64, 48)), compilations)
 
 
 @pytest.mark.parametrize(("options", "words"), [
@@ -150,6 +155,5 @@ def test_what_cannot_be_is_refused(small, options, words):
         GlobalDescriptor(small, **options)
     with pytest.raises(InputError, match="expected images of 64 x 48 px, got 48 x 64"):
         GlobalDescriptor(small, (64, 48))(np.zeros((1, 64, 48, 3), np.uint8))
-    unprojected = fill(partial(VggNetVlad, 4, None), NETVLAD, netvlad_checkpoint(4, None))
     with pytest.raises(InputError, match=r"components=3: expected None.*whitening"):
-        GlobalDescriptor(unprojected, components=3)
+        GlobalDescriptor(fill_netvlad(4, None), components=3)

@@ -22,15 +22,15 @@ from tests.builders import make_matches
 from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, MATCHES, NETWORKS, SIZE, WIDTH, maps
 from tests.networks.checkpoints import fill
-from tests.networks.test_netvlad import assert_close
-from tests.random_checkpoints import dinov2_shapes, selavpr_shapes, transformer_checkpoint
+from tests.networks.test_netvlad import assert_close, assert_separate_images
+from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes
 
 pytestmark = pytest.mark.thorough
 
 
 def network(depth=1, registers=0, seed=0, width=1024, prefix=""):
     build = partial(SelaVpr, width, depth, width // 64, registers=registers)
-    return fill(build, SELAVPR, transformer_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
+    return fill(build, SELAVPR, random_checkpoint(selavpr_shapes(width, depth, registers, prefix), seed))
 
 
 @pytest.mark.optimized
@@ -52,14 +52,13 @@ def test_tokens_are_the_public_codes(golden, case):
     """Positions are resized unless the size is that of the training; images need not be square."""
     depth, registers, adapted, size, seed = case
     if adapted:
-        shapes = selavpr_shapes(WIDTH, depth, registers, prefix="")
-        backbone = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
-        unadapted = transformer_checkpoint(shapes, seed)
-        checkpoint = unadapted | {f"backbone.{key}": value for key, value in backbone.items()}
+        backbone = random_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
+        checkpoint = random_checkpoint(selavpr_shapes(WIDTH, depth, registers, prefix=""), seed)
+        checkpoint |= {f"backbone.{key}": value for key, value in backbone.items()}
         transformer = fill(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
     else:
         build = partial(VisionTransformer, WIDTH, depth, 4, registers=registers)
-        checkpoint = transformer_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
+        checkpoint = random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
         transformer = fill(build, DINOV2, checkpoint)
     class_token, tokens = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
     key = name("backbone", *case[:3], *size, seed)
@@ -128,7 +127,7 @@ def test_without_adapters_an_adapted_block_is_a_plain_one():
 @pytest.mark.parametrize("prefix", ["", "module."])
 def test_keys_of_a_training_on_several_devices_are_the_same(prefix):
     model = network(width=64, prefix=prefix)
-    expected = transformer_checkpoint(selavpr_shapes(64, 1, prefix=prefix))[f"{prefix}LocalAdapt.upconv2.weight"]
+    expected = random_checkpoint(selavpr_shapes(64, 1, prefix=prefix))[f"{prefix}LocalAdapt.upconv2.weight"]
     np.testing.assert_array_equal(model.upsampling2.kernel[1, 2], expected[:, :, 1, 2])
 
 
@@ -171,7 +170,7 @@ def test_sizes_without_whole_patches_are_refused(size):
 
 def test_tokens_are_descriptors_of_images():
     shapes = dinov2_shapes(64, 2)
-    transformer = fill(partial(VisionTransformer, 64, 2, 4), DINOV2, transformer_checkpoint(shapes))
+    transformer = fill(partial(VisionTransformer, 64, 2, 4), DINOV2, random_checkpoint(shapes))
     size = (42, 28)
     class_token, token_maps = transformer(transformer.preprocess(image(size)))
     tokens = np.asarray(token_maps[0], np.float64).reshape(-1, 64)
@@ -187,11 +186,4 @@ def test_tokens_are_descriptors_of_images():
 
 @pytest.mark.optimized
 def test_tokens_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(compilations):
-    size = (28, 28)
-    extractor = SelaVprFeatures(network(width=64), size)
-    images = np.concatenate([image(size), image(size)[:, ::-1]])
-    compilations.reset()
-    both = [description.vector for description in extractor(images)]
-    np.testing.assert_array_equal(both[1], extractor(images[1:])[0].vector)
-    assert compilations.count == 1
-    assert np.abs(both[0] - both[1]).max() > 1e-3
+    assert_separate_images(SelaVprFeatures(network(width=64), (28, 28)), compilations)

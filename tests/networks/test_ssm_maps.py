@@ -8,20 +8,15 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.networks import SsmVgg, imagenet
+from mfvpr.networks import SsmVgg
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE
 from tests.golden.make_d2net import samples
-from tests.golden.make_ssm_maps import CASES, GOLDEN, checkpoint
+from tests.golden.make_ssm_maps import CASES, checkpoint
 from tests.networks.checkpoints import fill_published
 
 pytestmark = pytest.mark.thorough
 
 RELATIVE = 1e-5  # of the map's largest value
-
-
-@pytest.fixture(scope="module")
-def golden():
-    return dict(np.load(GOLDEN))
 
 
 @cache
@@ -66,10 +61,3 @@ def test_sizes_of_the_maps(width, height):
     maps = jax.eval_shape(lambda state, images: nnx.merge(graph, state)(images), state, images)
     for dense, stride in zip(maps, (STAGE1_STRIDE, STAGE2_STRIDE), strict=True):
         assert dense.shape == (2, -(-height // stride), -(-width // stride), 512)
-
-
-@pytest.mark.optimized
-def test_pixels_are_torchs_unless_caffes_are_asked_for():
-    image = np.random.default_rng(0).integers(0, 256, (1, 4, 4, 3), np.uint8)
-    np.testing.assert_array_equal(SsmVgg.preprocess(image), imagenet.preprocess(image, "torch"))
-    np.testing.assert_array_equal(SsmVgg.preprocess(image, "caffe"), imagenet.preprocess(image, "caffe"))
