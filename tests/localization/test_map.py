@@ -465,6 +465,24 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
             assert len(known.localize(image).alternatives) == 3
 
 
+@dataclass(frozen=True)
+class Bright(Constant):
+    """Keypoints as strong as the image is bright."""
+
+    def describe(self, image):
+        vector, (features,) = super().describe(image)
+        return Description(vector, (replace(features, scores=np.full(9, image.max() / 255, np.float32)),))
+
+
+def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
+    rng, known = np.random.default_rng(0), Map(tmp_path / "map", Bright(), Bright(), candidates=3)
+    images = [rng.integers(0, 2 if row < 3 else 256, (12, 16, 3), np.uint8) for row in range(8)]
+    for row, image in enumerate(images):
+        known.add(image, row, name=str(row))
+    assert known.localize(images[0]).reason == "too few features"
+    assert known.localize_with_evidence(images[0], before=3).prediction.place == 0
+
+
 @pytest.mark.slow
 def test_killed_while_adding_it_has_whole_rows(dataset, small_street, tmp_path):
     program = (

@@ -198,6 +198,19 @@ def test_a_map_that_replaced_the_one_that_is_open_is_refused(images, tmp_path, m
     assert len(opened(folder)) == 6
 
 
+def test_a_copy_that_grew_is_refused_in_place_of_the_map_that_is_open(images, folder, tmp_path):
+    """Though it has the same first rows."""
+    shutil.copytree(folder, tmp_path / "copy")
+    known = opened(folder)
+    for path, row in ((folder, 6), (tmp_path / "copy", 7)):
+        opened(path).add(images.paths[row], row, name=str(row))
+    assert known.refresh() == 1
+    shutil.rmtree(folder / "0000")
+    shutil.copytree(tmp_path / "copy" / "0000", folder / "0000")
+    with pytest.raises(InputError, match=r"replaced.* Open the map again"):
+        known.localize(images.paths[0])
+
+
 def test_a_vocabulary_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
     maps = [opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2)]
     for known in maps:

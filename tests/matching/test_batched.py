@@ -40,10 +40,11 @@ def images_of(counts, seed, *, longest=1.0):
     rng = np.random.default_rng(seed)
     centers = np.random.default_rng(0).normal(size=(60, 16))
     images = []
-    for count in counts:
+    for number, count in enumerate(counts):
         values = centers[rng.integers(0, 60, count)] + rng.normal(0, 0.3, (count, 16))
         values *= rng.uniform(1, longest, (count, 1)) / np.linalg.norm(values, axis=1, keepdims=True)
-        images.append(replace(make_features(rng, count), descriptors=values.astype(np.float32)))
+        image = make_features(rng, count, size=300 + 100 * seed + number)  # no two images have the same size
+        images.append(replace(image, descriptors=values.astype(np.float32)))
     return images
 
 

@@ -58,11 +58,12 @@ def test_grids_equal_the_loop(matches, scorer, axes, rtol):
 
 def test_axes_keep_their_order(matches):
     """Though distances are varied within each setting of the scorer."""
-    axes = {"max_distance": [0.7, 1.5], "window": [2, 6, 10]}
-    scores = score_grid(AnchorPoints(), matches, **axes)
-    transposed = score_grid(AnchorPoints(), matches, **dict(reversed(axes.items())))
-    assert scores.shape == (2, 3, 3)
-    np.testing.assert_array_equal(scores, np.swapaxes(transposed, 0, 1))
+    axes = {"max_distance": [0.7, 1.5], "window": [2, 6, 10], "tolerance": [1.0, 2.0, 3.0, 4.5]}
+    scores, names = score_grid(AnchorPoints(), matches, **axes), list(axes)
+    assert scores.shape == (2, 3, 4, 3)
+    for order in ((1, 0, 2), (1, 2, 0), (2, 0, 1)):  # the latter two are not their own inverse
+        other = score_grid(AnchorPoints(), matches, **{names[place]: axes[names[place]] for place in order})
+        np.testing.assert_array_equal(other, np.transpose(scores, (*order, 3)))
 
 
 @pytest.mark.parametrize("cores", [2, 3])

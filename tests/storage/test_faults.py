@@ -138,16 +138,17 @@ def test_a_damaged_row_is_named_and_made_anew(tmp_path, subject, damage):
     fill(folder, subject=subject)
     before = digests(folder)
     with subject.open(folder, 3) as store:
-        DAMAGE[damage](file_of(folder))
+        for row in (1, 2):
+            DAMAGE[damage](file_of(folder, row))
         assert store.done.all()
         rows = store.read()
         assert next(rows)[0] == 0
-        expected = rf"s: {words.content} of 1 {words.rows} are damaged.*row 1 \(1-.*\); run again, which {words.remake}"
+        expected = rf"s: {words.content} of 2 {words.rows} are damaged.*row 1 \(1-.*\); run again, which {words.remake}"
         with pytest.raises(InputError, match=expected) as error:
             next(rows)
         assert "\n" not in str(error.value)
-        assert store.done.tolist() == [True, False, True]
-    assert fill(folder, subject=subject) == [1]
+        assert store.done.tolist() == [True, False, False]
+    assert fill(folder, subject=subject) == [1, 2]
     assert digests(folder) == before
     assert len(read_all(folder, subject=subject)) == 3
 
