@@ -43,7 +43,7 @@ def test_files_of_other_programs(tmp_path):
     assert io.open_features(path, names).counts.tolist() == [4, 4]
     folder = ImageFolder(str(tmp_path), tuple(names))  # type: ignore[arg-type]
     files = FeatureFiles({str(tmp_path): File(path)})  # type: ignore[dict-item]
-    assert files.opened(folder, partial=False).counts.tolist() == [4, 4]
+    assert files.open(folder, partial=False).counts.tolist() == [4, 4]
     assert File(path) == File(Path(path))  # type: ignore[arg-type]
     assert folder.paths == [tmp_path / name for name in names]
     path = str(tmp_path / "g.npy")

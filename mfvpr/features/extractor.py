@@ -121,7 +121,7 @@ class Source(Protocol):
         """The only scale."""
         ...
 
-    def opened(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
+    def open(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
         """The features of a folder's images; if `partial`, features of some images may be missing."""
         ...
 

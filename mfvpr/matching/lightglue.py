@@ -47,7 +47,7 @@ class LightGlueMatching:
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatching":
         """Matcher from a model (`mfvpr.checkpoints.load_model`) and further attributes."""
-        return cls(jax.jit(type(model).packed)(model), fingerprint(recipe_of(model)), **options)
+        return cls(jax.jit(type(model).pack)(model), fingerprint(recipe_of(model)), **options)
 
     @property
     def dimension(self) -> int:

@@ -1,7 +1,7 @@
 """LightGlue (Lindenberger et al., ICCV 2023): match the keypoints of two images by attention.
 
 Each layer has self-attention among the keypoints of an image, then cross-attention to those of the other image. An
-assignment of the keypoints can be computed after each layer. The module has the published weights; `packed` arranges
+assignment of the keypoints can be computed after each layer. The module has the published weights; `pack` arranges
 them once for `lightglue_assignment.assignment`, which matches one pair of images.
 """
 
@@ -70,7 +70,7 @@ class LightGlue(nnx.Module):
         self.layers = nnx.List([Layer(width, rngs=rngs) for _ in range(num_layers)])
         self.confidences = nnx.List([nnx.Linear(width, 1, rngs=rngs) for _ in range(num_layers - 1)])
 
-    def packed(self) -> Packed:
+    def pack(self) -> Packed:
         """Weights for `assignment`."""
         layers = [_packed_layer(layer, 2 * self.position.out_features) for layer in self.layers]
         confidences = [_affine(confidence) for confidence in self.confidences]

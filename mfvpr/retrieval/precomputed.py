@@ -61,7 +61,7 @@ class FeatureFiles:
         default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False}
     )
 
-    def opened(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
+    def open(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
         """Open the features of a folder's images; `partial` allows missing images.
 
         Raises:

@@ -212,7 +212,7 @@ class FeatureCache:
         return content.fingerprint if path.is_dir() else content.sha256
 
     def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
-        opened = source.opened(folder, partial=self.skip_bad)
+        opened = source.open(folder, partial=self.skip_bad)
         counts = np.asarray(opened.counts)
         number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
         self.tell(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")

@@ -7,7 +7,7 @@ from mfvpr.checkpoints.networks import NETWORKS, plan_network
 def fill(build, table, tensors):
     """The network of a constructor."""
     plan = plan_network(build)
-    return plan.filled(convert(tensors, table, plan.shapes))
+    return plan.build(convert(tensors, table, plan.shapes))
 
 
 def fill_published(name, tensors):

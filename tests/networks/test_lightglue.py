@@ -39,7 +39,7 @@ def small_network(seed=0, sure=None):
 @cache
 def small(seed=0, sure=None, dtype=np.float32):
     """The packed weights of a small network."""
-    return jax.jit(LightGlue.packed)(jax.tree.map(lambda leaf: leaf.astype(dtype), small_network(seed, sure)))
+    return jax.jit(LightGlue.pack)(jax.tree.map(lambda leaf: leaf.astype(dtype), small_network(seed, sure)))
 
 
 @pytest.fixture(scope="module")

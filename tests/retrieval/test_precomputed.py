@@ -27,7 +27,7 @@ def list_candidates(source, queries, database):
 
 
 @pytest.mark.parametrize("read", [
-    lambda files, other: FeatureFiles(files).opened(other, partial=False),
+    lambda files, other: FeatureFiles(files).open(other, partial=False),
     lambda files, other: list_candidates(DescriptorFiles(files), other, other),
     lambda files, other: list_candidates(ShortlistFiles(files), other, other),
 ])  # fmt: skip
@@ -69,7 +69,7 @@ def read_both(database, queries, files):
     if "global" in files[database.root].path.name:
         return list_candidates(DescriptorFiles(files), queries, database)
     source = FeatureFiles(files)
-    return [source.opened(folder, partial=False) for folder in (database, queries)]
+    return [source.open(folder, partial=False) for folder in (database, queries)]
 
 
 @pytest.mark.parametrize("file", ["f.h5", "f.npz", "global.h5", "global.npz", "global.npy"])

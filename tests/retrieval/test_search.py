@@ -123,7 +123,7 @@ def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
     ks, rows = [1, 2, 9], list(range(7))
     rng.shuffle(rows)
     parts = [Tally.of(order[part_rows], positives[part_rows], ks) for part_rows in (rows[:cut], rows[cut:])]
-    merged = parts[1].merged(parts[0])
+    merged = parts[1].merge(parts[0])
     np.testing.assert_array_equal(merged.recall, recall_at_k(order, positives, ks))
     assert merged.queries == 7
     np.testing.assert_array_equal(Tally.of(np.zeros((0, 4), int), positives[:0], ks).recall, [0, 0, 0])

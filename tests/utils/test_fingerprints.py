@@ -136,7 +136,7 @@ def test_a_network_is_known_by_its_weights():
 
     def recipe(value):
         weights = {name: np.full(shape, value, np.float32) for name, shape in plan.shapes.items()}
-        return recipe_of(AlikedFeatures(plan.filled(weights)))
+        return recipe_of(AlikedFeatures(plan.build(weights)))
 
     assert recipe(0) == recipe(0) != recipe(1)
 
