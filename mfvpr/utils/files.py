@@ -44,11 +44,7 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def require_file(path: Path, expected: str = "a file") -> None:
-    """Refuse a path that is no regular file: a pipe would block its reader forever.
-
-    Raises:
-        InputError: the path is something else, or does not exist.
-    """
+    """Raise `InputError` if a path is no regular file: a pipe would block its reader forever."""
     if not path.is_file():
         got = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
         raise InputError(f"{path}: expected {expected}, got {got}; check the path")

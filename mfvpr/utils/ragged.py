@@ -27,15 +27,12 @@ def pad_rows(
         total: number of rows of the arrays, those beyond `rows` are empty. By default the number of `rows`.
     """
     total = len(rows) if total is None else total
-    arrays = {name: np.empty((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
+    arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
     counts = np.zeros(total, int)
     for place, row in enumerate(rows):
         counts[place] = len(next(iter(row.values())))
         for name, values in row.items():
             arrays[name][place, : counts[place]] = values
-    for place, count in enumerate(counts.tolist()):
-        for values in arrays.values():
-            values[place, count:] = 0
     return arrays, np.arange(capacity) < counts[:, None]
 
 
