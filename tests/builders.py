@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from mfvpr import Features, Matches, Shortlist, types
+from mfvpr.matching import MatchSet
 
 SIZE = 336
 
@@ -141,6 +142,12 @@ def of_query(pairs):
         if name.endswith("1")
     }
     return replace(pairs[0], **joined, **of_candidates), [int(pair.mask.sum()) for pair in pairs]
+
+
+def match_set_of(queries, capacity):
+    """The matches of queries, from the pairs of each."""
+    flat, counts = zip(*map(of_query, queries), strict=True)
+    return MatchSet(flat, np.array(counts), capacity)
 
 
 def local(descriptions):

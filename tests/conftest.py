@@ -15,6 +15,7 @@ from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
 from mfvpr.checkpoints.networks import blueprint, network_of
+from mfvpr.datasets import Dataset, folder_dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
 
@@ -115,6 +116,12 @@ def weights(tmp_path_factory) -> Path:
 def small_street(tmp_path_factory) -> Path:
     """Ten frames of the synthetic street: database/, queries/, ground_truth.csv."""
     return streets_folder(tmp_path_factory.mktemp("cache"), num_frames=10, image_size=(320, 240))
+
+
+@pytest.fixture(scope="session")
+def dataset(small_street) -> Dataset:
+    """The small street's ten queries, each with its database image."""
+    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
 @pytest.fixture(scope="session")

@@ -139,7 +139,7 @@ def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
     entry = entry_of(name)
     plan = blueprint(entry)
     arrays = load(name) if is_installed(entry) else {path: _random(path, shape) for path, shape in plan.shapes.items()}
-    return plan.fill(arrays), arrays
+    return plan.build(arrays), arrays
 
 
 def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:

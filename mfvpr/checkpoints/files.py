@@ -162,7 +162,7 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
     entry = entry_of(name)
     arrays = load(name, folder)
     try:
-        return blueprint(entry).fill(arrays)
+        return blueprint(entry).build(arrays)
     except InputError as error:  # the file comes from another version of the network
         raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
 

@@ -79,7 +79,7 @@ class Blueprint:
     _graph: Any
     _state: Any
 
-    def fill(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
+    def build(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
         """Build the network with these values, in evaluation mode.
 
         Raises:

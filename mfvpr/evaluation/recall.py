@@ -32,7 +32,7 @@ class Tally:
         correct = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
         return cls(np.array([correct[:, :k].any(axis=1).sum() for k in ks], int), len(order))
 
-    def merged(self, other: "Tally") -> "Tally":
+    def merge(self, other: "Tally") -> "Tally":
         """Add the counts of other queries."""
         if len(self.correct) != len(other.correct):
             raise ValueError(f"expected tallies of the same depths, got {len(self.correct)} and {len(other.correct)}")

@@ -40,7 +40,7 @@ class Recall:
     @property
     def pooled(self) -> Float[np.ndarray, "tolerances ks"]:
         """Recall over all queries of all sequences."""
-        return np.array([reduce(Tally.merged, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
+        return np.array([reduce(Tally.merge, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
 
 
 @dataclass(frozen=True, repr=False)

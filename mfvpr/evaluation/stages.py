@@ -189,9 +189,8 @@ def dominant_shifts(
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[part], places[part], match_set.capacity, total=SHIFTS_AT_ONCE)
-        number = len(queries[part])
-        shifts, intervals, scales = pair_shifts(fitted, pairs)
-        parts.append((shifts[:number], intervals[:number], scales[:number]))
+        shifts, intervals, scales = (values[: len(queries[part])] for values in pair_shifts(fitted, pairs))
+        parts.append((shifts, intervals, scales))
     shifts, intervals, scales = map(np.concatenate, zip(*parts, strict=True))
     return shifts, intervals, scales
 

@@ -27,10 +27,9 @@ def check_request(
     scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
     memory: float | None, *, cohort: bool = False,
 ) -> None:  # fmt: skip
-    """Check the arguments of `mfvpr.evaluate` that concern scores; `cohort` = whether there is one.
+    """Raise `InputError` if an argument of `mfvpr.evaluate` that concerns scores cannot be used.
 
-    Raises:
-        InputError: an argument cannot be used.
+    `cohort` = whether there is one.
     """
     require_word("ties", ties, Ties)
     if memory is not None and not 0 < memory < math.inf:
@@ -56,11 +55,7 @@ def check_request(
 
 
 def check_matching(candidates: Any, extractor: Extractor | Source, matching: Matcher) -> None:
-    """Check the arguments of `mfvpr.evaluate` that concern matches.
-
-    Raises:
-        InputError: an argument cannot be used.
-    """
+    """Raise `InputError` if an argument of `mfvpr.evaluate` that concerns matches cannot be used."""
     is_whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
     if candidates != "all" and not (is_whole and candidates >= 1):
         raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")

@@ -200,7 +200,7 @@ class Slots:
         self._features, self._device = features, device
         counts = features.counts
         capacities = _capacities(counts[wanted])
-        self._capacity = ragged.fitting(capacities, np.minimum(counts, capacities[-1]))
+        self._capacity = ragged.smallest_capacities(capacities, np.minimum(counts, capacities[-1]))
         wanted_capacities = self._capacity[wanted[counts[wanted] > 0]]
         rows = {int(capacity): int(np.sum(wanted_capacities == capacity)) for capacity in capacities}
         size = features.keypoint_bytes if wanted_capacities.size else 1

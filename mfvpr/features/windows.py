@@ -90,7 +90,7 @@ class WindowFitting:
     dtype: Literal["float32", "float64"] = "float32"
     seed: int = 0
 
-    def draw_rows(self, num_images: int) -> list[int]:
+    def sample_rows(self, num_images: int) -> list[int]:
         """Rows of the images to learn from."""
         rows = np.random.default_rng([self.seed, 0]).permutation(num_images)
         return sorted(rows[: self.max_images].tolist())
@@ -106,7 +106,7 @@ class WindowFitting:
         Args:
             maps: of the images in `rows`; unreadable images may be missing.
             windows: of these maps.
-            rows: from `draw_rows`.
+            rows: from `sample_rows`.
 
         Raises:
             InputError: the windows do not fit into memory, or there are fewer windows than dimensions.

@@ -25,19 +25,16 @@ _AT_ONCE = 25  # pairs; with ten a prediction takes 8 ms longer
 def match_and_score(
     query: Features, database: Features, slots: Int[np.ndarray, " n"], number: int, matcher: Matcher, scorer: Scorer
 ) -> tuple[Matches, Float[np.ndarray, " n"]]:
-    """Matches `[C, K, ...]` and scores, NumPy; a pair's result does not depend on the other pairs.
+    """Matches `[C, K, ...]` of an unpadded query, and scores, NumPy; no pair's result depends on the other pairs.
 
     A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes a few pairs at a
     time. Their number is the same for any number of cores, since the last bits of scores depend on it. A device with
     memory of its own takes all pairs at once.
 
     Args:
-        query: unpadded.
         database: `[S, N, ...]` on the device.
         slots: of the candidates.
         number: C; beyond n there are no matches.
-        matcher: of one pair.
-        scorer: of one pair's matches.
     """
     padded_query = stack_features([query], database.mask.shape[1], total=1)
     size = min(number, _AT_ONCE) if device_bytes(database) is None else number

@@ -187,8 +187,8 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
     """
     sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
-    sizes = ragged.worthwhile(sizes, match_set.counts, PROGRAM_SLOTS / settings)
-    return ragged.fitting(sizes, match_set.counts)
+    sizes = ragged.prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
+    return ragged.smallest_capacities(sizes, match_set.counts)
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:

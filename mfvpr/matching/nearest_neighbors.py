@@ -127,7 +127,7 @@ def compact(matches: Matches, capacity: int) -> Matches:
     The cost of all later steps is proportional to K or K^2, so that few slots are faster. Matches beyond the capacity
     are dropped: compare `matches.mask.sum()` with it.
     """
-    entries = ragged.in_front(per_match(matches), jnp.asarray(matches.mask), capacity)
+    entries = ragged.compact(per_match(matches), jnp.asarray(matches.mask), capacity)
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 

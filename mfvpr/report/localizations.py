@@ -13,7 +13,7 @@ from mfvpr.localization.predictions import Localization
 from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import below, clip_middle
+from mfvpr.utils.files import clip_middle, path_inside
 
 _GRAY = 150  # of an image that is not at hand
 _NAME_LENGTH = 80  # characters of a name or a place
@@ -43,7 +43,7 @@ def localization_figure(
         best = prediction.alternatives[0].name
         shown, note = candidate.image, " (its image is not at hand)"
         if root is not None:
-            file = below(root, best)
+            file = path_inside(root, best)
             with suppress(InputError):  # the map keeps features, not images
                 shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
         histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()

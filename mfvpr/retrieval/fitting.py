@@ -88,7 +88,7 @@ def _whitening(
 
 
 def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache) -> Whitening:
-    rows, bad = fitting.draw_rows(len(database)), {}
+    rows, bad = fitting.sample_rows(len(database)), {}
 
     def maps() -> Iterator[dict[int, np.ndarray]]:
         track = cache.track(f"{type(extractor).__name__} whitening")

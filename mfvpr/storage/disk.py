@@ -13,12 +13,9 @@ from mfvpr.utils.locks import lock
 
 @contextmanager
 def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hold the lock of a store, see `mfvpr.utils.locks`.
+    """Hold the lock of a store, see `mfvpr.utils.locks`; `content` is for messages.
 
-    Args:
-        folder: of the store.
-        content: of the store, for messages.
-        waiting: called with one line that names the process that this waits for; None = refuse a store in use.
+    `waiting` is called with one line that names the process that this waits for; None = refuse a store in use.
     """
 
     def on_conflict(handle: int) -> None:
@@ -42,12 +39,9 @@ def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None
 def disk_errors_as_input_errors(
     folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6
 ) -> Iterator[None]:
-    """Raise errors of the file system as an InputError of one line.
+    """Raise errors of the file system as an InputError of one line about the `content` of a store.
 
-    Args:
-        folder: of the store.
-        content: of the store, for messages.
-        needed: gives the bytes that are still to be written when the disk is full.
+    `needed` gives the bytes that are still to be written when the disk is full.
     """
     try:
         yield

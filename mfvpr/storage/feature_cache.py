@@ -130,13 +130,9 @@ class FeatureCache:
         *,
         label: str = "image",
     ) -> tuple[FeatureSet, ...]:
-        """Local features by scale, to be read on demand.
+        """Local features by scale, to be read on demand, of all images or of those in `rows`.
 
-        Args:
-            folder: the images.
-            extractor: gives the features, or has them already.
-            rows: images that are needed. None = all.
-            label: of the images in messages.
+        `label` names the images in messages.
 
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
@@ -153,16 +149,9 @@ class FeatureCache:
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
                 label: str = "image") -> Vectors:  # fmt: skip
-        """Global descriptors of all images.
+        """Global descriptors of all images; an aggregation is fitted on the `database`.
 
-        Args:
-            folder: the images.
-            describer: gives the descriptors.
-            database: images that an aggregation is fitted on.
-            label: of the images in messages.
-
-        Raises:
-            InputError: as `local`.
+        `label` and errors are those of `local`.
         """
         if not isinstance(describer, Aggregated) and not describer.vector_size:
             raise InputError(f"{type(describer).__name__}: gives no global descriptor; expected one that does, or "
@@ -176,12 +165,7 @@ class FeatureCache:
     ) -> Iterator[match_stores.MatchStore]:
         """The store of the matches of queries by name, locked while queries are missing; needs a root.
 
-        Args:
-            recipe: of the matches.
-            names: of Q queries.
-            num_candidates: C.
-            typical: matches of a pair, about.
-            label: of the images in messages.
+        `typical` is the number of matches of a pair, about; `label` names the matches in messages.
         """
         if self.root is None:
             raise ValueError("nothing is kept on disk: this cache has no root")

@@ -10,8 +10,7 @@ from mfvpr.features.extractor import Description, Extractor, Scale
 from mfvpr.storage import features, vectors
 from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.manifest import VECTORS, store_path
-from mfvpr.storage.row_files import SHARDS
-from mfvpr.storage.rows import RowStore
+from mfvpr.storage.rows import SHARDS, RowStore
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 
@@ -105,12 +104,7 @@ def open_sinks(
 ) -> list[Sink]:
     """Open the sinks of an extractor: of its global descriptor, if it gives one, then of each scale.
 
-    Args:
-        root: folder of stores; None = in memory.
-        extractor: gives the descriptions.
-        recipe: of its features of these images.
-        num_images: M.
-        **options: `waiting` and `shard` of `storage.rows.RowStore`.
+    Without a root, the sinks are in memory. `options` are `waiting` and `shard` of `storage.rows.RowStore`.
     """
     name, size = type(extractor).__name__, extractor.vector_size
     options["num_images"] = num_images

@@ -28,17 +28,9 @@ _NUM_ARRAYS = 5
 def open_store(
     folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
 ) -> FeatureStore:
-    """The store in `folder`. `with store:` locks it for writing, unless it is complete.
+    """The store in `folder`, see `rows.RowStore`; `options` are its `waiting`, `shard` and `tokens`.
 
-    Args:
-        folder: see `manifest.store_path`.
-        recipe: of the features (JSON values only): weights, settings, images. Kept in plain text.
-        num_images: M.
-        kind: with other messages, for a store that is part of a map.
-        **options: `waiting`, `shard` and `tokens` of `rows.RowStore`.
-
-    Raises:
-        InputError: made from something else, or no store at all.
+    A store that is part of a map has another `kind`, with other messages.
     """
     return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
 

@@ -6,26 +6,28 @@ any moment, and the next one goes on. A file knows its store and its row: exchan
 Shards write stores of their own in the folder `shards` of a store; readers see one store.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, full_disk_error, lock_store, used_bytes
 from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_leftovers, write_manifest
-from mfvpr.storage.row_files import SHARDS, RowFiles
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import difference
 from mfvpr.utils.threads import ordered_map
 
+SHARDS = "shards"  # the folder of a store in which each shard has its own
 THREADS = 4  # that read ahead, or write the rows of a batch
 BLOCK = 4096  # bytes that a file system hands out at a time
 ARRAY_OVERHEAD = 400  # bytes at most that an array takes in its file beside its values
+_ROW = re.compile(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})\.npz")  # the name of the file of a row
 
 Item = TypeVar("Item")
 Parts = Mapping[str, np.ndarray]
@@ -40,9 +42,10 @@ class RowStore(Generic[Item]):
     Attributes:
         folder: absolute path.
         kind: of its content.
-        sizes: lengths of axes by name, first M.
+        sizes: lengths of axes by name, first M, the number of rows.
         shard: that writes, into a folder of its own; None = one process writes the whole store.
         is_writable: whether rows may be written.
+        counts: `[M]` int32 entries of each row, -1 = not done, when the store was last opened, entered or looked at.
     """
 
     def __init__(
@@ -62,13 +65,10 @@ class RowStore(Generic[Item]):
 
         Args:
             folder: see `manifest.store_path`.
-            kind: of its content.
             recipe: of the rows (JSON values only). Kept in plain text.
-            sizes: lengths of axes by name, the first is the number of rows.
             pack: item -> arrays by name; the first has a value for each of the row's entries.
             unpack: arrays by name -> item.
             waiting: called with one line that names the process that a writer waits for; None = refuse a store in use.
-            shard: that writes, beside others.
             tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written
                 with another number is a damaged one. None = names alone tell rows apart.
 
@@ -111,20 +111,18 @@ class RowStore(Generic[Item]):
         """The folder in which rows are written."""
         return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
 
-    @property
-    def counts(self) -> Int[np.ndarray, " rows"]:
-        """Entries of each row, -1 = not done, when the store was last opened, entered or looked at."""
-        return self._files.counts
-
     def look(self) -> None:
         """Find the rows that are done by now; raises `InputError` if they were made from something else."""
         with disk_errors_as_input_errors(self.folder, self.kind.content):
             exists = has_manifest(self.folder, self.kind, self._manifest)
             shards = [path for path in (self.folder / SHARDS).glob("*-of-*") if path.is_dir()]
-            folders = [self.folder, *sorted({self.write_folder, *shards} - {self.folder})]
-            self._files = RowFiles(next(iter(self.sizes.values())), folders)
-            if exists:
-                self._files.find()
+            self._folders = [self.folder, *sorted({self.write_folder, *shards} - {self.folder})]
+            self.counts = np.full(next(iter(self.sizes.values())), -1, np.int32)
+            self._folder_of = np.zeros(len(self.counts), np.int16)  # index of each row's folder
+            for number, folder in enumerate(self._folders if exists else ()):
+                for path in folder.iterdir() if folder.is_dir() else ():
+                    if (name := _ROW.fullmatch(path.name)) and int(name[1]) < len(self.counts):
+                        self.counts[int(name[1])], self._folder_of[int(name[1])] = int(name[2]), number
 
     @property
     def done(self) -> Bool[np.ndarray, " rows"]:
@@ -186,11 +184,15 @@ class RowStore(Generic[Item]):
         damaged: dict[int, Path] = {}
         for row, item in zip(rows, ordered_map(self._read_item, rows, workers=THREADS), strict=True):
             if item is None:
-                damaged[row] = self._files.path(row)
+                damaged[row] = self._path(row)
             elif not damaged:
                 yield row, item
         if damaged:
             raise InputError(self._remove(damaged))
+
+    def _path(self, row: int) -> Path:
+        """The file of a row that is done."""
+        return self._folders[self._folder_of[row]] / f"{row}-{self.counts[row]}.npz"
 
     def _about(self, row: int, path: Path) -> str:
         token = "" if self._tokens is None else f" {self._tokens[row]:x}"
@@ -201,7 +203,8 @@ class RowStore(Generic[Item]):
         count = len(next(iter(parts.values())))
         path = self.write_folder / f"{row}-{count}.npz"
         write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
-        self._files.add(row, count, self.write_folder)
+        self._folder_of[row] = self._folders.index(self.write_folder)
+        self.counts[row] = count
 
     def _read_item(self, row: int) -> Item | None:
         parts = self._read_parts(row)
@@ -209,7 +212,7 @@ class RowStore(Generic[Item]):
 
     def _read_parts(self, row: int) -> Parts | None:
         """Arrays by name; None if the file is damaged, or of another row, or gone."""
-        path = self._files.path(row)
+        path = self._path(row)
         with disk_errors_as_input_errors(self.folder, self.kind.content):
             try:
                 return read_arrays(path, self._about(row, path))

@@ -54,7 +54,6 @@ class Shard:
     count: int
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not (1 <= self.count <= MOST and 0 <= self.index < self.count):
             raise InputError(f"shard={self}: expected i/n with i from 0 to n - 1 and n up to {MOST}")
 
@@ -63,11 +62,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """The shard `i/n`.
-
-        Raises:
-            InputError: the text is something else.
-        """
+        """The shard `i/n`; raises `InputError` if the text is something else."""
         if not (numbers := re.fullmatch(r"(\d{1,9})/(\d{1,9})", text, re.ASCII)):
             raise InputError(f"shard={text}: expected i/n, such as 0/8, the first of eight")
         return cls(int(numbers[1]), int(numbers[2]))

@@ -18,16 +18,14 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error."""
     with _beside(path) as temporary:
         yield temporary
-        temporary.chmod(0o644)  # mkstemp's 0600 would surprise whoever shares the folder
         os.replace(temporary, path)
 
 
 @contextmanager
-def placing(path: Path) -> Iterator[Path]:
+def write_once(path: Path) -> Iterator[Path]:
     """As `replacing`, but an existing file stays: of several processes at the same time, the first counts."""
     with _beside(path) as temporary:
         yield temporary
-        temporary.chmod(0o644)
         with suppress(FileExistsError):
             os.link(temporary, path)
 
@@ -36,6 +34,7 @@ def placing(path: Path) -> Iterator[Path]:
 def _beside(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.fchmod(handle, 0o644)  # mkstemp's 0600 would surprise whoever shares the folder
     os.close(handle)
     temporary = Path(name)
     try:
@@ -45,11 +44,7 @@ def _beside(path: Path) -> Iterator[Path]:
 
 
 def require_file(path: Path, expected: str = "a file") -> None:
-    """Refuse a path that is no regular file: a pipe would block its reader forever.
-
-    Raises:
-        InputError: the path is something else, or does not exist.
-    """
+    """Raise `InputError` if a path is no regular file: a pipe would block its reader forever."""
     if not path.is_file():
         got = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
         raise InputError(f"{path}: expected {expected}, got {got}; check the path")
@@ -76,11 +71,10 @@ def clip_middle(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
 
 
-def written_once(path: Path, text: str) -> str:
-    """Write `printable` text unless the file exists; returns the text of the file."""
-    with placing(path) as temporary:
+def write_text_once(path: Path, text: str) -> None:
+    """Write `printable` text unless the file exists."""
+    with write_once(path) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
-    return path.read_text(encoding="utf-8")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -95,7 +89,7 @@ def canonical_name(path: Path | str) -> str:
     return str(path.parent.resolve() / path.name)
 
 
-def below(root: Path, name: str) -> Path:
+def path_inside(root: Path, name: str) -> Path:
     """The path of a name from elsewhere below a folder; the file may be missing, links are followed.
 
     Raises:

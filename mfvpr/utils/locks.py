@@ -13,12 +13,9 @@ from filelock import lock_descriptor
 
 @contextmanager
 def lock(path: Path, flags: int, on_conflict: Callable[[int], None]) -> Iterator[int]:
-    """Open a file or folder and hold its lock; yields the handle.
+    """Open a file or folder with the flags of `os.open`, and hold its lock; yields the handle.
 
-    Args:
-        path: of the file or folder.
-        flags: of `os.open`.
-        on_conflict: called with the handle when the lock is held elsewhere: raises, or returns to wait for the lock.
+    If the lock is held elsewhere, `on_conflict` is called with the handle: it raises, or returns to wait for the lock.
     """
     handle = os.open(path, flags, 0o644)
     try:

@@ -101,11 +101,7 @@ def safe_sqrt(squared: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
 
 
 def without_gradient(why: str, values: Tree) -> Tree:
-    """The values, without a derivative.
-
-    Raises:
-        NoGradientError: with the message `why`, at a derivative.
-    """
+    """The values; their derivative raises `NoGradientError` with the message `why`."""
 
     @jax.custom_jvp
     def same(values: Tree) -> Tree:

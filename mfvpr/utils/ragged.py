@@ -27,15 +27,12 @@ def pad_rows(
         total: number of rows of the arrays, those beyond `rows` are empty. By default the number of `rows`.
     """
     total = len(rows) if total is None else total
-    arrays = {name: np.empty((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
+    arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
     counts = np.zeros(total, int)
     for place, row in enumerate(rows):
         counts[place] = len(next(iter(row.values())))
         for name, values in row.items():
             arrays[name][place, : counts[place]] = values
-    for place, count in enumerate(counts.tolist()):
-        for values in arrays.values():
-            values[place, count:] = 0
     return arrays, np.arange(capacity) < counts[:, None]
 
 
@@ -64,7 +61,7 @@ def sizes(counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int)
     return np.unique(np.ceil(np.quantile(lengths, quantiles) / step).astype(int) * step)
 
 
-def worthwhile(
+def prune_capacities(
     capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
 ) -> Int[np.ndarray, " _"]:
     """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
@@ -78,7 +75,9 @@ def worthwhile(
     return capacities
 
 
-def fitting(capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
+def smallest_capacities(
+    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "*batch"]
+) -> Int[np.ndarray, "*batch"]:
     """The smallest of ascending `capacities` that holds each of `counts`."""
     return capacities[np.searchsorted(capacities, counts)]
 
@@ -93,7 +92,7 @@ def at_least_one(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
 
 
-def in_front(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tree:
+def compact(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tree:
     """Entries of arrays `[n, ...]` where the mask is set, in their order, in `capacity` slots. Traced or not.
 
     Entries beyond the capacity are dropped; the values of unused slots are arbitrary.

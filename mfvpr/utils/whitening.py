@@ -36,17 +36,10 @@ class Whitening:
 
 
 def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: int) -> Whitening:
-    """Fit a whitening to a sample of vectors, float32 or float64, in double precision.
+    """Fit a whitening to a finite sample, float32 or float64, in double precision; its arrays have the sample's type.
 
     As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
     each component (the first of several) positive.
-
-    Args:
-        sample: finite.
-        dimension: number of components.
-
-    Returns:
-        Arrays of the sample's type.
 
     Raises:
         InputError: the sample has too few vectors or too few dimensions, or all its vectors are equal.

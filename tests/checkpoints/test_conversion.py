@@ -127,8 +127,8 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
     plan = blueprint(tiny_entry())
     assert dict(plan.shapes) == SHAPES
     assert plan.parameters == PARAMETERS
-    first = plan.fill(arrays)
-    plan.fill({path: 2 * array for path, array in arrays.items()})
+    first = plan.build(arrays)
+    plan.build({path: 2 * array for path, array in arrays.items()})
     np.testing.assert_array_equal(first.mix[1].kernel[...], arrays["mix.1.kernel"])
     assert first.bn.use_running_average
 

@@ -81,9 +81,7 @@ def test_few_candidates_of_other_places_make_no_answer_certain(num_others):
     model = fit_confidence(confidence_inputs(many, many), correct)
     few = Ranked(np.array([[0, 100, 200][: 1 + num_others]]), np.array([[2.2, 2.0, 1.8][: 1 + num_others]]))
     assert 0.02 < model(few, few)[0] < 0.7
-    place = Ranked(
-        np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]])
-    )  # no other place: what is known of all predictions
+    place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other: what is known of all predictions
     assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from mfvpr import frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives
-from mfvpr.evaluation import best_setting, halves, hits, neighbors
+from mfvpr.evaluation import best_setting, halves, neighbors
 from mfvpr.evaluation.selection import halves_of_map
 
 
@@ -54,13 +54,6 @@ def test_queries_without_a_place_may_be_tuned_on():
     positives = Positives.from_matrix(frame_positives(np.array([0, -1, 8, 9]), np.arange(10), tolerance=1))
     first, _ = halves(positives)
     assert list(first.tune) == [0, 1]
-
-
-def test_hits_look_at_the_first_k_and_never_at_nothing():
-    positives = Positives.from_rows([[0], [2]], 3)
-    rows = np.array([[[1, 0], [0, 2]], [[-1, -1], [2, -1]]])  # [settings, queries, depth]
-    np.testing.assert_array_equal(hits(rows, positives), [[False, False], [False, True]])
-    np.testing.assert_array_equal(hits(rows, positives, k=2), [[True, True], [False, True]])
 
 
 def test_neighbors_are_one_step_along_one_axis():

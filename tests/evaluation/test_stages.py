@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.matching import Matching, MatchSet
+from mfvpr.matching import Matching
 from mfvpr.matching import match_set as match_sets
 from mfvpr.reranking import ranking
 from mfvpr.retrieval import Retrieval
@@ -21,9 +21,9 @@ from mfvpr.storage.matches import StoredMatches, open_match_store
 from mfvpr.tuning.sweeps import sweep
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
-from tests.builders import of_query, random_matches
+from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, plain, title
-from tests.storage.synthetic_features import assert_same_match_sets, interrupt_after
+from tests.storage.synthetic_features import assert_same_match_sets
 
 pytestmark = pytest.mark.thorough
 
@@ -56,9 +56,9 @@ def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
 
 @pytest.fixture
 def open_store(tmp_path):
-    def open_store(num_queries=10, num_candidates=6, name="store"):
+    def open_store(num_queries=10, num_candidates=6):
         sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-        return open_match_store(tmp_path / name, {"name": "street"}, **sizes)
+        return open_match_store(tmp_path / "store", {"name": "street"}, **sizes)
 
     return open_store
 
@@ -95,18 +95,6 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     jax.tree.map(np.testing.assert_array_equal, one_by_one, fresh)
     rows = [sweep(scorers["h"], [{"sigma": 9.0}], match_set, candidates) for match_set in (matches, read_again)]
     np.testing.assert_array_equal(*rows)
-
-
-def test_an_interrupted_matching_goes_on_where_it_was(features, candidates, open_store):
-    with open_store() as store, pytest.raises(KeyboardInterrupt):
-        stages.match(features[1], features[0], candidates, store=store, track=interrupt_after(9))
-    with open_store() as store:
-        assert store.done.tolist() == [True] * stages.STORE_BATCH + [False] * 2
-        with pytest.raises(InputError, match=r"store: .*10 queries, got 8"):
-            stages.stored_matches(store)
-        resumed = stages.match(features[1], features[0], candidates, store=store)
-    with open_store(name="uninterrupted") as store:
-        assert_same_match_sets(resumed, stages.match(features[1], features[0], candidates, store=store))
 
 
 @pytest.fixture
@@ -190,15 +178,13 @@ SIZES = ((336, 336), (640, 480))
 def mixed_sizes():
     """Queries and candidates of two sizes, matches with a confidence."""
     rng, queries, pairs_each = np.random.default_rng(5), 4, 3
-    flat, counts = [], []
-    for query in range(queries):
-        sizes = [SIZES[query % 2], *(SIZES[place % 2] for place in range(pairs_each))]
-        pairs = [random_matches(rng, 30, sizes=(sizes[0], size)) for size in sizes[1:]]
-        for part, of_one in zip((flat, counts), of_query(pairs), strict=True):
-            part.append(of_one)
+    pairs = [
+        [random_matches(rng, 30, sizes=(SIZES[query % 2], SIZES[place % 2])) for place in range(pairs_each)]
+        for query in range(queries)
+    ]
     indices = np.tile(np.arange(pairs_each, dtype=np.int32), (queries, 1))
     listed = Shortlist(indices, rng.random(indices.shape).astype(np.float32), indices >= 0)
-    return MatchSet(flat, np.array(counts), 64), listed
+    return match_set_of(pairs, 64), listed
 
 
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)

@@ -73,28 +73,11 @@ def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth(le
         assert stats.beta(correct + 1, worth - correct).sf(high) == pytest.approx(tail)
 
 
-@pytest.mark.parametrize("recall", [0.5, 0.8, 0.95])
-@pytest.mark.parametrize("queries", [50, 100])
-def test_along_a_path_the_recall_is_in_nine_of_ten_intervals(recall, queries):
-    """At an autocorrelation of 0.8; blocks of the cube root of Q gave 34 to 78 of 100."""
-    low, high = np.array([recall_interval(hits) for hits in paths(recall, 0.8, queries)]).T
-    assert np.mean((low <= recall) & (recall <= high)) >= 0.9
-
-
 @pytest.mark.parametrize("recall", [0.5, 0.65, 0.8, 0.95])
-def test_so_it_is_where_hits_hang_together_longer_than_neighbors_say(recall):
+def test_along_a_path_the_recall_is_in_nine_of_ten_intervals(recall):
     """Thresholded Gaussian sequences of 101 queries; two standard errors are allowed for."""
     low, high = np.array([recall_interval(hits) for hits in latent_paths(recall, 0.8, 101, count=400)[0]]).T
     assert np.mean((low <= recall) & (recall <= high)) >= 0.9 - 2 * math.sqrt(0.9 * 0.1 / 400)
-
-
-def test_independent_queries_have_nearly_the_binomial_interval():
-    for hits in paths(0.8, 0, 400, count=20):
-        low, high = recall_interval(hits)
-        expected = stats.binomtest(int(hits.sum()), 400).proportion_ci()
-        assert expected.high - expected.low <= high - low
-    widths = [np.diff(recall_interval(hits)) for hits in paths(0.8, 0, 400)]
-    assert np.mean(widths) < 1.15 * 2 * 1.96 * math.sqrt(0.8 * 0.2 / 400)
 
 
 @pytest.mark.parametrize("queries", [1, 2, 9, 100])
@@ -150,21 +133,13 @@ def flips_oracle(differences, sequences, block):
 
 
 @pytest.mark.parametrize("sequences", [[30], [13, 17], [1, 20, 0, 9]])
-@pytest.mark.parametrize("block", [3, 4, 50])
+@pytest.mark.parametrize("block", [1, 3, 4, 50])
 def test_block_sign_flips_count_all_flips_of_blocks_within_a_sequence(sequences, block):
     for first, second in latent_paths(0.7, 0.6, 30, count=8, systems=2).swapaxes(0, 1):
         expected = flips_oracle((first.astype(int) - second).tolist(), sequences, block)
         got = block_sign_flips(first, second, block=block, sequences=sequences)
         assert got == (block, expected[0], pytest.approx(expected[1], rel=1e-12))
         assert block_sign_flips(second, first, block=block, sequences=sequences) == got
-
-
-def test_blocks_of_one_query_are_mcnemars():
-    for first, second in latent_paths(0.8, 0.5, 300, count=10, systems=2).swapaxes(0, 1):
-        expected = mcnemar(first, second)
-        got = block_sign_flips(first, second, block=1)
-        assert got.p_value == pytest.approx(expected.p_value, rel=1e-9)
-        assert got.blocks == expected.only_first + expected.only_second
 
 
 @pytest.mark.parametrize("sequences", [[101], [60, 41]])
@@ -218,21 +193,3 @@ def test_queries_of_one_place_differ_together(block):
         assert block_sign_flips(first, second, block=block, places=places) == (
             block, expected[0], pytest.approx(expected[1], rel=1e-12),
         )  # fmt: skip
-
-
-def test_drives_of_the_same_places_are_no_independent_ones():
-    """Two systems equally good, four drives that share half of what makes a place hard."""
-    drives, count = 4, 300
-    low = {"places": 0, "drives": 0}
-    common = np.random.default_rng(1).standard_normal((2, count, 101 + 200))
-    separate = np.random.default_rng(2).standard_normal((2, count, drives, 101 + 200))
-    latent = (common[:, :, None] + separate) / math.sqrt(2)
-    for step in range(1, latent.shape[-1]):  # an autoregression, whose start is forgotten
-        latent[..., step] = 0.5 * latent[..., step - 1] + math.sqrt(0.75) * latent[..., step]
-    hits = latent[..., -101:].reshape(2, count, -1) < 0.52
-    for first, second in hits.swapaxes(0, 1):
-        tests = {"places": {"places": np.tile(np.arange(101), drives)}, "drives": {"sequences": [101] * drives}}
-        for name, how in tests.items():
-            low[name] += block_sign_flips(first, second, **how).p_value <= 0.05
-    assert low["places"] / count <= 0.08
-    assert low["drives"] / count > 0.12

@@ -14,8 +14,7 @@ from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
 from mfvpr.matching import Matching
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.retrieval import Retrieval, RetrievalResult, WhitenedSearch
-from mfvpr.retrieval.search import EXACT
+from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
@@ -207,15 +206,6 @@ def test_a_ground_truth_of_other_images_is_told(dataset):
         result.recall([0], [0])
     with pytest.raises(InputError, match="threshold=-1: expected a number from 0"):
         result.recall([-1])
-
-
-def test_dimensions_of_both_sides_must_be_the_same():
-    rng = np.random.default_rng(0)
-    vectors = [rng.normal(size=(4, size)).astype(np.float32) for size in (3, 5)]
-    with unchecked_shapes(), pytest.raises(InputError, match=r"got 3 .*5"):
-        EXACT.shortlist(*vectors, 2)
-    with pytest.raises(InputError, match="dimension=0: expected at least 1"):
-        WhitenedSearch(0)
 
 
 def test_images_of_nothing_have_no_shortlist(dataset, tmp_path):

@@ -31,7 +31,7 @@ SIZE = (160, 128)
 def _vacant(outputs):
     """A network that is never run."""
     plan = plan_network(partial(VggNetVlad, 2, outputs))
-    return plan.fill({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
+    return plan.build({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
 
 
 SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}

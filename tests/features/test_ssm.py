@@ -101,7 +101,7 @@ def test_maps_are_of_unit_length_where_there_is_something():
 def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, zero_row):
     rng, positions = np.random.default_rng(3), Windows((6, 6, 2), 3)
     how = WindowFitting(4, 5, windows_at_most, zero_row, "float64", seed=7)
-    rows = how.draw_rows(9)
+    rows = how.sample_rows(9)
     assert rows == sorted(set(rows))
     assert len(rows) == 5
     maps = {row: rng.normal(size=(6, 6, 2)) for row in rows}
@@ -112,8 +112,8 @@ def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, ze
     expected = fit_whitening(sample, 4)
     np.testing.assert_array_equal(learned.components, expected.components)
     np.testing.assert_array_equal(learned.mean, expected.mean)
-    assert replace(how, max_images=None).draw_rows(9) == [*range(9)]
-    assert replace(how, seed=8).draw_rows(9) != rows
+    assert replace(how, max_images=None).sample_rows(9) == [*range(9)]
+    assert replace(how, seed=8).sample_rows(9) != rows
 
 
 def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):

@@ -31,7 +31,7 @@ match = jax.jit(mfvpr.match, static_argnames="cross_check")
 def described(maps, stage, num_database):
     """Whitened windows `[V, D']` of maps, learned from the first, those of the database."""
     positions, how = Windows(maps.shape[1:], SIZES[stage - 1]), FITTINGS[stage - 1]
-    learned = how.fit([dict(enumerate(maps[:num_database]))], positions, how.draw_rows(num_database))
+    learned = how.fit([dict(enumerate(maps[:num_database]))], positions, how.sample_rows(num_database))
     vectors = np.asarray(project(maps, *kernels(learned, positions), stride=1))
     return vectors[:num_database], vectors[num_database:]
 

@@ -12,7 +12,7 @@ from tests.random_checkpoints import netvlad_shapes, random_checkpoint
 def fill(build, table, tensors):
     """The network of a constructor."""
     plan = plan_network(build)
-    return plan.fill(convert(tensors, table, plan.shapes))
+    return plan.build(convert(tensors, table, plan.shapes))
 
 
 def fill_published(name, tensors):

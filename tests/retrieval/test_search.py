@@ -15,6 +15,7 @@ from mfvpr.retrieval.search import EXACT
 from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import unit
+from tests.shapes import unchecked_shapes
 
 
 def test_shortlist_is_the_exact_order():
@@ -123,19 +124,21 @@ def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
     ks, rows = [1, 2, 9], list(range(7))
     rng.shuffle(rows)
     parts = [Tally.of(order[part_rows], positives[part_rows], ks) for part_rows in (rows[:cut], rows[cut:])]
-    merged = parts[1].merged(parts[0])
+    merged = parts[1].merge(parts[0])
     np.testing.assert_array_equal(merged.recall, recall_at_k(order, positives, ks))
     assert merged.queries == 7
     np.testing.assert_array_equal(Tally.of(np.zeros((0, 4), int), positives[:0], ks).recall, [0, 0, 0])
 
 
-@pytest.mark.parametrize("queries, database", [(0, 3), (3, 0)])
-def test_a_search_needs_both_sides(queries, database):
-    with pytest.raises(InputError, match=f"got {queries} of queries and {database} of the database"):
-        EXACT.shortlist(np.ones((queries, 4), np.float32), np.ones((database, 4), np.float32), 2)
-
-
-def test_what_is_excluded_is_of_these_queries():
-    descriptors = np.eye(3, dtype=np.float32)
-    with pytest.raises(InputError, match=r"3 queries .*3 database images, got 2 and 3"):
-        EXACT.shortlist(descriptors, descriptors, 2, excluded=Positives.from_rows([[0], [1]], 3))
+@pytest.mark.parametrize(
+    ("queries", "database", "excluded", "words"),
+    [
+        ((0, 4), (3, 4), None, "got 0 of queries and 3 of the database"),
+        ((3, 4), (0, 4), None, "got 3 of queries and 0 of the database"),
+        ((4, 3), (4, 5), None, r"got 3 .*5"),
+        ((3, 3), (3, 3), Positives.from_rows([[0], [1]], 3), r"3 queries .*3 database images, got 2 and 3"),
+    ],
+)
+def test_sides_that_do_not_fit_are_refused(queries, database, excluded, words):
+    with unchecked_shapes(), pytest.raises(InputError, match=words):
+        EXACT.shortlist(np.ones(queries, np.float32), np.ones(database, np.float32), 2, excluded=excluded)

@@ -111,12 +111,6 @@ def test_a_store_is_read_while_another_process_writes_it(tmp_path, request):
         assert before.done.tolist() == [True, False, False]
 
 
-def test_who_completes_a_store_lets_others_read_it(tmp_path):
-    with open_store(tmp_path / "s", RECIPE, num_images=3) as writer:
-        writer.write({row: features_of(row) for row in range(3)})
-        assert len(read_all(tmp_path / "s")) == 3
-
-
 def test_a_complete_store_is_not_written(tmp_path):
     fill(tmp_path / "s")
     DAMAGE["empty"](file_of(tmp_path / "s"))

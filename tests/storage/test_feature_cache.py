@@ -224,13 +224,10 @@ def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path)
     queries, describer = image_folder(small_street / "queries"), Aggregated(SIFT, VladFitting(num_words=4))
     cache = FeatureCache(tmp_path)
     [local] = cache.local(folder, SIFT)
-    expected = VladFitting(num_words=4).fit(local)(all_of(local))
-    np.testing.assert_allclose(cache.vectors(folder, describer, folder).values, expected, atol=1e-6)
-    [query_features] = cache.local(queries, SIFT)
-    np.testing.assert_allclose(
-        cache.vectors(queries, describer, folder).values,
-        VladFitting(num_words=4).fit(local)(all_of(query_features)), atol=1e-6,
-    )  # fmt: skip
+    vlad = VladFitting(num_words=4).fit(local)
+    for images in (folder, queries):
+        [features] = cache.local(images, SIFT)
+        np.testing.assert_allclose(cache.vectors(images, describer, folder).values, vlad(all_of(features)), atol=1e-6)
 
 
 @pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 155), (1415, 681, 1942, 989)])

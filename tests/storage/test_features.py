@@ -61,11 +61,3 @@ def test_size_on_disk(tmp_path):
     assert apparent <= size < 0.52 * 2064 * sum(counts)
     forecast = forecast_bytes(len(counts), np.mean(counts), 512)
     assert 0.83 * forecast < size <= forecast + 100_000  # random descriptors compress worst
-
-
-def test_a_global_descriptor_takes_the_space_of_one(tmp_path):
-    with open_store(tmp_path / "s", RECIPE, num_images=2) as store:
-        store.write({row: features_of(row, 1, 8192) for row in range(2)})
-    for row in range(2):
-        assert 2 * 8192 <= (tmp_path / "s" / f"{row}-1.npz").stat().st_size < 2 * 8192 + 2500
-    assert 2 * 2 * 8192 < forecast_bytes(2, 1, 8192) <= 2 * (2 * 8192 + 4096)

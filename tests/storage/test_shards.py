@@ -33,14 +33,31 @@ HOW = {"candidates": 4, "fused": {"histogram": Fusion("zscore")}, "cohort": 1,
        "correlated": {"count": FrameCorrelation(1)}}  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def dataset(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+def run_of(dataset, extractor=SIFT, retriever=VLAD, *, skip_bad=False, **how):
+    """A function of a cache: the evaluation."""
+    return lambda cache: mfvpr.evaluate(
+        dataset, extractor, retriever, SCORERS, cache=replace(cache, skip_bad=skip_bad), **how
+    )
+
+
+def counted_run(dataset):
+    """The evaluation with all options, and the extractor that counts its images."""
+    extractor = Counted()
+    return run_of(dataset, extractor, Retrieval(Aggregated(extractor, VladFitting(num_words=8))), **HOW), extractor
 
 
 @pytest.fixture(scope="module")
 def plain(dataset, tmp_path_factory):
-    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, cache=FeatureCache(tmp_path_factory.mktemp("plain")), **HOW)
+    """The result without shards, and the hashes of its rows."""
+    root = tmp_path_factory.mktemp("plain")
+    return counted_run(dataset)[0](FeatureCache(root)), row_hashes(root)
+
+
+def row_hashes(root):
+    return {
+        (path.relative_to(root).parts[0], path.name): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in root.rglob("[0-9]*-*.npz")
+    }
 
 
 def shared(root, count, run, seed=0):
@@ -70,35 +87,29 @@ def assert_same(report, expected):
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_shards_give_what_one_machine_gives(dataset, plain, tmp_path, count):
     """Frame correlation, which looks at the queries before, and a cohort, which looks at all images, among it."""
-    extractor = Counted()
-    retriever = Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
-
-    def run(cache):
-        return mfvpr.evaluate(dataset, extractor, retriever, SCORERS, cache=cache, **HOW)
-
+    run, extractor = counted_run(dataset)
     result, lines = shared(tmp_path, count, run)
-    assert_same(result, plain)
+    assert_same(result, plain[0])
+    assert row_hashes(tmp_path) == plain[1]
     assert extractor.seen == len(dataset.database) + len(dataset.queries)  # each image once
     assert lines[-1] == "its images and queries are done"
     missing = [line for line in lines if line != lines[-1]]
     assert bool(missing) == (count > 1)
     assert all(re.search(r"of \d+ are missing, of shards \d", line) for line in missing)
-    assert {path.parent.parent.name for path in tmp_path.rglob("[0-9]*-*.npz")} == {"shards"}
+    folders = {path.parent for path in tmp_path.rglob("[0-9]*-*.npz")}
+    assert {path.parent.name for path in folders} == {"shards"}
+    for folder in folders:
+        assert folder.name in [f"{index}-of-{count}" for index in range(count)]
+        assert json.loads((folder / "manifest.json").read_text())["format"].startswith("mfvpr ")
 
 
 def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
     """With a retrieval of its own descriptors, as for a single machine."""
-    retriever, plain_root = Retrieval(Mean()), tmp_path / "plain"
-    expected = mfvpr.evaluate(dataset, SIFT, retriever, SCORERS, candidates=2, cache=FeatureCache(plain_root))
-    result, _ = shared(
-        tmp_path / "s", 3, lambda cache: mfvpr.evaluate(dataset, SIFT, retriever, SCORERS, candidates=2, cache=cache)
-    )
+    run = run_of(dataset, retriever=Retrieval(Mean()), candidates=2)
+    expected = run(FeatureCache(tmp_path / "plain"))
+    result, _ = shared(tmp_path / "s", 3, run)
     assert_same(result, expected)
-
-    def files(root):
-        return sorted(path.name for path in root.rglob("*-*.npz") if path.name[0].isdigit() and "Sift" in str(path))
-
-    assert files(tmp_path / "s") == files(plain_root)
+    assert row_hashes(tmp_path / "s") == row_hashes(tmp_path / "plain")
 
 
 @pytest.mark.slow
@@ -108,23 +119,17 @@ def test_several_sequences_and_scales_and_more_shards_than_images(small_street, 
         small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
     )
     extractor = TwoScales()
-    how = {"candidates": 3, "memory": 1e-4}
-    expected = mfvpr.evaluate(
-        several, extractor, Retrieval(extractor), SCORERS, cache=FeatureCache(tmp_path / "s"), **how
-    )
+    run = run_of(several, extractor, Retrieval(extractor), candidates=3, memory=1e-4)
+    expected = run(FeatureCache(tmp_path / "s"))
     for count in (3, 17):
-        result, _ = shared(
-            tmp_path / f"s{count}", count,
-            lambda cache: mfvpr.evaluate(several, extractor, Retrieval(extractor), SCORERS, cache=cache, **how),
-        )  # fmt: skip
-        assert_same(result, expected)
+        assert_same(shared(tmp_path / f"s{count}", count, run)[0], expected)
 
 
 @pytest.mark.parametrize("store", ["Sift", "matches"])
 def test_damaged_rows_of_any_shard_are_made_again(dataset, tmp_path, store):
     def run(cache):
         try:
-            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
+            return run_of(dataset, candidates=3)(cache)
         except InputError as error:  # the row is removed, and made again
             messages.append(str(error))
             return run(cache)
@@ -155,9 +160,7 @@ class Drawn:
 
 
 def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
-    def run(cache):
-        return mfvpr.evaluate(dataset, SIFT, Drawn(), SCORERS, candidates=3, cache=cache)
-
+    run = run_of(dataset, retriever=Drawn(), candidates=3)
     result, _ = shared(tmp_path, 3, run)
     [path] = tmp_path.glob("matches-*/shortlist.npz")
     expected = read_arrays(path, path.parent.name)["indices"]
@@ -167,9 +170,8 @@ def test_candidates_are_those_of_the_first_shard(dataset, tmp_path):
     np.testing.assert_array_equal(run(FeatureCache(tmp_path)).matched[0].candidates.indices, expected)
 
 
-def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
+def test_what_was_bad_once_stays_so(dataset, tmp_path, monkeypatch):
     """An image that one shard could not read, and can be read now: all go on without it."""
-    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
     broken = [True]
     read = type(dataset.database).read
 
@@ -182,8 +184,7 @@ def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
 
     def run(cache):
         try:
-            cache = replace(cache, skip_bad=True)
-            return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=cache)
+            return run_of(dataset, skip_bad=True, candidates=5)(cache)
         finally:
             broken[0] &= cache.shard is None or cache.shard.index != shard_of("0003.png", 2)
 
@@ -195,25 +196,6 @@ def test_what_was_bad_once_stays_so(small_street, tmp_path, monkeypatch):
         assert not (result.matched[0].candidates.indices == 3).any()
 
 
-def test_stores_of_shards_have_the_same_rows_byte_by_byte(dataset, tmp_path):
-    def run(cache):
-        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
-
-    run(FeatureCache(tmp_path / "plain"))
-    shared(tmp_path / "shards", 2, run)
-
-    def hashes(root):
-        return {
-            (path.relative_to(root).parts[0], path.name): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in root.rglob("[0-9]*-*.npz")
-        }
-
-    assert hashes(tmp_path / "shards") == hashes(tmp_path / "plain")
-    for path in (tmp_path / "shards").glob("*/shards/*"):
-        assert path.name in ("0-of-2", "1-of-2")
-        assert json.loads((path / "manifest.json").read_text())["format"].startswith("mfvpr ")
-
-
 def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
     for side in ("database", "queries"):
         (tmp_path / side).mkdir()
@@ -222,10 +204,7 @@ def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
     (tmp_path / "database" / "0002.png").write_bytes(b"no image")
     dataset = folder_dataset(tmp_path / "database", tmp_path / "queries", ground_truth="order")
 
-    def run(cache):
-        cache = replace(cache, skip_bad=True)
-        return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=3, cache=cache)
-
+    run = run_of(dataset, skip_bad=True, candidates=3)
     expected = run(FeatureCache(tmp_path / "plain"))
     for count in (2, 4):
         result, _ = shared(tmp_path / f"s{count}", count, run)

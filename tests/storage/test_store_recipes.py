@@ -54,6 +54,8 @@ def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidat
                 stages.match(drawn, drawn, shortlist, store=store)
             assert digests(store.folder) == before
     with opened() as store:
+        with pytest.raises(InputError, match=r"s: .*6 queries, got 4"):
+            stages.stored_matches(store)
         again = stages.match(drawn, drawn, candidates, store=store)
         assert_same_match_sets(again, stages.match(drawn, drawn, candidates))
         np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, candidates.indices)

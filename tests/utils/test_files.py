@@ -3,7 +3,7 @@
 import pytest
 
 from mfvpr.utils import InputError
-from mfvpr.utils.files import below
+from mfvpr.utils.files import path_inside
 
 
 @pytest.fixture
@@ -20,19 +20,19 @@ def root(tmp_path):
 
 
 def test_files_of_a_folder(root, monkeypatch):
-    assert below(root, "a/0.png") == below(root, "in") == root / "a/0.png"
-    assert below(root, "a/no such..png") == root / "a/no such..png"
-    assert below(root, str(root / "a/0.png")) == root / "a/0.png"
+    assert path_inside(root, "a/0.png") == path_inside(root, "in") == root / "a/0.png"
+    assert path_inside(root, "a/no such..png") == root / "a/no such..png"
+    assert path_inside(root, str(root / "a/0.png")) == root / "a/0.png"
     (root.parent / "link").symlink_to(root)
-    assert below(root.parent / "link", "in") == root / "a/0.png"  # where the folder itself is, its owner knows
+    assert path_inside(root.parent / "link", "in") == root / "a/0.png"  # where the folder itself is, its owner knows
     monkeypatch.chdir(root)
-    assert below(root.relative_to(root), "in") == root / "a/0.png"
+    assert path_inside(root.relative_to(root), "in") == root / "a/0.png"
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../secret", "a/../../secret", "a/../a/0.png", "out", "up/secret",
                                   "around", "a\0b", "../\n", "x" * 5000 + "/.."])  # fmt: skip
 def test_names_that_lead_elsewhere(root, name):
     with pytest.raises(InputError, match="expected the name of a file below") as refused:
-        below(root, name)
+        path_inside(root, name)
     assert len(str(refused.value)) < 500
     assert "\n" not in str(refused.value)

@@ -1,29 +1,16 @@
-"""Locks between processes, and between blocks of one."""
+"""Locks of files and folders."""
 
 import fcntl
 import os
-import subprocess
-import sys
 import threading
 
 import pytest
 
 from mfvpr.utils.locks import lock, lock_folder
 
-HOLD = ("import fcntl, os, sys\n"
-        "handle = os.open(sys.argv[1], os.O_RDONLY)\n"
-        "fcntl.flock(handle, fcntl.LOCK_EX); print('held', flush=True); sys.stdin.read()")  # fmt: skip
-
 
 def refuse(_):
     raise KeyError("in use")
-
-
-def hold(path):
-    """A process that holds a path's lock as earlier versions do."""
-    process = subprocess.Popen([sys.executable, "-c", HOLD, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"held\n"
-    return process
 
 
 def test_a_folder_is_held_by_one_block_and_left_empty(tmp_path):
@@ -36,16 +23,6 @@ def test_a_folder_is_held_by_one_block_and_left_empty(tmp_path):
         os.close(handle)
     with lock_folder(tmp_path, KeyError("in use")):
         assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_ends_with_its_process(tmp_path):
-    with hold(tmp_path) as process:
-        with pytest.raises(KeyError, match="in use"), lock_folder(tmp_path, KeyError("in use")):
-            pass
-        process.kill()
-        process.wait()
-        with lock_folder(tmp_path, KeyError("in use")):
-            pass
 
 
 def test_a_conflict_without_an_error_waits(tmp_path):

@@ -57,7 +57,7 @@ def test_capacities_are_few_and_hold_every_row(counts, step):
     assert (capacities % step == 0).all()
     assert (np.diff(capacities) > 0).all()
     assert capacities[0] > 0
-    fitting = ragged.fitting(capacities, counts)
+    fitting = ragged.smallest_capacities(capacities, counts)
     for count, capacity in zip(counts, fitting, strict=True):
         assert capacity == min(size for size in capacities if size >= count)
     if counts.any():
@@ -66,8 +66,8 @@ def test_capacities_are_few_and_hold_every_row(counts, step):
 
 def test_a_capacity_is_worth_what_it_saves():
     capacities, counts = np.array([8, 16]), np.array([8, 7, 0, 16, 5])
-    assert ragged.worthwhile(capacities, counts, 3 * 8).tolist() == [8, 16]
-    assert ragged.worthwhile(capacities, counts, 3 * 8 + 1).tolist() == [16]
+    assert ragged.prune_capacities(capacities, counts, 3 * 8).tolist() == [8, 16]
+    assert ragged.prune_capacities(capacities, counts, 3 * 8 + 1).tolist() == [16]
 
 
 def test_empty_rows_make_no_capacity_smaller():
@@ -80,17 +80,17 @@ def test_the_last_entry_is_repeated():
     np.testing.assert_array_equal(ragged.repeat_last(np.array([5]), 1), [5])
 
 
-in_front = jax.jit(ragged.in_front, static_argnums=2)
+compact = jax.jit(ragged.compact, static_argnums=2)
 
 
 @given(st.lists(st.booleans(), min_size=12, max_size=12), st.sampled_from([1, 5, 14]))
 def test_marked_entries_come_to_the_front(mask, capacity):
     values = np.arange(12, dtype=np.float32) + 1
-    front = in_front({"a": values}, np.array(mask), capacity)["a"]
+    front = compact({"a": values}, np.array(mask), capacity)["a"]
     expected = values[np.array(mask)][:capacity]
     assert front.shape == (capacity,)
     np.testing.assert_array_equal(front[: len(expected)], expected)
 
 
 def test_no_entries_can_be_indexed():
-    assert ragged.in_front({"a": np.zeros((0, 2))}, jnp.zeros(0, bool), 3)["a"].shape == (3, 2)
+    assert ragged.compact({"a": np.zeros((0, 2))}, jnp.zeros(0, bool), 3)["a"].shape == (3, 2)

@@ -65,6 +65,11 @@ def test_a_descriptor_that_is_not_finite_teaches_nothing():
         np.testing.assert_array_equal(from_broken, expected)
 
 
+def test_no_components_are_refused_before_the_fit():
+    with pytest.raises(InputError, match="dimension=0: expected at least 1"):
+        WhitenedSearch(0)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.1, 1e6])
 @pytest.mark.parametrize("shape", [(9, 4), (4, 9)], ids=str)
 def test_equal_vectors_raise(value, shape):

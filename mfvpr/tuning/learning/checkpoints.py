@@ -44,14 +44,9 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
 
 
 def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
-    """Write the checkpoint of a step, and remove all but the last two.
+    """Write the checkpoint of a step above all earlier ones, and remove all but the last two.
 
-    Args:
-        folder: of checkpoints; made if it is missing.
-        step: above the steps of earlier checkpoints.
-        recipe: of the training, JSON values.
-        state: pytree of arrays.
-        progress: JSON values.
+    `state` is a pytree of arrays; `recipe` and `progress` are JSON values.
 
     Raises:
         InputError: the disk is full, or cannot be written. Earlier checkpoints stay.
@@ -70,10 +65,7 @@ def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progres
 def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
     """State and progress of the newest checkpoint, None without one. Nothing in the folder is changed.
 
-    Args:
-        folder: of `save`, may be missing.
-        recipe: of the training.
-        state: pytree of the same structure and shapes.
+    `state` is a pytree of the same structure and shapes. The folder may be missing.
 
     Raises:
         InputError: the folder is no folder of checkpoints, the checkpoint has another recipe, or it is damaged.

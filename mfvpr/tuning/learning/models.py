@@ -47,8 +47,7 @@ class Model:
         """A model that starts from the values of a hard scorer.
 
         Args:
-            scorer: the hand-set one.
-            unit: spread of its scores.
+            scorer: the hand-set one; `unit` is the spread of its scores.
             c: the retrieval's weight to start with; None = not fused.
             weight: the match weight to start with; None = that of the scorer, which is not learned.
         """
@@ -85,20 +84,17 @@ class Model:
 
     def objective(self, loss: Loss) -> Objective:
         """A function of parameters and a batch: the mean loss of its queries, or of its matches with a teacher."""
-        return self._of_ranking(loss) if self.teacher is None else partial(_of_matches, self.teacher)
+        return partial(self._ranking_loss, loss) if self.teacher is None else partial(_match_loss, self.teacher)
 
-    def _of_ranking(self, loss: Loss) -> Objective:
-        def mean(parameters: Parameters, batch: Batch) -> Array:
-            scorer, c = self.scorer_of(parameters), self.c_of(parameters)
-            scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
-            scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
-            logits = scores / self.unit * jnp.exp(parameters["sharpness"])
-            return losses.mean_loss(loss, logits, batch.positives, batch.mask)
-
-        return mean
+    def _ranking_loss(self, loss: Loss, parameters: Parameters, batch: Batch) -> Array:
+        scorer, c = self.scorer_of(parameters), self.c_of(parameters)
+        scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
+        scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
+        logits = scores / self.unit * jnp.exp(parameters["sharpness"])
+        return losses.mean_loss(loss, logits, batch.positives, batch.mask)
 
 
-def _of_matches(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
+def _match_loss(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
     """Cross entropy of the labels of matches, `[]`, in nats; correct and incorrect ones have the same total weight."""
     weight: LearnedWeight = parameters["weight"]
 

@@ -20,9 +20,7 @@ def can_learn(scorer: Any) -> bool:
 def starts(scorer: Any, spread: float) -> dict[str, float]:
     """Values to start learning from, by field: the scorer's values, or declared ones for fields that are None.
 
-    Args:
-        scorer: a value.
-        spread: standard deviation of its scores.
+    `spread` is the standard deviation of the scores.
     """
     values = {}
     for name, field in parameters_of(scorer).items():
@@ -34,11 +32,7 @@ def starts(scorer: Any, spread: float) -> dict[str, float]:
 
 
 def to_logarithms(values: Mapping[str, float | Array]) -> dict[str, Array]:
-    """Unbounded parameters from positive values of any shape.
-
-    Raises:
-        InputError: a value is not above 0, or infinite.
-    """
+    """Unbounded parameters from positive values of any shape; others raise `InputError`."""
     for name, value in values.items():
         if not np.all(np.isfinite(value) & (np.asarray(value) > 0)):
             raise InputError(f"{name}={value}: expected a number above 0 to start from")

@@ -110,11 +110,7 @@ def training_splits(
 ) -> list[TrainingSplit]:
     """Split each half of a protocol into queries to train on and queries to validate on.
 
-    Args:
-        match_set: of all queries.
-        candidates: their shortlist.
-        protocol: the ground truth, with halves.
-        retrieval_score: the retrieval's part of a combined score, see `mfvpr.reranking.ranking.retrieval_scores`.
+    `retrieval_score` is the retrieval's part of a combined score, see `mfvpr.reranking.ranking.retrieval_scores`.
 
     Raises:
         InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.

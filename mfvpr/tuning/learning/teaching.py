@@ -60,9 +60,6 @@ def start(
     """The model that learns from rankings, starting from a hard scorer.
 
     Args:
-        split: to learn on.
-        scorer: the hand-set one.
-        options: of the learning.
         fused: learn the retrieval's weight as well.
         learned_weight: learn the match weight as well, starting from 1 for every match.
     """
@@ -76,7 +73,7 @@ def start(
 
 
 def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
-    """The model that learns a match weight from labels of single matches; for the arguments see `start`."""
+    """The model that learns a match weight from labels of single matches."""
     sizes = split.match_set.image_sizes
     seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))
@@ -93,14 +90,7 @@ def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
 
 
 def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) -> Fit:
-    """Learn a model's parameters on one half of the path.
-
-    Args:
-        split: to learn on.
-        model: the start.
-        options: of the learning.
-        keeping: `folder`, `recipe` and `track` of `mfvpr.tuning.learning.training.fit`.
-    """
+    """Learn a model's parameters; `keeping` are `folder`, `recipe` and `track` of `training.fit`."""
     size = options.batch
     objective = model.objective(options.loss)
     mean_loss = jax.jit(objective)

@@ -55,14 +55,8 @@ def grid(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 def distinct(settings: Sequence[Setting]) -> tuple[list[dict[str, Any]], list[list[int]]]:
     """Settings with different scores, without `c`, and for each the places in `settings` that share its scores."""
-    places: dict[Any, list[int]] = {}
-    unique = {}
-    for place, setting in enumerate(settings):
-        without_c = {name: value for name, value in setting.items() if name != FUSION}
-        key = _key(without_c)
-        places.setdefault(key, []).append(place)
-        unique.setdefault(key, without_c)
-    return list(unique.values()), list(places.values())
+    by_scores = _group_by(settings, range(len(settings)), lambda name, _: name != FUSION)
+    return [setting for setting, _ in by_scores], [places for _, places in by_scores]
 
 
 def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]) -> Iterator[Group]:

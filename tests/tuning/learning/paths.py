@@ -5,20 +5,18 @@ import numpy as np
 from mfvpr import Shortlist
 from mfvpr.datasets import Positives
 from mfvpr.evaluation import EvaluationProtocol, halves
-from mfvpr.matching import MatchSet
 from mfvpr.tuning.learning.splits import training_splits
-from tests.builders import of_query, random_matches
+from tests.builders import match_set_of, random_matches
 
 QUERIES = 32
 TOLERANCES = (0, 1, 2)  # frames; the middle one decides
 SIZES = (96, 200)  # px, of every other image: the first is the smaller
 
 
-def matches_of(query, candidates, rng, sizes):
-    """Matches of one query with its candidates, and their counts; those of correct candidates share a shift."""
-    pairs = [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
-             for c in candidates]  # fmt: skip
-    return of_query(pairs)
+def pairs_of(query, candidates, rng, sizes):
+    """Matches of one query with each of its candidates."""
+    return [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
+            for c in candidates]  # fmt: skip
 
 
 def path(*, sizes=SIZES, only_right=(), seed=0):
@@ -28,8 +26,7 @@ def path(*, sizes=SIZES, only_right=(), seed=0):
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
     scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
     candidates = Shortlist(indices=indices, scores=scores, mask=mask)
-    of_queries = [matches_of(query, indices[query], rng, sizes) for query in range(QUERIES)]
-    matches = MatchSet([flat for flat, _ in of_queries], np.array([counts for _, counts in of_queries]), 16)
+    matches = match_set_of([pairs_of(query, indices[query], rng, sizes) for query in range(QUERIES)], 16)
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
     protocol = EvaluationProtocol(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from mfvpr import HistogramOfShifts, InputError
-from mfvpr.datasets import Positives
-from mfvpr.datasets.positives import join_positives
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.splits import VALIDATION, training_splits
@@ -91,13 +89,6 @@ def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
     for setting in ({}, {"c": None}, {"c": 3.0}):
         got = compared.evaluate("it", scorer, setting).hits[:, alone.half.report]
         np.testing.assert_array_equal(got, expected.evaluate("it", scorer, setting).hits)
-
-
-def test_databases_stand_side_by_side():
-    first, second = Positives.from_rows([[0, 2], []], 3), Positives.from_rows([[1], [0], []], 2)
-    both = join_positives([first, second])
-    assert [both.of(query).tolist() for query in range(5)] == [[0, 2], [], [4], [3], []]
-    assert both.num_database == 5
 
 
 def test_sets_that_do_not_go_together_are_refused(parts):

@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.tuning.learning.training import TrainingError
-from tests.tuning.learning.toys import START, batches, contents, objective, program, same, train, validate
+from tests.tuning.learning.toys import START, batches, contents, objective, same, train, validate
 
 pytestmark = pytest.mark.thorough
 
@@ -127,28 +127,6 @@ def test_an_ended_training_stays_ended(tmp_path):
     assert same(train(tmp_path, steps=100, patience=3, batches=None), ended)
 
 
-@pytest.mark.parametrize("stop", [2, 13])
-def test_an_interruption_changes_nothing(tmp_path, uninterrupted, stop):
-    def interrupted(step):
-        if step == stop:
-            raise KeyboardInterrupt
-        return batches(step)
-
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path, batches=interrupted)
-    assert same(train(tmp_path), uninterrupted)
-
-
-def test_killed_in_the_middle_it_ends_the_same(tmp_path, uninterrupted):
-    done = program(f"folder = Path({str(tmp_path)!r}); print(killed(lambda: train(folder), folder, 80))")
-    assert done.stdout == "True\n", done.stderr
-    left = {path.name for path in tmp_path.iterdir()}
-    assert "10" in left
-    assert "20" not in left
-    assert same(train(tmp_path), uninterrupted)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["15", "20"]
-
-
 @pytest.mark.parametrize(
     "broken, culprit",
     [
@@ -190,11 +168,5 @@ def test_impossible_settings_are_refused(incorrect):
 
 def test_progress_is_told():
     tracked = []
-
-    def track(steps, total):
-        for step in steps:
-            tracked.append((step, total))
-            yield step
-
-    train(steps=7, track=track)
+    train(steps=7, track=lambda steps, total: (tracked.append((step, total)) or step for step in steps))
     assert tracked == [(step, 7) for step in range(7)]

@@ -17,7 +17,7 @@ from mfvpr.scoring.parameters import with_parameters
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps.settings import groups
 from mfvpr.types import Shortlist
-from tests.builders import of_query, random_matches
+from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
 from tests.storage.synthetic_features import DAMAGE, interrupt_after
 
@@ -31,20 +31,15 @@ def make_set():
     """Few to many matches a pair, with a confidence, some pairs without; images of two sizes on either side; and a
     shortlist that ends early for one query."""
     rng = np.random.default_rng(4)
-    flat, counts = [], []
+    pairs = []
     for query in range(QUERIES):
-        sizes = [((168, 168), (320, 240))[query % 2], *[((168, 168), (200, 150))[row % 2] for row in range(CANDIDATES)]]
-        pairs = [
-            random_matches(rng, count, sizes=(sizes[0], size))
-            for count, size in zip(rng.permutation([0, 3, 20, 33, 60]), sizes[1:], strict=True)
-        ]
-        for part, of_one in zip((flat, counts), of_query(pairs), strict=True):
-            part.append(of_one)
+        size = ((168, 168), (320, 240))[query % 2]
+        counts = enumerate(rng.permutation([0, 3, 20, 33, 60]))
+        pairs.append([random_matches(rng, n, sizes=(size, ((168, 168), (200, 150))[row % 2])) for row, n in counts])
     indices = np.stack([rng.permutation(DATABASE)[:CANDIDATES] for _ in range(QUERIES)]).astype(np.int32)
     indices[2, 3:] = -1
     scores = np.sort(rng.random((QUERIES, CANDIDATES)).astype(np.float32))[:, ::-1]
-    counts = np.array(counts)
-    return MatchSet(flat, counts, 96), Shortlist(indices, scores, indices >= 0)
+    return match_set_of(pairs, 96), Shortlist(indices, scores, indices >= 0)
 
 
 @pytest.fixture(scope="module")
