@@ -66,9 +66,8 @@ def _draw_averages(path: Path, titles: Sequence[str], groups: Mapping[str, Mappi
     for number, (label, members) in enumerate(groups.items()):
         places = [titles.index(title) + 0.4 * (number - (len(groups) - 1) / 2) for title in members]
         color = _PRINTED if label == _OVER_PAPERS else _OURS
-        axes.barh(places, [*members.values()], 0.38, label=label, color=color)
-        for place, value in zip(places, members.values(), strict=True):
-            axes.text(value + 0.5, place, f"{value:.1f}", va="center", fontsize=7)
+        bars = axes.barh(places, [*members.values()], 0.38, label=label, color=color)
+        axes.bar_label(bars, fmt="%.1f", padding=2, fontsize=7)
     _save_bars(figure, path, titles, "mean Recall@1 within 2 frames, %", 108)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments import build, truth
+from experiments import build, run_folder, truth
 from experiments.console import tell
 from experiments.launch import how_to_install
 from experiments.paper import runs, systems, timing
@@ -131,7 +131,8 @@ def evaluate_all(
                 except InputError as error:
                     fail(f"{run} on {place.name}: {error}")
                     continue
-            runs.write_missing_page(folder)
+            if not (folder / PAGE).is_file():
+                run_folder.report_page(folder)
     if finished:
         tell(f"{finished} of {total} evaluations were finished before")
     return datasets, failures

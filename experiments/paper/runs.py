@@ -16,7 +16,6 @@ from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
 from experiments.settings import CONF, SettingsError, check
 from mfvpr.checkpoints import REGISTRY, files
-from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.runs import write_json
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
@@ -117,12 +116,6 @@ def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
 
         run_folder.write_files(folder, settings, evaluation.ground_truth(outcome), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
-
-
-def write_missing_page(folder: Path) -> None:
-    """Write the page of a finished run, unless it is there."""
-    if not (folder / PAGE).is_file():
-        run_folder.report_page(folder)
 
 
 def read_json(path: Path) -> Any:

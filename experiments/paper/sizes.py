@@ -18,9 +18,7 @@ _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
     """Average bytes of what was already extracted: `local` features, and the `descriptor` of retrieval."""
     cache = tools.cache
-    sources = cache.local(
-        database, fit_to_database(tools.extractor, database, cache), []
-    )  # nothing is extracted for this
+    sources = cache.local(database, fit_to_database(tools.extractor, database, cache), [])  # extracts nothing
     keypoint = 0 if isinstance(tools.extractor, _GRIDS) else _KEYPOINT
     local = 0.0
     for features in sources:

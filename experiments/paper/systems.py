@@ -84,10 +84,8 @@ def _stand_ins(features: str, title: str) -> Iterator[Row]:
 
 ROWS = (*_PAPER, *_stand_ins("sift", "SIFT"), *_stand_ins("aliked", "ALIKED"))
 
-_SIFT, _ALIKED = (
-    ("features=sift", "retrieval=vlad"),
-    ("features=aliked", "features.weights=aliked-n32", "retrieval=vlad"),
-)
+_SIFT = ("features=sift", "retrieval=vlad")
+_ALIKED = ("features=aliked", "features.weights=aliked-n32", "retrieval=vlad")
 _ALL, _FEW = ("scorer=compared", "candidates=50"), ("scorer=histogram", "candidates=10")
 _RUNS = {
     "sift_50": (*_SIFT, *_ALL),

@@ -104,13 +104,6 @@ class Evaluations:
         recalls = (result.recall[OVERALL] for (_, name), result in self.results.items() if name == dataset)
         return sorted(next(recalls, {}))
 
-    def rows_on(self, datasets: Sequence[str]) -> list[Row]:
-        """Rows that were evaluated on one of the data sets, or are printed for it."""
-        return [
-            row for row in self.rows
-            if any((row.name, name) in self.results or printed_recall(row.name, name) for name in datasets)
-        ]  # fmt: skip
-
 
 def row_result(row: Row, results: Sequence[Mapping[str, Any]], candidates: int | str | None = None) -> RowResult | None:
     """A row's part of an evaluation's results; None if it has none."""
@@ -184,10 +177,12 @@ def _settings(evaluations: Evaluations) -> Table:
 
 
 def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) -> Table:
-    """Recall by part and threshold; parts are (words, data set, sequence)."""
+    """Recall by part and threshold, of rows that are known on a data set; parts are (words, data set, sequence)."""
     columns = [(*part, threshold) for part in parts for threshold in evaluations.thresholds(part[1])]
     rows = []
-    for row in evaluations.rows_on([name for _, name, _ in parts]) if columns else ():
+    for row in evaluations.rows if columns else ():
+        if not any((row.name, name) in evaluations.results or printed_recall(row.name, name) for _, name, _ in parts):
+            continue
         cells = []
         for _, name, sequence, threshold in columns:
             result = evaluations.results.get((row.name, name))

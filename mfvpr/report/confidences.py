@@ -57,9 +57,8 @@ class CalibratedPredictions:
     @cached_property
     def fitted(self) -> dict[str, Confidence]:
         """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
-        inputs = {
-            name: self._inputs(name) for name in (self.evaluation.result.systems if self.evaluation.thresholds else ())
-        }
+        systems = self.evaluation.result.systems if self.evaluation.thresholds else ()
+        inputs = {name: self._inputs(name) for name in systems}
         return {name: fit_confidence(values, self.correct(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
@@ -75,9 +74,7 @@ class CalibratedPredictions:
     @cached_property
     def has_positives(self) -> Bool[np.ndarray, " queries"]:
         """Whether the database shows the query's place, with ground truth."""
-        return np.concatenate(
-            [positives.counts > 0 for positives in self.evaluation.positives if positives is not None]
-        )
+        return np.concatenate([part.counts > 0 for part in self.evaluation.positives if part is not None])
 
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the prediction is `NO_PLACE`."""
@@ -92,12 +89,9 @@ class CalibratedPredictions:
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by the confidence where it is known."""
-        confidences = {"score": self.scores(system)}
-        if system in self.probabilities:
-            confidences["confidence"] = self.probabilities[system]
-        return {
-            by: precision_recall(values, self.correct(system), self.has_positives) for by, values in confidences.items()
-        }
+        by_kind = {"score": self.scores(system), "confidence": self.probabilities.get(system)}
+        return {by: precision_recall(values, self.correct(system), self.has_positives)
+                for by, values in by_kind.items() if values is not None}  # fmt: skip
 
     def reliability(self, system: str) -> Reliability:
         """Reliability of the confidence."""
@@ -138,11 +132,8 @@ def confidence_table(calibrated: CalibratedPredictions) -> Table:
 
 
 def _confidence_row(calibrated: CalibratedPredictions, system: str) -> list[str]:
-    percent = [
-        value
-        for curve in calibrated.curves(system).values()
-        for value in (curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99))
-    ]
+    percent = [value for curve in calibrated.curves(system).values()
+               for value in (curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99))]  # fmt: skip
     probabilities = calibrated.probabilities[system]
     percent += [calibrated.reliability(system).calibration_error, chance_calibration_error(probabilities)]
     known = 3 if np.isnan(probabilities).all() else len(percent)  # an unknown confidence has empty cells
@@ -231,8 +222,6 @@ def confidence_figures(calibrated: CalibratedPredictions) -> list[Figure]:
     if calibrated.probabilities:
         reliabilities = {name: calibrated.reliability(name) for name in calibrated.probabilities}
         figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliabilities)))
-    if RETRIEVAL in calibrated.probabilities:
-        figures.append(
-            ("rerank_share.png", partial(shares_figure, shares=SHARES, recall=_recalls_by_share(calibrated)))
-        )
+    if recalls := _recalls_by_share(calibrated):
+        figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=recalls)))
     return figures

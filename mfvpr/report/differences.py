@@ -24,6 +24,13 @@ class Difference(NamedTuple):
     mcnemar: McNemar
     sign_flips: SignFlips
 
+    @property
+    def cells(self) -> list[str]:
+        """A line of `differences.csv`."""
+        counts, flips = self.mcnemar, self.sign_flips
+        numbers = map(number, (counts.p_value, flips.block, flips.blocks, flips.p_value))
+        return [self.first, self.second, str(counts.only_first), str(counts.only_second), *numbers]
+
 
 def differences(evaluation: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order; none without ground truth."""
@@ -39,12 +46,10 @@ def differences(evaluation: EvaluationReport) -> list[Difference]:
 
 def _places(evaluation: EvaluationReport) -> np.ndarray | None:
     """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
-    truth, known = (
-        evaluation.sequences[0].truth,
-        [positives for positives in evaluation.positives if positives is not None],
-    )
+    truth = evaluation.sequences[0].truth
     if truth is None or (len(evaluation.sequences) == 1 and truth.unit != "m"):
         return None
+    known = [positives for positives in evaluation.positives if positives is not None]
     return places_along_path(stack_positives(known), truth.unit)
 
 
@@ -73,23 +78,17 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
     systems, places = [*evaluation.result.systems], _places(evaluation)
     places = np.arange(sum(len(sequence.images) for sequence in evaluation.sequences)) if places is None else places
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
-    for part, (sequence, part_places) in enumerate(
-        zip(evaluation.sequences, evaluation.by_sequence(places), strict=True)
-    ):
+    places_by_sequence = evaluation.by_sequence(places)
+    for part, sequence in enumerate(evaluation.sequences):
         correct_by_system = [np.asarray(evaluation.is_correct(system, part), bool) for system in systems]
         lines = []
         for query, name in enumerate(sequence.images.names):
             cells = [cell for correct in correct_by_system for cell in _hit_and_rank(correct[query])]
-            lines.append([name, int(part_places[query]), *cells])
+            lines.append([name, int(places_by_sequence[part][query]), *cells])
         write_csv(evaluation.folder(folder, part) / "gains.csv", header, lines)
     tests = differences(evaluation)
-    write_csv(
-        folder / "differences.csv",
-        ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"],
-        [[first, second, counts.only_first, counts.only_second, *(number(value) for value in (
-            counts.p_value, flips.block, flips.blocks, flips.p_value))]
-         for first, second, counts, flips in tests],
-    )  # fmt: skip
+    header = ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"]
+    write_csv(folder / "differences.csv", header, [test.cells for test in tests])
     write_text(folder / "differences.md", _table(systems, tests).markdown())
 
 

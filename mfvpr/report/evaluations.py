@@ -138,9 +138,8 @@ def write_skipped(folder: Path, result: Result) -> None:
     names = result.dataset.database.names
     bad_rows = {bad for matched in result.matched for bad in matched.bad_database.items()}
     lines = sorted(("database", names[row], reason) for row, reason in bad_rows)
-    for matched in result.matched:
-        images = matched.sequence.images.names
-        lines += [("queries", images[row], reason) for row, reason in matched.bad_queries.items()]
+    lines += [("queries", matched.sequence.images.names[row], reason)
+              for matched in result.matched for row, reason in matched.bad_queries.items()]  # fmt: skip
     if lines:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())
 
@@ -199,15 +198,12 @@ class SequenceFigures:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
         correct = self.evaluation.is_correct(self.evaluation.headline, self.place)
         has_prediction = self._ranked.rows[:, 0] >= 0
-        verdicts = (
-            np.full(len(has_prediction), "best") if correct is None else np.where(correct[:, 0], "correct", "incorrect")
-        )
+        words = ["best"] if correct is None else ["correct", "incorrect"]
+        verdicts = np.full(len(has_prediction), "best") if correct is None else np.where(correct[:, 0], *words)
         if not isinstance(selection, int):
             return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
-        numbers = (
-            {"best": selection} if correct is None else {"correct": (selection + 1) // 2, "incorrect": selection // 2}
-        )
-        return {query: verdict for verdict, number in numbers.items()
+        numbers = map(len, np.array_split(range(selection), len(words)))
+        return {query: verdict for verdict, number in zip(words, numbers, strict=True)
                 for query in _pick_evenly(np.flatnonzero(has_prediction & (verdicts == verdict)), number)}  # fmt: skip
 
     def title(self, query: int, verdict: str) -> str:

@@ -95,9 +95,8 @@ def _draw_pair(axes: Axes, query: np.ndarray, candidate: Candidate) -> None:
     words = "query | candidate"
     if candidate.matches is not None and candidate.explanation is not None:
         words = _draw_matches(axes, offset, candidate.matches, candidate.explanation)
-    axes.set_title(
-        f"{clip_middle(printable(candidate.caption), _CAPTION_LENGTH)}\n{words}", fontsize=9, parse_math=False
-    )
+    caption = clip_middle(printable(candidate.caption), _CAPTION_LENGTH)
+    axes.set_title(f"{caption}\n{words}", fontsize=9, parse_math=False)
 
 
 def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation) -> str:

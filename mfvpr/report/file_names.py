@@ -29,10 +29,8 @@ def file_names(names: Sequence[str]) -> dict[str, str]:
     files = {}
     for name, file in plain.items():
         is_safe = _PLAIN.fullmatch(file) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
-        is_unique = counts[_fold_case(file)] == 1
-        files[name] = (
-            file if is_safe and is_unique else f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
-        )
+        hashed = f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
+        files[name] = file if is_safe and counts[_fold_case(file)] == 1 else hashed
     return files
 
 

@@ -51,11 +51,7 @@ def localization_figure(
         caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {prediction.score:.5g}{p}"
         candidate = Candidate(shown, caption, localization.matches, explain(histogram, localization.matches))
     query = resize(image, extractor.image_size, extractor.interpolation)
-    place = (
-        f"no place ({prediction.reason})"
-        if prediction.place is None
-        else clip_middle(str(prediction.place), _NAME_LENGTH)
-    )
-    title = f"{clip_middle(name, _NAME_LENGTH)} -> {place}"
+    place = f"no place ({prediction.reason})" if prediction.place is None else str(prediction.place)
+    title = f"{clip_middle(name, _NAME_LENGTH)} -> {clip_middle(place, _NAME_LENGTH)}"
     about = {"image": name, "place": str(prediction.place)}
     histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)

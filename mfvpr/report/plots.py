@@ -1,4 +1,4 @@
-"""Figures of numbers: precision and recall, calibration, sweeps, trainings; and the canvas of all figures."""
+"""Figures of numbers: precision and recall, calibration, sweeps, trainings; canvas and colors of all figures."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mfvpr.evaluation.precision import PrecisionRecall, Reliability
-from mfvpr.report.colors import color_and_dash
 from mfvpr.utils.files import clip_middle, printable, replacing
 
 BINS = 12  # of the matches, by the value of an input
+COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
+_FIRST = "#8a8f98"  # of what all others are compared with
+_DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
 _LINE_STYLES = {"solid": "solid", "dash": "dashed", "dot": "dotted", "dashdot": "dashdot"}  # by plotly's words
 _TITLE_LENGTH = 34  # characters that fit above a panel
 _LOSS, _MARK, _SHARE = "#2fa8ff", "#e8482c", "#888888"
@@ -43,6 +45,13 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(temporary, dpi=dpi, **options)
+
+
+def color_and_dash(place: int) -> tuple[str, str]:
+    """Color and plotly's name of the dash of the system at a place of the table, the same in figures and pages."""
+    if place == 0:
+        return _FIRST, "solid"
+    return COLORS[(place - 1) % len(COLORS)], _DASHES[(place - 1) // len(COLORS) % len(_DASHES)]
 
 
 def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:

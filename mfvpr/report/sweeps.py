@@ -118,30 +118,28 @@ def heat_maps(outcome: Outcome) -> list[Figure]:
     A space that was not searched completely has none.
     """
     axes, protocol = outcome.axes, outcome.protocol
-    values = {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
+    values = {"": [""]} | {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
     names = [name for name, axis in values.items() if len(axis) > 1] if outcome.is_grid else []
-    pairs = list(itertools.combinations(names, 2)) or [(name, name) for name in names]
+    pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     if not pairs:
         return []
     recall = outcome.recall[: axes.size, protocol.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    defaults = {name: values[name].index(format_value(value)) if format_value(value) in values[name] else None
-                for name, value in axes.own.items()}  # fmt: skip
-    files = file_names([first if first == second else f"{first} + {second}" for first, second in pairs])
+    own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
+    files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
     figures: list[Figure] = []
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
-        single = first == second
         plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
-        fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in (first, second)]
-        row, column = 0 if single else defaults[first], defaults[second]
+        fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
+        in_grid = own[first] in values[first] and own[second] in values[second]
         draw = partial(
             heat_map_figure,
-            recall=plane[None] if single else plane,
-            rows=("", [""]) if single else (first, _short(values[first])),
+            recall=plane,
+            rows=(first, _short(values[first])),
             columns=(second, _short(values[second])),
-            best=(0 if single else best[first], best[second]),
-            defaults=None if row is None or column is None else (row, column),
+            best=(best[first], best[second]),
+            defaults=(values[first].index(own[first]), values[second].index(own[second])) if in_grid else None,
             title="; ".join([f"{protocol.label(1, protocol.thresholds[protocol.main])} in %", *fixed]),
         )
         figures.append((f"{file}.png", draw))

@@ -1,19 +1,16 @@
-"""Charts of runs, drawn by plotly: lines and bars of numbers from the page's tables or the run's files."""
+"""Charts of runs for plotly.js: lines and bars of numbers from the page's tables or the run's files."""
 
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from mfvpr.report.colors import COLORS, color_and_dash
+from mfvpr.report.plots import COLORS, color_and_dash
 from mfvpr.utils.files import printable
 
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
-
-# plotly is imported where it is needed: the rest of the library does not depend on it.
 _POWERS = [step * 10.0**power for power in range(-4, 4) for step in (1, 2, 5)]
 _HEIGHT = 380  # px
+_NAMES = {"type": "category", "autorange": "reversed"}  # an axis of names, the first on top
 
 Scale = Literal["linear", "log", "percent"]
 _SCALES: dict[Scale, dict[str, Any]] = {
@@ -61,21 +58,18 @@ def line_chart(
     `axes` are words of x and y, `scale` is that of x. Points are `marked` if the curve is known only there. The axis of
     a `unit` other than % is logarithmic.
     """
-    from plotly import graph_objects
-
-    figure, form = graph_objects.Figure(), ".1f" if unit == "%" else ".3g"
-    for place, (label, points) in enumerate(curves.items()):
-        figure.add_scatter(
-            x=[x for x, _ in points], y=[y for _, y in points], name=_escape(label),
-            mode="lines+markers" if marked else "lines", line=_line(place),
-            hovertemplate=f"%{{x:.4g}}: %{{y:{form}}} {unit}",
-        )  # fmt: skip
-    figure.update_xaxes(_SCALES[scale])
-    figure.update_yaxes({"range": [-2, 102]} if unit == "%" else {"type": "log", "tickvals": _POWERS})
+    form = ".1f" if unit == "%" else ".3g"
+    traces = [
+        {"type": "scatter", "x": [x for x, _ in points], "y": [y for _, y in points], "name": _escape(label),
+         "mode": "lines+markers" if marked else "lines", "line": _line(place),
+         "hovertemplate": f"%{{x:.4g}}: %{{y:{form}}} {unit}"}
+        for place, (label, points) in enumerate(curves.items())
+    ]  # fmt: skip
+    y_axis = {"range": [-2, 102]} if unit == "%" else {"type": "log", "tickvals": _POWERS}
     ends = (f"{label}: {points[0][1]:{form}} to {points[-1][1]:{form}} {unit}" for label, points in curves.items()
             if points)  # fmt: skip
     words = f"{axes[1]} against {axes[0]}. {'; '.join(ends)}."
-    return _chart(name, title, words, figure, axes, legend=len(curves) > 1)
+    return _chart(name, title, words, traces, axes, _SCALES[scale], y_axis, showlegend=len(curves) > 1)
 
 
 def bar_chart(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *, axis: str) -> Chart:
@@ -83,37 +77,33 @@ def bar_chart(name: str, title: str, groups: Mapping[str, Mapping[str, Bar]], *,
 
     Members of a single group have a color each if there are enough colors.
     """
-    from plotly import graph_objects
-
-    figure, single = graph_objects.Figure(), len(groups) == 1
+    single, traces = len(groups) == 1, []
     for place, (label, members) in enumerate(groups.items()):
         by_member = single and len(members) <= 1 + len(COLORS)
-        colors = [_line(member)["color"] for member in range(len(members))]
-        figure.add_bar(
-            x=[bar.percent for bar in members.values()], y=[*map(_escape, members)], name=_escape(label),
-            orientation="h", marker_color=colors if by_member else _line(place + single)["color"],
-            error_x=_whiskers([*members.values()]), hovertemplate="%{y}: %{x:.1f} %",
-        )  # fmt: skip
-    figure.update_xaxes(range=[0, 102])
-    figure.update_yaxes(type="category", autorange="reversed")
+        colors = [color_and_dash(member)[0] for member in range(len(members))]
+        traces.append({
+            **_bars({member: bar.percent for member, bar in members.items()}), "name": _escape(label),
+            "marker": {"color": colors if by_member else color_and_dash(place + single)[0]},
+            "error_x": _whiskers([*members.values()]), "hovertemplate": "%{y}: %{x:.1f} %",
+        })  # fmt: skip
     parts = (f"{label}, {member}: {bar.percent:.1f} %" for label, members in groups.items()
              for member, bar in members.items())  # fmt: skip
     height = max(_HEIGHT, 100 + 16 * sum(map(len, groups.values())))
-    return _chart(name, title, f"{axis}. {'; '.join(parts)}.", figure, (axis, ""), legend=not single, height=height)
+    words = f"{axis}. {'; '.join(parts)}."
+    return _chart(name, title, words, traces, (axis, ""), {"range": [0, 102]}, _NAMES, showlegend=not single,
+                  height=height)  # fmt: skip
 
 
 def amount_chart(name: str, title: str, values: Mapping[str, float], *, axis: str) -> Chart:
     """Horizontal bars, one for each name."""
-    from plotly import graph_objects
-
-    figure = graph_objects.Figure()
-    figure.add_bar(
-        x=[*values.values()], y=[*map(_escape, values)], orientation="h", marker_color=COLORS[0],
-        hovertemplate="%{y}: %{x:.4g}", texttemplate="%{x:.3g}", textposition="auto",
-    )  # fmt: skip
-    figure.update_yaxes(type="category", autorange="reversed")
+    bars = _bars(values) | {"marker": {"color": COLORS[0]}, "hovertemplate": "%{y}: %{x:.4g}",
+                            "texttemplate": "%{x:.3g}", "textposition": "auto"}  # fmt: skip
     parts = "; ".join(f"{label}: {value:.3g}" for label, value in values.items())
-    return _chart(name, title, f"{axis}. {parts}.", figure, (axis, ""), legend=False)
+    return _chart(name, title, f"{axis}. {parts}.", [bars], (axis, ""), {}, _NAMES, showlegend=False)
+
+
+def _bars(values: Mapping[str, float]) -> dict[str, Any]:
+    return {"type": "bar", "orientation": "h", "x": [*values.values()], "y": [*map(_escape, values)]}
 
 
 def _escape(text: str) -> str:
@@ -137,17 +127,17 @@ def _whiskers(members: Sequence[Bar]) -> dict[str, Any]:
 
 
 def _chart(
-    name: str, title: str, words: str, figure: "Figure", axes: tuple[str, str], *, legend: bool, height: int = _HEIGHT
-) -> Chart:
+    name: str, title: str, words: str, traces: Sequence[Mapping[str, Any]], titles: tuple[str, str],
+    x_axis: Mapping[str, Any], y_axis: Mapping[str, Any], **layout: Any,
+) -> Chart:  # fmt: skip
     """A chart in the layout of all charts; its colors follow the page's."""
-    figure.update_layout(
-        template="none", paper_bgcolor="rgba(0,0,0,0)", plot_bgcolor="rgba(0,0,0,0)", dragmode=False, height=height,
-        margin={"l": 56, "r": 12, "t": 12, "b": 48}, font={"family": "system-ui, sans-serif", "size": 13},
-        showlegend=legend, legend={"orientation": "h", "yanchor": "bottom", "y": 1.02, "x": 0},
-        hoverlabel={"namelength": -1}, barmode="group",
-    )  # fmt: skip
-    options = {"fixedrange": True, "automargin": True, "zeroline": False, "title_font_size": 13}
-    figure.update_xaxes(title_text=axes[0], **options)
-    figure.update_yaxes(title_text=axes[1], **options)
-    values = figure.to_plotly_json()
-    return Chart(name, title, words, {"data": values["data"], "layout": values["layout"]})
+    common = {"fixedrange": True, "automargin": True, "zeroline": False}
+    x, y = ({**common, **axis, "title": {"text": text, "font": {"size": 13}}}
+            for axis, text in zip((x_axis, y_axis), titles, strict=True))  # fmt: skip
+    layout = {
+        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "dragmode": False, "height": _HEIGHT,
+        "margin": {"l": 56, "r": 12, "t": 12, "b": 48}, "font": {"family": "system-ui, sans-serif", "size": 13},
+        "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.02, "x": 0},
+        "hoverlabel": {"namelength": -1}, "barmode": "group", "xaxis": x, "yaxis": y, **layout,
+    }  # fmt: skip
+    return Chart(name, title, words, {"data": traces, "layout": layout})

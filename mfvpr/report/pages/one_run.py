@@ -1,7 +1,7 @@
 """The page of one run."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -91,10 +91,8 @@ def _recall_section(run: Run) -> Section:
     words += "are 95 % and know that neighbors along the path fail together."
     tables = {}
     if table := run.tables.get("table.csv"):
-        rows = []
-        for row in table.rows:
-            bar = recalls[row[0]].get(row[1] if several else "")
-            rows.append([*row, bar.interval_words if bar else ""])
+        bars = [recalls[row[0]].get(row[1] if several else "") for row in table.rows]
+        rows = [[*row, bar.interval_words if bar else ""] for row, bar in zip(table.rows, bars, strict=True)]
         tables["Recall of every system"] = Table([*table.header, f"R@1{run.within}, 95 %"], rows, 1 + several)
     return Section("recall", "Recall", words, charts, tables)
 
@@ -143,8 +141,10 @@ def precision_charts(curves: Curves, by: str = "score", words: str = "by the sco
     return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
 
 
-def paired_tests_table(kind: str, rows: list[list[str]]) -> Table:
-    """Paired tests of systems or of runs (`kind`)."""
+def paired_tests_table(kind: str, lines: Sequence[Sequence[str]]) -> Table:
+    """Paired tests of systems or of runs (`kind`), of lines as in `differences.csv`."""
+    rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(line)]
+            for line in lines]  # fmt: skip
     columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
     return Table(columns, rows, text_columns=2)
 
@@ -160,9 +160,7 @@ def paired_tests_words(kind: str) -> str:
 def _differences_section(run: Run) -> Iterator[Section]:
     table = run.tables.get("differences.csv")
     if table and table.rows:
-        rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(row)]
-                for row in table.rows]  # fmt: skip
-        tables = {"Every two systems": paired_tests_table("system", rows)}
+        tables = {"Every two systems": paired_tests_table("system", table.rows)}
         yield Section("differences", "Differences", paired_tests_words("system"), tables=tables)
 
 
@@ -210,9 +208,8 @@ def _predictions_section(run: Run) -> Section:
 
 
 def _settings_section(run: Run) -> Section:
-    about = {name: run.about.get(name) for name in ("command", "commit")} | {
-        "ground truth": run.common["ground_truth"], "data fingerprint": run.common["data_fingerprint"]
-    }  # fmt: skip
+    about = {name: run.about.get(name) for name in ("command", "commit")}
+    about |= {name.replace("_", " "): run.common[name] for name in ("ground_truth", "data_fingerprint")}
     tables = {
         "Run": values_table(about),
         "Settings": values_table(run.about["settings"]),

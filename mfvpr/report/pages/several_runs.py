@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
+from mfvpr.report.differences import Difference
 from mfvpr.report.pages.charts import bar_chart
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.one_run import (
@@ -63,7 +64,7 @@ def _labels(folders: Sequence[Path]) -> list[str]:
         labels = ["/".join(parts[-length:]) for parts in paths]
         if len({*labels}) == len(labels):
             return labels
-    twice = next(folder for row, folder in enumerate(folders) if folder.absolute() in map(Path.absolute, folders[:row]))
+    twice = next(folder for folder in folders if paths.count(folder.absolute().parts) > 1)
     raise InputError(f"{twice}: expected different run folders, got this one twice")
 
 
@@ -106,10 +107,8 @@ def _pairs(runs: Mapping[str, Run]) -> Section:
             incomparable.append([label, other, reason])
             continue
         pair = run.all_gains.hits(run.headline), second.all_gains.hits(second.headline)
-        test, flips = mcnemar(*pair), block_sign_flips(*pair, places=np.sort(run.all_gains.places))
-        rows.append([f"{label}: {run.headline}", f"{other}: {second.headline}", str(test.only_first),
-                     str(test.only_second), f"{test.p_value:.2g}", str(flips.block), str(flips.blocks),
-                     f"{flips.p_value:.2g}"])  # fmt: skip
+        tests = mcnemar(*pair), block_sign_flips(*pair, places=np.sort(run.all_gains.places))
+        rows.append(Difference(f"{label}: {run.headline}", f"{other}: {second.headline}", *tests).cells)
     tables = {"Every two runs of the same queries": paired_tests_table("run", rows)} if rows else {}
     if incomparable:
         tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)
