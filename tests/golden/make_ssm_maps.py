@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mfvpr.networks.imagenet import DEVIATION, MEAN
 from tests.golden.make_d2net import samples, texture
 from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 
 GOLDEN = Path(__file__).parent / "ssm_maps.npz"
 SEEDS = (0, 1, 2)
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # torchvision's Normalize, as the public code calls it
 
 
 class Case(NamedTuple):

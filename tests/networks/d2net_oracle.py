@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.networks.aliked_oracle import sampled
+
 
 class Found(NamedTuple):
     """A keypoint of one map."""
@@ -44,7 +46,7 @@ def keypoints(dense: np.ndarray, banned: np.ndarray | None = None) -> list[Found
         at_row, at_column = row + down, column + right
         if min(at_row, at_column) < 0 or math.ceil(at_row) >= height or math.ceil(at_column) >= width:
             continue
-        descriptor = _bilinear(dense, at_row, at_column)
+        descriptor = sampled(dense, at_column, at_row)
         descriptor = descriptor / max(np.linalg.norm(descriptor), 1e-12)
         score = dense[row, column, channel]
         detections.append(Found(channel, row, column, 4 * at_column + 1.5, 4 * at_row + 1.5, score, descriptor))
@@ -85,20 +87,11 @@ def _is_edge(dense: np.ndarray, channel: int, row: int, column: int) -> bool:
     return det <= 0 or (ii + jj) ** 2 / det > (5 + 1) ** 2 / 5
 
 
-def _bilinear(dense: np.ndarray, row: float, column: float) -> np.ndarray:
-    top, left = math.floor(row), math.floor(column)
-    bottom, right = math.ceil(row), math.ceil(column)
-    down, across = row - top, column - left
-    upper = (1 - across) * dense[top, left] + across * dense[top, right]
-    lower = (1 - across) * dense[bottom, left] + across * dense[bottom, right]
-    return (1 - down) * upper + down * lower
-
-
 def _enlarged(dense: np.ndarray, height: int, width: int) -> np.ndarray:
     """Bilinear; the corners stay the corners."""
     tall, wide, channels = dense.shape
     result = np.zeros((height, width, channels))
     for row, column in np.ndindex(height, width):
         at_row, at_column = row * (tall - 1) / (height - 1), column * (wide - 1) / (width - 1)
-        result[row, column] = _bilinear(dense, min(at_row, tall - 1), min(at_column, wide - 1))
+        result[row, column] = sampled(dense, min(at_column, wide - 1), min(at_row, tall - 1))
     return result

@@ -22,6 +22,8 @@ PAGE = "report.html"  # in a run folder
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
+_SIZES = {"queries": "queries", "database": "database images", "candidates": "candidates of a query",
+          "bytes_per_image": "bytes on disk of an image's features, about"}  # fmt: skip
 _P_VALUES = (4, 7)  # columns of differences.csv
 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
@@ -186,10 +188,7 @@ def _confidence_section(run: Run) -> Iterator[Section]:
 def _costs_section(run: Run) -> Section:
     seconds, common = run.common["seconds"], run.common
     rows = [[stage, f"{value:.3f}", f"{value / max(common['queries'], 1):.4f}"] for stage, value in seconds.items()]
-    sizes = [["queries", f"{common['queries']}"], ["database images", f"{common['database']}"],
-             ["candidates of a query", f"{common['candidates']}"]]  # fmt: skip
-    if common["bytes_per_image"] is not None:
-        sizes.append(["bytes on disk of an image's features, about", f"{common['bytes_per_image']}"])
+    sizes = [[words, f"{common[name]}"] for name, words in _SIZES.items() if common[name] is not None]
     chart = amount_chart("seconds", "Seconds by stage", seconds, axis="seconds")
     tables = {"Seconds": Table(["stage", "seconds", "per query"], rows), "Sizes": Table(["what", "number"], sizes)}
     words = "What was in the stores already was not computed again."
