@@ -206,7 +206,7 @@ def fusion(settings: dict[str, Any]) -> Fusion:
     return Fusion(c, retrieval_score, weights or {})
 
 
-def frames(settings: dict[str, Any]) -> FrameCorrelation | None:
+def frame_correlation(settings: dict[str, Any]) -> FrameCorrelation | None:
     """The correlation with previous queries; None without them."""
     previous = settings["previous_queries"]
     return FrameCorrelation(previous) if previous else None

@@ -24,13 +24,13 @@ class ConfidenceFile(NamedTuple):
     origin: Mapping[str, Any]
 
 
-def read(settings: Mapping[str, Any]) -> ConfidenceFile | None:
+def read_file(settings: Mapping[str, Any]) -> ConfidenceFile | None:
     """Read the file that the settings name; None if there is none."""
     path = settings["confidence"]
     return None if path is None else ConfidenceFile(path, *read_confidences(build.expand_user(path)))
 
 
-def check(
+def check_confidence(
     file: ConfidenceFile | None, headline: str, settings: Mapping[str, Any], images: Images
 ) -> ConfidenceFile | None:
     """Keep the systems of a file whose settings fit this run at least as well as those of the headline system.
@@ -97,7 +97,7 @@ def _system_settings(settings: Any, system: str) -> dict[str, Any]:
     return {**settings, "scorer": parts}
 
 
-def origin(settings: Mapping[str, Any], images: Images, evaluation: EvaluationReport) -> dict[str, Any]:
+def provenance(settings: Mapping[str, Any], images: Images, evaluation: EvaluationReport) -> dict[str, Any]:
     """The data and settings that the confidence of a run was fitted with, for its file."""
     return {
         "dataset": images.dataset.name,
@@ -105,7 +105,7 @@ def origin(settings: Mapping[str, Any], images: Images, evaluation: EvaluationRe
         "queries": sum(len(sequence.images) for sequence in evaluation.sequences),
         "correct_within": _threshold(settings, images),
         "candidates": num_candidates(settings, images),
-        "ground_truth": truth.description(settings, images.dataset),
+        "ground_truth": truth.describe(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.describe_settings(settings["scorer"])},
         "command": settings.get("command"),
         "versions": versions(),

@@ -9,7 +9,7 @@ from experiments import build, confidences, run_folder, stages, truth
 from experiments.settings import SettingsError
 from experiments.stages import Images, Tools
 from mfvpr.datasets import Dataset
-from mfvpr.datasets.published import differences
+from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation import evaluation
 from mfvpr.features import Source
@@ -81,17 +81,18 @@ def _write_results(folder: Path, outcome: Outcome) -> None:
 
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
-    scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read(settings)
+    scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
     fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
     fusion.check(main, scorers)
     tools, images = stages.prepare(settings, watch)
     figure_queries = query_rows(settings["figures"], images.dataset)
-    headline, frames = fusion.system(main) if settings["final"] == "combined" else main, build.frames(settings)
+    headline = fusion.system(main) if settings["final"] == "combined" else main
+    frames = build.frame_correlation(settings)
     cohort, fused_systems = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
         fused_systems.append(f"{main} + {COHORT}")
     fusions = {name: fusion.rename_main(main, name) for name in fused_systems}
-    confidence = confidences.check(confidence, headline, settings, images)
+    confidence = confidences.check_confidence(confidence, headline, settings, images)
     result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.retriever, scorers, candidates=settings["candidates"],
         matching=tools.matching, fused=fusions, cohort=cohort,
@@ -129,7 +130,7 @@ def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusio
 def ground_truth(outcome: Outcome) -> dict[str, Any]:
     """Description and fingerprint of the ground truth."""
     dataset, thresholds = outcome.images.dataset, outcome.report.thresholds
-    return truth.description(outcome.settings, dataset) | {"fingerprint": truth.fingerprint(dataset, thresholds)}
+    return truth.describe(outcome.settings, dataset) | {"fingerprint": truth.positives_fingerprint(dataset, thresholds)}
 
 
 def text(outcome: Outcome) -> str:
@@ -150,12 +151,12 @@ def heading(outcome: Outcome) -> str:
     check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
     check = "" if check == "cross_check=mutual" else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
-    incomplete = " (incomplete)" if any(differences(dataset)) else ""
+    incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
         f"{dataset.name}{incomplete}: {queries} queries{several}{_skip_note(bad_queries)}, "
         f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
         f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
-        f"{settings['features']['name']} features{check}; {truth.in_words(truth.description(settings, dataset))}"
+        f"{settings['features']['name']} features{check}; {truth.in_words(truth.describe(settings, dataset))}"
     )
 
 
@@ -170,7 +171,8 @@ def write(folder: Path, outcome: Outcome) -> None:
         runs.write_table(folder, recall_table(outcome.report), heading(outcome))
     write_rankings(folder, outcome.report, outcome.calibrated.refused_of_headline)
     write_gains(folder, outcome.report)
-    write_confidence(folder, outcome.calibrated, confidences.origin(outcome.settings, outcome.images, outcome.report))
+    provenance = confidences.provenance(outcome.settings, outcome.images, outcome.report)
+    write_confidence(folder, outcome.calibrated, provenance)
     if outcome.histogram is not None:
         write_shifts(folder, outcome.report, outcome.histogram, outcome.calibrated.refused_of_headline)
     write_skipped(folder, outcome.report.result)
@@ -187,7 +189,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "queries": sum(len(sequence.images) for sequence in dataset.sequences),
         "database": len(dataset.database),
         "dataset": dataset.name,
-        "incomplete": list(differences(dataset)),
+        "incomplete": list(published_differences(dataset)),
         "data_fingerprint": outcome.images.fingerprints,
         "ground_truth": ground_truth(outcome),
         "reading": outcome.images.reading,

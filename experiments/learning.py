@@ -94,7 +94,7 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     assert not isinstance(matches, Scales)
     recipe = stages.recipe(tools, images, candidates.mask.shape[1])
     part = Part(label(settings["dataset"]), protocol, matches, candidates)
-    return Prepared(part, images, recipe, truth.description(settings, images.dataset))
+    return Prepared(part, images, recipe, truth.describe(settings, images.dataset))
 
 
 def label(settings: dict[str, Any]) -> str:

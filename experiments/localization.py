@@ -130,10 +130,10 @@ class _LocalizationFigures:
 
 def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """The confidence of the score that the map was made with."""
-    file = confidences.read(settings)
+    file = confidences.read_file(settings)
     if file is None:
         return None
-    map_settings = maps.read(build.expand_user(settings["map"]))
+    map_settings = maps.read_settings(build.expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "

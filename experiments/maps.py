@@ -28,7 +28,7 @@ def build_map(settings: Mapping[str, Any]) -> None:
 
 def print_map(folder: Path) -> None:
     """Print the number of images, the size on disk and the settings of a map."""
-    settings, robot_map = read(folder), open_map(folder)
+    settings, robot_map = read_settings(folder), open_map(folder)
     print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
@@ -58,10 +58,10 @@ def map_of_settings(settings: Mapping[str, Any]) -> Map:
 
 def open_map(folder: Path, **options: Any) -> Map:
     """The map in a folder, with options of `Map`."""
-    return map_of(folder, read(folder), **options)
+    return map_of(folder, read_settings(folder), **options)
 
 
-def read(folder: Path) -> dict[str, Any]:
+def read_settings(folder: Path) -> dict[str, Any]:
     """The settings that a map was made with; a SettingsError if there is no map."""
     path = folder / SETTINGS
     try:
@@ -77,7 +77,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def _compare(folder: Path, settings: Mapping[str, Any]) -> None:
-    before = read(folder)
+    before = read_settings(folder)
     if differing := [name for name in _GROUPS if before[name] != settings[name]]:
         raise SettingsError(f"map={folder}: was made with other {' and '.join(differing)}; name another folder, or "
                             "set what it was made with (python -m experiments.map info)")  # fmt: skip

@@ -11,7 +11,7 @@ from experiments.overrides import compose_data_sets
 from experiments.stages import dataset_of
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents
-from mfvpr.datasets.published import PUBLISHED, differences
+from mfvpr.datasets.published import PUBLISHED, published_differences
 from mfvpr.datasets.sequences import own_rows
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.report import Table
@@ -72,7 +72,7 @@ def check(name: str, settings: list[str], sheet: Path | None) -> None:
     contact_sheet(target, dataset)
     print(f"pairs of images: {target}")
     bad = sum(map(len, unreadable))
-    if wrong := [*differences(dataset), *([f"{bad:,} images cannot be read"] if bad else [])]:
+    if wrong := [*published_differences(dataset), *([f"{bad:,} images cannot be read"] if bad else [])]:
         refuse(f"{dataset.name}: {'; '.join(wrong)}")
 
 

@@ -13,7 +13,7 @@ from experiments import build
 from experiments.console import tell
 from experiments.settings import SettingsError
 from mfvpr.datasets import image_folder
-from mfvpr.datasets.videos import VIDEO_SUFFIXES, frames
+from mfvpr.datasets.videos import VIDEO_SUFFIXES, read_frames
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name
 
 POLL = 0.2  # seconds between two looks at a folder
@@ -35,7 +35,7 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | UInt8[np.n
             yield from ((canonical_name(image), image) for image in image_folder(path).paths)
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             name = canonical_name(path)
-            yield from ((f"{name}:{number}", image) for number, image in frames(path, every=settings["every"]))
+            yield from ((f"{name}:{number}", image) for number, image in read_frames(path, every=settings["every"]))
         else:
             yield canonical_name(path), path
 

@@ -51,7 +51,7 @@ def sweep(settings: dict[str, Any]) -> None:
             runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
             write_text(new / "summary.txt", f"{text}\n")
 
-        ground_truth, figures = truth.description(settings, images.dataset), sweeps.heat_maps(outcome)
+        ground_truth, figures = truth.describe(settings, images.dataset), sweeps.heat_maps(outcome)
         run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
@@ -73,7 +73,7 @@ def _block_folder(
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
     dataset, features = images.dataset, settings["features"]
-    ground_truth = truth.in_words(truth.description(settings, dataset))
+    ground_truth = truth.in_words(truth.describe(settings, dataset))
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
@@ -89,6 +89,6 @@ def _results(
         "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,
         "scorer": settings["scorer"], "features": settings["features"], "retrieval": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
-        "final": settings["final"], "ground_truth": truth.description(settings, images.dataset),
+        "final": settings["final"], "ground_truth": truth.describe(settings, images.dataset),
         **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

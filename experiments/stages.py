@@ -11,7 +11,7 @@ from experiments import build, truth
 from experiments.console import bar, tell
 from mfvpr.datasets import Dataset, QuerySequence
 from mfvpr.datasets.contents import Contents
-from mfvpr.datasets.published import differences
+from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation import match_sequence
@@ -89,7 +89,7 @@ def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
             sequence = without_neighbors(sequence, len(dataset.database), same_images[-1], neighbors)
         sequences.append(sequence)
     images = Images(replace(dataset, sequences=tuple(sequences)), sides)
-    for difference in differences(images.dataset):
+    for difference in published_differences(images.dataset):
         tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
     for sequence, rows in zip(sequences, same_images, strict=True):
         _warn_of_sequence(settings, sequence, rows)

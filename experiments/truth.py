@@ -29,7 +29,7 @@ def evaluation_protocol(settings: Mapping[str, Any], dataset: Dataset) -> Evalua
     return evaluation.evaluation_protocol(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
 
 
-def description(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
+def describe(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
     """Kind, files, unit and thresholds of the ground truth, as results store them."""
     choice, truth = settings["dataset"], dataset.sequences[0].truth
     entries = {
@@ -40,7 +40,7 @@ def description(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]
     return entries if truth is None else entries | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
 
 
-def fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
+def positives_fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
     """Fingerprint of the positives of all sequences, independent of their file; None without ground truth."""
     content = []
     for sequence in dataset.sequences:

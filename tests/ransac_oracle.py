@@ -15,7 +15,7 @@ def estimate(points1, points0, *, threshold, max_iterations=2000, confidence=0.9
     count = len(points1)
     best, samples, limit = (np.zeros(count, bool), np.full(count, np.inf)), 0, max_iterations
     for round_number in itertools.count():
-        drawn = np.asarray(quads.draw(jax.random.key(seed), round_number, np.int32(count)))
+        drawn = np.asarray(quads.draw_four(jax.random.key(seed), round_number, np.int32(count)))
         accepted = [four for four in drawn.T if keeps_orientation(points1[four], points0[four])][: quads.ROUND]
         for four in accepted:
             if samples >= limit:

@@ -15,7 +15,7 @@ from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
 from mfvpr.matching import MatchSet
-from mfvpr.tuning.sweeps.settings import groups
+from mfvpr.tuning.sweeps.settings import group_by_program
 from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import of_query, random_matches
@@ -98,7 +98,7 @@ def test_the_program_of_a_sweep_is_that_of_its_class():
     match_set = MatchSet.of([rows], np.array([counts]))
     work = SimpleNamespace(match_set=match_set, settings=1)
     for number in range(60):
-        [group] = groups(register_scorer(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
+        [group] = group_by_program(register_scorer(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
         group_program(work, group)
         assert log[-1:] == [number]
 

@@ -17,7 +17,7 @@ from experiments.paper.tables import Evaluations, paper_tables, row_result
 from experiments.settings import SettingsError
 from experiments.stages import dataset_of
 from mfvpr.datasets import Dataset
-from mfvpr.datasets.published import differences
+from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.reranking.results import RETRIEVAL
@@ -112,12 +112,12 @@ def evaluate_all(
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.contents(folder).fingerprint for side, folder in folders.items()}
-            correct = truth.fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
+            correct = truth.positives_fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue
         datasets[place.name] = dataset
-        for difference in differences(dataset):
+        for difference in published_differences(dataset):
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names, start=number * len(names) + 1):
             chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place, settings)

@@ -14,7 +14,7 @@ from experiments.paper.printed import BERLIN, OTHERS, average, printed_recall, p
 from experiments.paper.systems import Row
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import MEANS
-from mfvpr.datasets.published import differences
+from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import middle
 from mfvpr.report import Table
 
@@ -71,7 +71,7 @@ class Evaluations:
 
     def title(self, name: str) -> str:
         """A data set's name, marked if it lacks images."""
-        return name + INCOMPLETE * (next(differences(self.datasets[name]), None) is not None)
+        return name + INCOMPLETE * (next(published_differences(self.datasets[name]), None) is not None)
 
     @cached_property
     def means(self) -> tuple[list[str], dict[str, Float[np.ndarray, " tolerances"]]]:

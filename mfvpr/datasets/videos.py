@@ -12,7 +12,7 @@ from mfvpr.utils.files import require_file
 VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 
-def frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+def read_frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
     """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame.
 
     Raises:

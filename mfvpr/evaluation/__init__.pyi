@@ -16,7 +16,7 @@ __all__ = [
     "hits",
     "match_sequence",
     "mcnemar",
-    "neighbors",
+    "neighboring_settings",
     "precision_recall",
     "read_confidences",
     "recall_at_k",
@@ -31,6 +31,6 @@ from .precision import precision_recall, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .recall import Tally, hits, recall_at_k
 from .results import Recall, Result
-from .selection import Half, best_setting, halves, neighbors, separate
+from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .statistics import estimate, mcnemar

@@ -70,7 +70,7 @@ def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[n
     return Half(tune[positives.take(tune).among(reported).counts == 0], report, ~reported)
 
 
-def neighbors(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:
+def neighboring_settings(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:
     """Numbers of the settings of a grid that differ from a setting by one step along one axis."""
     shape = tuple(map(len, axes.values()))
     numbers = np.arange(math.prod(shape)).reshape(shape)
@@ -91,5 +91,5 @@ def best_setting(recall: Float[np.ndarray, " settings"], axes: Mapping[str, Sequ
     equal = np.flatnonzero(recall == recall.max())
     if axes is None:
         return int(equal[0])
-    around = [np.mean(recall[neighbors(axes, int(setting)) or [setting]]) for setting in equal]
+    around = [np.mean(recall[neighboring_settings(axes, int(setting)) or [setting]]) for setting in equal]
     return int(equal[np.argmax(around)])

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 
 from mfvpr.io.checks import Lengths, as_float32, with_length
 from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
-from mfvpr.io.feature_files import as_float
+from mfvpr.io.feature_files import convert_floats
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
@@ -67,7 +67,7 @@ def write_global_descriptors(
     """
     path = Path(path)
     require_different(path, names)
-    values = as_float(str(path), np.asarray(descriptors), half)
+    values = convert_floats(str(path), np.asarray(descriptors), half)
     _require_rows(path, values, names)
     suffix = path.suffix.lower()
     if suffix == ".npy":

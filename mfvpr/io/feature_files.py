@@ -43,7 +43,7 @@ def write_features(
             write_npz(path / f"{_below(name)}.npz", arrays.items())
 
 
-def as_float(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
+def convert_floats(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
     """Convert to float32, or to float16 if `half`.
 
     Raises:
@@ -61,7 +61,7 @@ def as_float(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Fl
 def _parts(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:
     mask, size = np.asarray(features.mask), np.asarray(features.image_size)
     arrays = {
-        part: as_float(f"{shorten(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
+        part: convert_floats(f"{shorten(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
         for part in ("keypoints", "descriptors", "scores")
     }
     return arrays | {"image_size": size.astype(np.int64) if (size == np.round(size)).all() else size}

@@ -106,7 +106,7 @@ def _pixels(image: Any) -> np.ndarray:
     return pixels
 
 
-def local_features(images: ImageFolder, extractor: Extractor, track: Track = no_progress) -> Iterator[Features]:
+def extract_local_features(images: ImageFolder, extractor: Extractor, track: Track = no_progress) -> Iterator[Features]:
     """Extract the local features of all images of a folder."""
     for batch in _batches(images, extractor, range(len(images)), track):
         yield from (round_as_stored(description.features) for description in batch.values())

@@ -13,7 +13,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Extractor
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.describing import local_features
+from mfvpr.localization.describing import extract_local_features
 from mfvpr.storage.disk import disk_errors_as_input_errors
 from mfvpr.storage.features import FeatureStore, open_store
 from mfvpr.storage.maps import MAP, file_stamp, has_rows, write_settings
@@ -76,7 +76,7 @@ class VocabularyFile:
         shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed
         try:
             with open_store(folder, settings, num_images=len(images)) as store:
-                features = enumerate(local_features(images, self._extractor, track))
+                features = enumerate(extract_local_features(images, self._extractor, track))
                 while batch := dict(itertools.islice(features, self._extractor.batch_size)):
                     store.write(batch)
             vocabulary = self._fitting.fit(FeatureSet(store, {}))

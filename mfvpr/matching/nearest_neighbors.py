@@ -191,7 +191,7 @@ def keypoint_count(features: Features) -> Int[Array, ""]:
 
 def at_least_one(features: Features) -> Features:
     """Add a slot of padding to an image without slots."""
-    return replace(features, **ragged.at_least_one(per_keypoint(features)))
+    return replace(features, **ragged.at_least_one_row(per_keypoint(features)))
 
 
 def _pad_to_blocks(features: Features) -> Features:

@@ -76,7 +76,7 @@ def sweep_summary(outcome: Outcome) -> str:
         settings_table(outcome, shown).text(),
     ]
     if outcome.is_grid and not protocol.halves and len(shown) < len(outcome.settings):
-        around = evaluation.neighbors(outcome.axes.values, outcome.chosen[0])
+        around = evaluation.neighboring_settings(outcome.axes.values, outcome.chosen[0])
         table = settings_table(outcome, [outcome.chosen[0], *around])
         parts += ["The best, and its neighbors in the grid:", table.text()] if around else []
     return "\n".join([*parts, *_verdicts(outcome)])

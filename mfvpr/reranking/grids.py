@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Num
 from mfvpr.matching.nearest_neighbors import filter_matches
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.parameters import numbers, whole_numbers, with_capacity, with_parameters
+from mfvpr.scoring.parameters import numbers_by_name, whole_numbers, with_capacity, with_parameters
 from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs
 from mfvpr.scoring.weights import ChosenWeight, Weight, match_weights
 from mfvpr.types import Array, Matches
@@ -84,7 +84,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
 
 def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
     """Raise a ValueError if a number of the scorer has the name of an axis with another meaning."""
-    for name in {*names} & {*numbers(scorer)} & {*reserved}:
+    for name in {*names} & {*numbers_by_name(scorer)} & {*reserved}:
         raise ValueError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
 
 
@@ -247,7 +247,7 @@ def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
 
 def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
-    values = numbers(scorer)
+    values = numbers_by_name(scorer)
     numeric = [*values, *(["weight"] if hasattr(scorer, "weight") else []), "max_distance"]
     if name not in numeric:
         nearest = difflib.get_close_matches(name, numeric, n=1) or numeric

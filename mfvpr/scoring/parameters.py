@@ -14,7 +14,7 @@ from jaxtyping import Num
 from mfvpr.types import Array
 
 
-def numbers(scorer: Any) -> dict[str, Any]:
+def numbers_by_name(scorer: Any) -> dict[str, Any]:
     """Numbers of a scorer by dotted name, which a grid may vary; also a `temperature` of None."""
     leaves = jax.tree_util.tree_leaves_with_path(scorer, is_leaf=lambda leaf: leaf is None)
     return {
@@ -28,17 +28,17 @@ def numbers(scorer: Any) -> dict[str, Any]:
 def whole_numbers(scorer: Any) -> set[str]:
     """Names of the `numbers` that are integers, such as indices, and must remain integers."""
     is_whole = lambda number: jnp.issubdtype(jnp.result_type(number), jnp.integer)  # noqa: E731
-    return {name for name, number in numbers(scorer).items() if number is not None and is_whole(number)}
+    return {name for name, number in numbers_by_name(scorer).items() if number is not None and is_whole(number)}
 
 
-def choices(scorer: Any) -> set[str]:
+def static_names(scorer: Any) -> set[str]:
     """Dotted names of the static fields of a scorer, whose values select the compiled program."""
     names = set()
     for field in fields(scorer) if is_dataclass(scorer) else ():
         if field.metadata.get("static"):
             names.add(field.name)
         else:
-            names |= {f"{field.name}.{name}" for name in choices(getattr(scorer, field.name))}
+            names |= {f"{field.name}.{name}" for name in static_names(getattr(scorer, field.name))}
     return names
 
 

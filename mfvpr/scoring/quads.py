@@ -28,7 +28,7 @@ def canonical_order(points: Float[Array, "slots 4"], real: Bool[Array, " slots"]
     return jax.lax.sort((*keys, jnp.arange(len(real), dtype=jnp.int32)), num_keys=len(keys))[-1]
 
 
-def draw(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, ""] | int) -> Int[Array, "4 draws"]:
+def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, ""] | int) -> Int[Array, "4 draws"]:
     """Four distinct numbers below `count` (at least 4), all sets equally likely."""
     bits = jax.random.bits(jax.random.fold_in(key, round_number), (4, _DRAWS), jnp.uint32)
     share = (bits >> 8).astype(jnp.float32) * 2.0**-24
@@ -56,7 +56,7 @@ def draw_samples(
         round_number: from 0.
         count: number of real matches, at least 4.
     """
-    index = jax.lax.optimization_barrier(draw(key, round_number, count))  # each coordinate would draw again
+    index = jax.lax.optimization_barrier(draw_four(key, round_number, count))  # each coordinate would draw again
     number = _running_count(~_is_degenerate(_gather(points, index)))
     draws = jnp.searchsorted(number, jnp.arange(1, ROUND + 1, dtype=number.dtype), method="scan_unrolled")
     index = index.at[:, jnp.minimum(draws, _DRAWS - 1)].get(mode="promise_in_bounds")

@@ -63,12 +63,12 @@ def used_bytes(folder: Path) -> int:
     return total
 
 
-def free_bytes(folder: Path) -> int:
+def free_disk_bytes(folder: Path) -> int:
     folder = folder.absolute()
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
 
 
 def full_disk_error(folder: Path, needed: int) -> InputError:
-    free = free_bytes(folder)
+    free = free_disk_bytes(folder)
     return InputError(f"{folder}: expected about {needed / 1e6:.1f} MB of free disk space, got {free / 1e6:.1f} MB; "
                       "free some space and run again, which goes on from here")  # fmt: skip

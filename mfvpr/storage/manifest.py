@@ -102,7 +102,7 @@ def has_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
     return True
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_store_leftovers(folder: Path) -> None:
     """Remove temporary files of a killed process. The caller has the lock of the store."""
     for leftover in filter(_is_leftover, folder.iterdir()):
         leftover.unlink()

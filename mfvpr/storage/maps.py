@@ -33,7 +33,15 @@ from jaxtyping import Int
 
 from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
-from mfvpr.storage.manifest import FEATURES, MANIFEST, Kind, has_manifest, manifest_of, remove_leftovers, write_manifest
+from mfvpr.storage.manifest import (
+    FEATURES,
+    MANIFEST,
+    Kind,
+    has_manifest,
+    manifest_of,
+    remove_store_leftovers,
+    write_manifest,
+)
 from mfvpr.storage.map_entries import Entry, EntryStore, open_entry_store
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
@@ -67,7 +75,7 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
                          "map anew in another folder.")  # fmt: skip
     with disk_errors_as_input_errors(folder, MAP.content):
-        remove_leftovers(folder)
+        remove_store_leftovers(folder)
         write_manifest(folder, MAP, manifest_of(MAP, settings, {}))
 
 

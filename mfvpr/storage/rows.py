@@ -15,8 +15,8 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.storage.disk import disk_errors_as_input_errors, free_bytes, full_disk_error, lock_store, used_bytes
-from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_leftovers, write_manifest
+from mfvpr.storage.disk import disk_errors_as_input_errors, free_disk_bytes, full_disk_error, lock_store, used_bytes
+from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_store_leftovers, write_manifest
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
@@ -95,7 +95,7 @@ class RowStore(Generic[Item]):
                     write_manifest(self.folder, self.kind, self._manifest)
                 self.write_folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(lock_store(self.write_folder, self.kind.content, self._waiting))
-                remove_leftovers(self.write_folder)
+                remove_store_leftovers(self.write_folder)
                 write_manifest(self.write_folder, self.kind, self._manifest)
                 self.look()
                 stack.callback(setattr, self, "is_writable", False)
@@ -258,7 +258,7 @@ def row_bytes(num_bytes: float, num_arrays: int) -> int:
 
 def require_space(folder: Path, num_bytes: int) -> None:
     """Raise `InputError` if less than `num_bytes` are free on the disk of `folder`."""
-    if free_bytes(folder) < num_bytes:
+    if free_disk_bytes(folder) < num_bytes:
         raise full_disk_error(folder, num_bytes)
 
 

@@ -87,7 +87,7 @@ def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np
     return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
 
 
-def at_least_one(tree: Tree) -> Tree:
+def at_least_one_row(tree: Tree) -> Tree:
     """Arrays `[n, ...]`; those with n = 0 become one entry of zeros, which can be indexed. Traced or not."""
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
 
@@ -98,4 +98,4 @@ def compact(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tre
     Entries beyond the capacity are dropped; the values of unused slots are arbitrary.
     """
     slots = jnp.nonzero(mask, size=capacity, fill_value=0)[0]
-    return jax.tree.map(lambda leaf: at_least_one(jnp.asarray(leaf))[slots], tree)
+    return jax.tree.map(lambda leaf: at_least_one_row(jnp.asarray(leaf))[slots], tree)

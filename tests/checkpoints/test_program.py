@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from experiments.launch import one_line
-from experiments.weights import main
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry

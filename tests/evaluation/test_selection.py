@@ -5,7 +5,7 @@ import pytest
 
 from mfvpr import frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives
-from mfvpr.evaluation import best_setting, halves, neighbors
+from mfvpr.evaluation import best_setting, halves, neighboring_settings
 from mfvpr.evaluation.selection import halves_of_map
 
 
@@ -58,9 +58,9 @@ def test_queries_without_a_place_may_be_tuned_on():
 
 def test_neighbors_are_one_step_along_one_axis():
     axes = {"sigma": [1, 2, 3], "weight": ["fs", "dmf"]}  # numbers: 0 1 / 2 3 / 4 5
-    assert neighbors(axes, 2) == [0, 4, 3]
-    assert neighbors(axes, 5) == [3, 4]
-    assert neighbors({"sigma": [1]}, 0) == []
+    assert neighboring_settings(axes, 2) == [0, 4, 3]
+    assert neighboring_settings(axes, 5) == [3, 4]
+    assert neighboring_settings({"sigma": [1]}, 0) == []
 
 
 def test_equals_are_told_apart_by_their_neighbors():

@@ -16,7 +16,7 @@ from PIL import Image
 from experiments import build, maps, query_images
 from experiments.settings import SettingsError
 from mfvpr.datasets import read_image
-from mfvpr.datasets.videos import frames
+from mfvpr.datasets.videos import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.storage.maps import lock_map
 from mfvpr.utils import InputError
@@ -133,7 +133,7 @@ def test_frames_of_a_video_are_localized(folder, video, small_street, localize):
     assert [(line["image"], line["place"]) for line in lines] == [
         (f"{video}:{row}", f"{row:04d}.png") for row in (0, 3, 6, 9)
     ]
-    [(_, first), *_] = frames(video)
+    [(_, first), *_] = read_frames(video)
     expected = read_image(small_street / "database/0000.png")
     assert first.shape == expected.shape
     assert np.abs(first.astype(int) - expected).mean() < 4  # a JPEG of it
@@ -143,7 +143,7 @@ def test_files_that_are_no_video(tmp_path):
     (tmp_path / "a.mp4").write_text("text")
     for path, words in ((tmp_path / "a.mp4", "without frames"), (tmp_path, "a folder"), (tmp_path / "no", "nothing")):
         with pytest.raises(InputError, match=words):
-            list(frames(path))
+            list(read_frames(path))
 
 
 def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queries, localize):
@@ -196,7 +196,7 @@ def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch)
     monkeypatch.setattr(maps, "map_of", build_other_first)
     with pytest.raises(SettingsError, match="was made with other candidates"):
         maps.map_of_settings(settings[0])
-    assert maps.read(tmp_path / "map")["candidates"] == 6
+    assert maps.read_settings(tmp_path / "map")["candidates"] == 6
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, thr
 
 
 def test_draws_are_distinct_and_every_set_is_as_likely():
-    drawn = np.sort(np.asarray(quads.draw(jax.random.key(1), 0, np.int32(6))), axis=0)
+    drawn = np.sort(np.asarray(quads.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
     assert (np.diff(drawn, axis=0) > 0).all()
     assert (drawn.min(), drawn.max()) == (0, 5)
     _, counts = np.unique(drawn, axis=1, return_counts=True)
@@ -82,7 +82,7 @@ def test_samples_are_the_first_draws_that_a_camera_can_see():
     points[5:10] = np.linspace(0, 0.75, 5, dtype=np.float32)[:, None]  # on a line in both images
     key = jax.random.key(7)
     samples, count = quads.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
-    drawn = np.asarray(quads.draw(key, 3, np.int32(30))).T
+    drawn = np.asarray(quads.draw_four(key, 3, np.int32(30))).T
     visible = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
     assert int(count) == min(len(visible), quads.ROUND)
     expected = points[np.array(visible[: int(count)])]

@@ -111,7 +111,7 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
         raise InputError(f"{error} (layout: python -m experiments.data list {name})") from error
 
 
-def differences(dataset: Dataset) -> Iterator[str]:
+def published_differences(dataset: Dataset) -> Iterator[str]:
     """Differences from the published numbers of images, in words; none for data sets that are not published."""
     entry = PUBLISHED.get(dataset.name)
     if entry is None:

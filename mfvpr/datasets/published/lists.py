@@ -55,7 +55,7 @@ def dataset_of_lists(
 
 
 @contextmanager
-def reading(path: Path, damage: str, kind: str = "a list") -> Iterator[None]:
+def reading_list(path: Path, damage: str, kind: str = "a list") -> Iterator[None]:
     """Require a regular file, and raise all errors of reading it as InputErrors; `damage` describes another content."""
     require_file(path, kind)
     try:
@@ -75,7 +75,7 @@ def expected_file(root: Path, *names: str) -> Path | None:
 
 def read_lines(path: Path) -> list[str]:
     """Read lines that are not empty, without the spaces around them."""
-    with reading(path, "expected lines of text; get it again"):
+    with reading_list(path, "expected lines of text; get it again"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
 
@@ -90,7 +90,7 @@ def read_names(path: Path) -> list[str]:
 
 def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
     """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`."""
-    with reading(path, "this file is damaged; get it again"), path.open("rb") as file:
+    with reading_list(path, "this file is damaged; get it again"), path.open("rb") as file:
         if _OBJECTS in file.read(128):
             file.seek(0)
             lists = read_objects(file, "lists of rows")
@@ -115,5 +115,5 @@ def _require_integers(rows: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _read_array(path: Path) -> np.ndarray:
-    with reading(path, "expected an array of NumPy; get it again"), path.open("rb") as file:
+    with reading_list(path, "expected an array of NumPy; get it again"), path.open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False)

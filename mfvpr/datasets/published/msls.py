@@ -9,7 +9,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.ground_truth import FARTHEST, RadiusTruth
 from mfvpr.datasets.positives import rows_within
-from mfvpr.datasets.published.lists import dataset_of_lists, listed_images, reading
+from mfvpr.datasets.published.lists import dataset_of_lists, listed_images, reading_list
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numbers import parse_number
 
@@ -77,7 +77,7 @@ def _flag(text: str) -> bool:
 def _table(path: Path) -> dict[str, dict[str, str]]:
     """Lines of a table by key."""
     with (
-        reading(path, "expected a table of commas; get it again", "a table of the data set"),
+        reading_list(path, "expected a table of commas; get it again", "a table of the data set"),
         path.open(newline="", encoding="utf-8") as file,
     ):
         lines = list(csv.DictReader(file))

@@ -6,7 +6,7 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.ground_truth import RadiusTruth
-from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images, reading
+from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images, reading_list
 from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 
@@ -30,7 +30,7 @@ def pitts30k(root: Path, name: str) -> Dataset:
 
 
 def _dataset_of_structure(root: Path, name: str, path: Path) -> Dataset:
-    with reading(path, f"expected the structure dbStruct of {name}; get the file again"), path.open("rb") as file:
+    with reading_list(path, f"expected the structure dbStruct of {name}; get the file again"), path.open("rb") as file:
         arrays = read_matlab(file, text=True)
         sides = [_cell_texts(arrays, f"dbStruct.{field}.") for field in ("dbImageFns", "qImageFns")]
         positions = [arrays[f"dbStruct.{field}"].T.astype(np.float64) for field in ("utmDb", "utmQ")]

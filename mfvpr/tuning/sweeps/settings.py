@@ -59,7 +59,9 @@ def distinct(settings: Sequence[Setting]) -> tuple[list[dict[str, Any]], list[li
     return [setting for setting, _ in by_scores], [places for _, places in by_scores]
 
 
-def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]) -> Iterator[Group]:
+def group_by_program(
+    scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
+) -> Iterator[Group]:
     """Group settings by program.
 
     Args:
@@ -67,7 +69,7 @@ def groups(scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarr
         settings: the same names in each. Each value of a static parameter, and None, has its own program.
         image_sizes: `[n, 2]` all sizes of queries and of database images.
     """
-    static, integers = parameters.choices(scorer), parameters.whole_numbers(scorer)
+    static, integers = parameters.static_names(scorer), parameters.whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
     for choices, members in by_choices:

@@ -23,7 +23,7 @@ from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
 from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
 from mfvpr.scoring.scorer import check_host, on_host
-from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, groups
+from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, group_by_program
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
@@ -113,7 +113,7 @@ def sweep(
     unique, places = distinct(settings)
     per_block = min(settings_per_block or SETTINGS_PER_BLOCK, len(unique))
     queries = queries_per_block or queries_that_fit(match_set, per_block)
-    programs = list(groups(scorer, unique, match_set.image_sizes))
+    programs = list(group_by_program(scorer, unique, match_set.image_sizes))
     work = Work(match_set, all_queries, len(unique) / len(programs), candidates, views, depth, ties, retrieval_score)
     if folder is not None:
         programs = [replace(group, program=group_program(work, group)) for group in programs]

@@ -15,7 +15,7 @@ from mfvpr.matching.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.reranking import ranking
 from mfvpr.scoring.parameters import with_parameters
 from mfvpr.tuning import sweeps
-from mfvpr.tuning.sweeps.settings import groups
+from mfvpr.tuning.sweeps.settings import group_by_program
 from mfvpr.types import Shortlist
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
@@ -101,7 +101,7 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
     scorer = mfvpr.HistogramOfShifts()
     settings = sweeps.grid({"sigma": [9.0, 20.0, 30.0], "weight": [FS, DMF], "max_distance": [0.8, 2.0]})
     settings.insert(3, {"sigma": 9.0, "weight": FS, "max_distance": 1.1})
-    programs = list(groups(scorer, settings, data[0].image_sizes))
+    programs = list(group_by_program(scorer, settings, data[0].image_sizes))
     assert sorted(group.rows.shape for group in programs) == [(1, 5), (2, 4)]
     assert sorted(row for group in programs for row in group.rows.reshape(-1)) == list(range(13))
     for rows, setting in zip(sweeps.sweep(scorer, settings, *data)[0], settings, strict=True):
