@@ -60,8 +60,8 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     for number, name in enumerate(sequences):
         places = [*range(len(HOSTILE))] if several else [""] * len(HOSTILE)
         _write_answers(sequence_folder(folder, sequences, number), ranks, truth, places)
-        _write_figure(folder / "figures" / f"{name if several else ''}" / f"correct_{number:04d}.png", name, 0)
-        _write_figure(folder / "figures" / f"{name if several else ''}" / f"incorrect_{number:04d}.png", name, 6)
+        for outcome, query in (("correct", 0), ("incorrect", 6)):
+            _write_figure(folder / "figures" / (name if several else "") / f"{outcome}_{number:04d}.png", name, query)
     if truth:
         _write_tables(folder, ranks, sequences)
     return folder

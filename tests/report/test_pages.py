@@ -248,32 +248,17 @@ def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):
 
 
 def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypatch, capsys):
-    places = {name: write_run(tmp_path / name) for name in ("sweep", "broken", "kind", "lacking", "old", "figure")}
-    change_json(places["sweep"] / "results.json", lambda rows: {"settings": []})
-    (places["broken"] / "run.json").write_text("{")
-    change_json(places["kind"] / "results.json", lambda rows: [{**row, "seconds": "3"} for row in rows])
-    (places["lacking"] / "gains.csv").unlink()
-    (places["old"] / "gains.csv").write_text("query,retrieval,retrieval rank\na,1,1\n")
-    (places["figure"] / "figures" / "right_0009.png").write_bytes(b"no image")
-    for place, words in (
-        (tmp_path / "none", "none with a results.json"), (places["sweep"], "no rows"), (places["broken"], "JSONDecode"),
-        (places["kind"], "seconds is str"), (places["lacking"], "gains.csv"), (places["old"], "'place'"),
-        (places["figure"], "expected a figure of the run"),
-    ):  # fmt: skip
-        code, stdout, stderr = typed(monkeypatch, capsys, "report", place)
+    figure = shutil.copytree(run, tmp_path / "figure")
+    (figure / "figures" / "right_0009.png").write_bytes(b"no image")
+    for folders in ([tmp_path / "none"], [figure], [run, run], [run, run.parent / "." / "one"]):
+        code, stdout, stderr = typed(monkeypatch, capsys, "report", *folders)
         assert (code, stdout, stderr.count("\n")) == (2, "", 1)
-        assert stderr.startswith(f"error: {place}")
-        assert words in stderr
-    code, _, stderr = typed(monkeypatch, capsys, "report", run, run)
-    assert code == 2
-    assert "one: expected different run folders" in stderr
-    with pytest.raises(InputError, match="expected different"):
-        write_comparison([run, run.parent / "." / "one"], tmp_path / "page.html")
+        assert stderr.startswith(f"error: {folders[0]}")
 
 
 @pytest.fixture
 def error_with(run, tmp_path, monkeypatch):
-    """The error of a run folder with another text in a file; None if it has a page, which is not written."""
+    """The error of a run folder with another text in a file, or without it (None); None if it has a page."""
     monkeypatch.setattr(one_run, "write_page", lambda *_, **parts: None)
     monkeypatch.setattr(one_run, "pictures", lambda *_: [])
     shutil.copytree(run, tmp_path / "run")
@@ -281,7 +266,7 @@ def error_with(run, tmp_path, monkeypatch):
     def error_with(name, text):
         path = tmp_path / "run" / name
         before = path.read_bytes()
-        path.write_text(text, "utf-8", "surrogateescape")
+        path.unlink() if text is None else path.write_text(text, "utf-8", "surrogateescape")
         try:
             write_report(tmp_path / "run")
             return None
@@ -293,6 +278,17 @@ def error_with(run, tmp_path, monkeypatch):
     return error_with
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("results.json", '{"settings": []}', "no rows"), ("run.json", "{", "JSONDecode"),
+        ("gains.csv", None, "gains.csv"), ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "'place'"),
+    ],
+)  # fmt: skip
+def test_files_of_other_programs_are_errors(error_with, name, text, words):
+    assert words in error_with(name, text)
+
+
 def test_edited_results_are_errors_of_one_line(error_with, run):
     text = (run / "results.json").read_text("utf-8")
     for before, after in (
@@ -301,7 +297,7 @@ def test_edited_results_are_errors_of_one_line(error_with, run):
         ('"recall_at": {', '"recall_at": {"x": 1,'), ('"recall_at": {', '"recall_at": {"5": 1,'), ('"1":', '"01":'),
         ('"tolerance": 2', '"tolerance": null'), ('"name"', '"named"'), ('"system"', '"systems"'),
         ('"thresholds": [', '"thresholds": ["0",'),
-        ('"dataset"', '"sequence"'), ('"ground_truth"', '"truth"'),
+        ('"dataset"', '"sequence"'), ('"ground_truth"', '"truth"'), ('"seconds": {', '"seconds": "3", "x": {'),
     ):  # fmt: skip
         reason = error_with("results.json", text.replace(before, after, 1))
         assert reason is not None, after

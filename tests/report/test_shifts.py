@@ -1,6 +1,5 @@
 """shifts.csv of a run: its pairs, and that their shifts are those of the library."""
 
-import csv
 from dataclasses import replace
 
 import jax
@@ -14,7 +13,7 @@ from mfvpr.matching import MatchSet
 from mfvpr.report.shifts import HEADER
 from mfvpr.utils import Stopwatch
 from tests.builders import make_matches, of_query
-from tests.programs import composed, shared, small
+from tests.programs import composed, csv_rows, shared, small
 
 pytestmark = pytest.mark.thorough
 
@@ -26,18 +25,13 @@ def root(tmp_path_factory):
     return shared(tmp_path_factory)
 
 
-def lines_of(file):
-    with file.open(newline="") as opened:
-        return [*csv.DictReader(opened)]
-
-
 @pytest.mark.first_case
 @pytest.mark.parametrize("final", ["score", "combined"])
 def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, final):
     settings = composed(*small(root), *STEERING, f"final={final}", f"out={tmp_path}/out")
     evaluation.evaluate(settings)
-    lines, first = lines_of(tmp_path / "out" / "shifts.csv"), {}
-    for line in reversed(lines_of(tmp_path / "out" / "predictions.csv")):
+    lines, first = csv_rows(tmp_path / "out" / "shifts.csv"), {}
+    for line in reversed(csv_rows(tmp_path / "out" / "predictions.csv")):
         first[line["query"]] = line
     assert list(lines[0]) == list(HEADER)
     assert [(line["query"], line["prediction"]) for line in lines] == [
@@ -45,9 +39,8 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     ]
     tools, images = stages.begun(settings, Stopwatch())
     matches, candidates = stages.match_data_set(settings, tools, images, Stopwatch())
-    scorer = HistogramOfShifts(
-        bin_size=5.0, sigma=10.0, weight=evaluation.build.scorers(settings["scorer"])["histogram"].weight
-    )
+    weight = evaluation.build.scorers(settings["scorer"])["histogram"].weight
+    scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
     names = images.dataset.database.names
     for row, line in enumerate(lines):
         place = list(candidates.indices[row]).index(names.index(line["prediction"]))
@@ -93,10 +86,10 @@ def test_refused_answers_have_no_shift(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
     confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
     evaluation.evaluate(composed(*small(root), *STEERING, *confidence))
-    predictions = {line["query"]: line["prediction"] for line in lines_of(tmp_path / "out" / "top_predictions.csv")}
+    predictions = {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "top_predictions.csv")}
     places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
     assert 0 < len(places) < len(predictions)
-    assert {line["query"]: line["prediction"] for line in lines_of(tmp_path / "out" / "shifts.csv")} == places
+    assert {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "shifts.csv")} == places
 
 
 def test_only_a_histogram_has_one(root, tmp_path):
