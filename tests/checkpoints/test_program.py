@@ -7,39 +7,30 @@ import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.errors import one_line
-from experiments.weights import main
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+from tests.programs import ROOT, typed
 from tests.random_checkpoints import layered, places365_shapes, random_checkpoint, write_numpy, write_zip
 
-ROOT = Path(__file__).parent.parent.parent
 CONTENT = bytes(range(256)) * 4096
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
 @pytest.fixture
-def program(folder, monkeypatch, capfd):
+def program(folder, monkeypatch, capsys):
     """Runs the command line in this process: exit code, stdout, stderr."""
-    handler = signal.getsignal(signal.SIGTERM)
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["weights", *map(str, arguments)])
-        code = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code or 0
-        return code, *capfd.readouterr()
+        code, stdout, stderr = typed(monkeypatch, capsys, "weights", *arguments)
+        return code or 0, stdout, stderr
 
-    yield run
-    signal.signal(signal.SIGTERM, handler)
+    return run
 
 
 @pytest.fixture
@@ -128,13 +119,13 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
     assert program("verify") == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
 
 
-def test_missing_weights_are_answered_with_a_command(program, folder, capfd):
+def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
     for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "convert d2_tf.pth"),
                           ("mixvpr_512", "convert 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
         with pytest.raises(SystemExit) as caught, one_line():
             load_model(name)
         assert caught.value.code == 2
-        stderr = capfd.readouterr().err
+        stderr = capsys.readouterr().err
         assert stderr.startswith(f"error: {name}: not installed in {folder}; get ")
         assert stderr.endswith(f" and install it: python -m experiments.weights {command}\n")
         assert f" and install it: python -m experiments.weights {command}\n" in program("verify", name)[1]
