@@ -254,7 +254,7 @@ def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypa
     change_json(places["kind"] / "results.json", lambda rows: [{**row, "seconds": "3"} for row in rows])
     (places["lacking"] / "gains.csv").unlink()
     (places["old"] / "gains.csv").write_text("query,retrieval,retrieval rank\na,1,1\n")
-    (places["figure"] / "figures" / "right_0009.png").write_bytes(b"no image")
+    (places["figure"] / "figures" / "correct_0009.png").write_bytes(b"no image")
     for place, words in (
         (tmp_path / "none", "none with a results.json"), (places["sweep"], "no rows"), (places["broken"], "JSONDecode"),
         (places["kind"], "seconds is str"), (places["lacking"], "gains.csv"), (places["old"], "'place'"),
