@@ -249,7 +249,7 @@ def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):
 
 def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypatch, capsys):
     figure = shutil.copytree(run, tmp_path / "figure")
-    (figure / "figures" / "right_0009.png").write_bytes(b"no image")
+    (figure / "figures" / "correct_0009.png").write_bytes(b"no image")
     for folders in ([tmp_path / "none"], [figure], [run, run], [run, run.parent / "." / "one"]):
         code, stdout, stderr = typed(monkeypatch, capsys, "report", *folders)
         assert (code, stdout, stderr.count("\n")) == (2, "", 1)
