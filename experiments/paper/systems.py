@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.build import expand_user
-from experiments.quoting import as_typed
+from experiments.overrides import quote
 from experiments.settings import RULES, SettingsError
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
@@ -144,7 +144,7 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
         elif name in located:
             available.append(located[name])
         elif folder := _folder(root, name, located):
-            available.append(Place(name, (f"dataset={name}", as_typed(f"dataset.root={folder}")), folder))
+            available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={folder}")), folder))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
             missing.append(f"{name}: needs {data or 'data=DIR'}/{name} {needs}")
@@ -158,7 +158,7 @@ def _places_by_coordinates(root: Path) -> Iterator[Place]:
             sides = {side: inside / side for side in _SIDES}
             if all(side.is_dir() and _first_name(side).startswith(_POSITIONS) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
-                settings = (as_typed(f"dataset.{name}={value}") for name, value in chosen.items())
+                settings = (quote(f"dataset.{name}={value}") for name, value in chosen.items())
                 yield Place(folder.name, ("dataset=folder", *settings), folder)
                 break
 

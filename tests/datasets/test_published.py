@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mfvpr.datasets.published import differences, published_dataset
+from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
 from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE
 from mfvpr.utils import InputError
@@ -431,10 +431,10 @@ def test_pipes_are_not_waited_for(tmp_path, pipe):
 
 
 def test_numbers_of_images_are_compared_with_the_published(ssm):
-    assert list(differences(published_dataset("berlin_a100", ssm))) == [
+    assert list(published_differences(published_dataset("berlin_a100", ssm))) == [
         "12 database images where 85 are published",
         "3 queries in berlin_a100 where 81 are published",
     ]
     put(ssm, *(f"Reference/image{i:04d}.png" for i in range(85)), *(f"Live/image{i:05d}.jpg" for i in range(81)))
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n" + "".join(f"0,{i}\n" for i in range(81)))
-    assert list(differences(published_dataset("berlin_a100", ssm))) == []
+    assert list(published_differences(published_dataset("berlin_a100", ssm))) == []
