@@ -19,8 +19,6 @@ BENCHMARKS = {
     "real": "recall of every score on the same matches of real images, time per query (1 round)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
-    "city": "100,000 images, features of the shortlists alone; forecast for 2.8 million (3 rounds, 2 GB of disk)",
-    "kills": "shards whose tasks are killed: results equal those of undisturbed tasks (200 kills; 15 minutes)",
 }
 OPTIONS = {"stores": "scale", "data": "real"}  # option -> the only benchmark that takes it
 

@@ -23,7 +23,7 @@ from mfvpr.features import FeatureSet, FeatureSource, InMemory
 from mfvpr.report import Table
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.retrieval.search import EXACT
-from mfvpr.types import Features, Shortlist
+from mfvpr.types import Features
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
@@ -120,7 +120,10 @@ def _measure(data: SyntheticSet, root: Path, rounds: int, start: float) -> Itera
     count = len(predictions) * data.queries
     yield vars(data) | {
         "total": [sum(prediction.seconds.values()) / data.queries for prediction in predictions],
-        "steps": {name: seconds / data.queries for name, seconds in median_seconds(predictions).items()},
+        "steps": {
+            step: float(np.median([prediction.seconds[step] for prediction in predictions])) / data.queries
+            for step in STEPS
+        },
         "cpu": cpu / count,
         "reading": source.seconds / count,
         "rows": source.rows / count,
@@ -143,19 +146,10 @@ def rank_queries(
     queries: FeatureSet, database: FeatureSet, vectors: tuple[np.ndarray, np.ndarray],
     *, memory: float | None = MEMORY,
 ) -> Rankings:  # fmt: skip
-    """Retrieve by the global descriptors `vectors` of both sides, and re-rank."""
-    start = time.perf_counter()
-    candidates = EXACT.shortlist(*vectors, CANDIDATES)
-    retrieving = {"retrieval": time.perf_counter() - start}
-    prediction = rerank(queries, database, candidates, memory=memory)
-    return prediction._replace(seconds=retrieving | prediction.seconds)
-
-
-def rerank(
-    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, *, memory: float | None = MEMORY
-) -> Rankings:
-    """Match, score and rank the candidates."""
+    """Retrieve by the global descriptors `vectors` of both sides, match, score and rank."""
     times = [time.perf_counter()]
+    candidates = EXACT.shortlist(*vectors, CANDIDATES)
+    times.append(time.perf_counter())
     matches = stages.match(queries, database, candidates, memory=memory)
     times.append(time.perf_counter())
     scores = stages.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
@@ -163,13 +157,7 @@ def rerank(
     order = rank_shortlist(candidates, scores)
     times.append(time.perf_counter())
     rows = np.take_along_axis(candidates.indices, order, axis=1)
-    return Rankings(rows, scores, dict(zip(STEPS[1:], np.diff(times).tolist(), strict=True)))
-
-
-def median_seconds(predictions: list[Rankings]) -> dict[str, float]:
-    """Medians over the rounds, by step."""
-    steps = predictions[0].seconds
-    return {step: float(np.median([prediction.seconds[step] for prediction in predictions])) for step in steps}
+    return Rankings(rows, scores, dict(zip(STEPS, np.diff(times).tolist(), strict=True)))
 
 
 def _table(results: dict[str, dict[str, Any]]) -> Table:

@@ -19,6 +19,8 @@ COMMON = 2 / 7  # share of its keypoints that an image has in common with the qu
 SHIFT, JITTER = 60.0, 3.0  # px: largest shift of the common keypoints together, deviation of each
 NOISE = 0.5  # length of the noise of a common descriptor
 GLOBAL = 512  # dimensions of a global descriptor
+VIEWS = 3  # database images that show the place of a query
+LIKENESS = 0.25  # cosine similarity of global descriptors of one place; of different places 0 +- 0.04
 BATCH = 50  # images that are stored at a time
 
 
@@ -30,17 +32,15 @@ class SyntheticSet:
     queries: int  # Q
     keypoints: int  # N, of each image
     dimension: int  # of local descriptors
-    views: int = 3  # database images that show the place of a query
-    likeness: float = 0.25  # cosine similarity of global descriptors of one place; of different places 0 +- 0.04
 
     @property
     def title(self) -> str:
         return f"{self.images} images, D = {self.dimension}"
 
     def similar(self) -> np.ndarray:
-        """Rows `[Q, views]` of the database images that show the place of each query."""
+        """Rows `[Q, VIEWS]` of the database images that show the place of each query."""
         rows = np.random.default_rng([self.images, self.queries]).permutation(self.images)
-        return rows[: self.queries * self.views].reshape(self.queries, self.views)
+        return rows[: self.queries * VIEWS].reshape(self.queries, VIEWS)
 
     def query_by_row(self) -> dict[int, int]:
         """Row of a database image -> the query of the same place, if there is one."""
@@ -69,7 +69,7 @@ class SyntheticSet:
         sizes = self.queries, self.images
         queries, database = (_unit(rng.standard_normal((size, GLOBAL), np.float32)) for size in sizes)
         rows = self.similar()
-        database[rows] = _unit(self.likeness * queries[:, None] + np.sqrt(1 - self.likeness**2) * database[rows])
+        database[rows] = _unit(LIKENESS * queries[:, None] + np.sqrt(1 - LIKENESS**2) * database[rows])
         return queries, database
 
     def stores(self, root: Path) -> tuple[FeatureStore, FeatureStore]:
@@ -80,13 +80,9 @@ class SyntheticSet:
             self._complete_store(root, "database", self.images, lambda row: self.image(row, queries.get(row))),
         )
 
-    def open_store(self, root: Path, side: str, total: int) -> FeatureStore:
-        """The store below `root` for the features of `total` images."""
-        recipe = {"made_up": side} | asdict(self)
-        return open_store(store_path(root, side, recipe), recipe, num_images=total)
-
     def _complete_store(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:
-        with self.open_store(root, side, total) as store:
+        recipe = {"synthetic": side, "views": VIEWS, "likeness": LIKENESS} | asdict(self)
+        with open_store(store_path(root, side, recipe), recipe, num_images=total) as store:
             missing_rows = np.flatnonzero(~store.done)
             require_space(store.folder, forecast_bytes(len(missing_rows), self.keypoints, self.dimension))
             features = ordered_map(make, missing_rows.tolist(), workers=2)
