@@ -20,7 +20,7 @@ def _add_commands(parser: Parser) -> None:
     command.add_argument("name", metavar="NAME", help="as in dataset=NAME")
     command.add_argument("settings", metavar="root=DIR", nargs="*", help="settings of the data set, without `dataset.`")
     command.add_argument("--sheet", metavar="FILE", type=Path, help="where to draw them, by default NAME.png")
-    command.set_defaults(run="published_data:check")
+    command.set_defaults(run="published_data:check_data_set")
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def files() -> dict[str, str]:
     return {path: f"{_FIRST}{text}\n" for path, text in texts.items()}
 
 
-def write(conf: Path) -> None:
+def write_declared_files(conf: Path) -> None:
     """Write all files, and remove the files of other scorers."""
     texts = {conf / path: text for path, text in files().items()}
     for path, text in texts.items():
@@ -95,4 +95,4 @@ def _line(name: str, default: Any, comment: str) -> str:
 
 
 if __name__ == "__main__":
-    write(CONF)
+    write_declared_files(CONF)

@@ -73,7 +73,7 @@ def _fill_store(settings: dict[str, Any]) -> None:
 def _write_results(folder: Path, outcome: Outcome) -> None:
     run_folder.write_results(
         folder, outcome.settings, ground_truth(outcome), text=text(outcome),
-        write=lambda new: write(new, outcome), figures=outcome.figures,
+        write=lambda new: write_run_folder(new, outcome), figures=outcome.figures,
     )  # fmt: skip
     if page := run_folder.report_page(folder):
         print(f"report: {page}")
@@ -164,7 +164,7 @@ def _skip_note(number: int) -> str:
     return f" ({number} skipped)" if number else ""
 
 
-def write(folder: Path, outcome: Outcome) -> None:
+def write_run_folder(folder: Path, outcome: Outcome) -> None:
     """Write all files of a run folder but the figures."""
     runs.write_json(folder / "results.json", result_rows(outcome))
     if outcome.report.thresholds:

@@ -50,7 +50,7 @@ def list_data(names: list[str]) -> None:
         print(f"{name}: {description}")
 
 
-def check(name: str, settings: list[str], sheet: Path | None) -> None:
+def check_data_set(name: str, settings: list[str], sheet: Path | None) -> None:
     """Print image counts beside the published ones and the ground truth's extent; draw image pairs."""
     [chosen] = compose_data_sets("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)

@@ -18,10 +18,10 @@ def _add_arguments(parser: Parser) -> None:
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
     parser.add_argument("--out", metavar="FILE", type=Path,
                         help=f"by default RUN/report.html of one run, {_COMPARISON} here of several")  # fmt: skip
-    parser.set_defaults(run="report:write")
+    parser.set_defaults(run="report:write_page")
 
 
-def write(runs: list[Path], out: Path | None) -> None:
+def write_page(runs: list[Path], out: Path | None) -> None:
     """Write the page of one run, or of several compared, and print its path."""
     from mfvpr.report.pages.one_run import write_report
     from mfvpr.report.pages.several_runs import write_comparison

@@ -21,7 +21,7 @@ from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
-from mfvpr.report.rankings import NO_PLACE, number, write_csv
+from mfvpr.report.rankings import NO_PLACE, format_number, write_csv
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
@@ -205,7 +205,7 @@ def _write_top_predictions(folder: Path, calibrated: CalibratedPredictions) -> N
             row, unsure = ranked.rows[query, 0], refused[place][query]
             reason: Reason | None = "no candidates" if row < 0 else "low confidence" if unsure else None
             values = (ranked.scores[query, 0], probabilities[place][query])
-            numbers = ["" if np.isnan(value) else number(value) for value in values]
+            numbers = ["" if np.isnan(value) else format_number(value) for value in values]
             correct = "" if is_correct is None else int(is_correct[query, 0])
             in_database = "" if positives is None else int(positives.counts[query] > 0)
             lines.append([image, NO_PLACE if reason else database[row], *numbers, correct, reason or "", in_database])

@@ -11,7 +11,7 @@ from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.rankings import number, write_csv
+from mfvpr.report.rankings import format_number, write_csv
 from mfvpr.report.tables import Table
 from mfvpr.utils.files import write_text
 
@@ -28,7 +28,7 @@ class Difference(NamedTuple):
     def cells(self) -> list[str]:
         """A line of `differences.csv`."""
         counts, flips = self.mcnemar, self.sign_flips
-        numbers = map(number, (counts.p_value, flips.block, flips.blocks, flips.p_value))
+        numbers = map(format_number, (counts.p_value, flips.block, flips.blocks, flips.p_value))
         return [self.first, self.second, str(counts.only_first), str(counts.only_second), *numbers]
 
 

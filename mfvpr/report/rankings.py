@@ -44,7 +44,7 @@ def write_predictions(path: Path, rankings: Rankings) -> None:
     refused = np.zeros(len(rankings.rows), bool) if rankings.refused is None else rankings.refused
     lines = (
         [rankings.queries[query], rank + 1, NO_PLACE if refused[query] else rankings.database[row],
-         number(rankings.scores[query, rank]) if row >= 0 else "",
+         format_number(rankings.scores[query, rank]) if row >= 0 else "",
          "" if rankings.correct is None else int(rankings.correct[query, rank])]
         for (query, rank), row in np.ndenumerate(rankings.rows)
         if (rank == 0 if refused[query] else row >= 0)
@@ -67,7 +67,8 @@ def write_failures(path: Path, rankings: Rankings) -> None:
         rank = int(np.argmax(correct))
         with np.errstate(invalid="ignore"):  # of two infinite scores
             margin = scores[0] - scores[rank]
-        first_correct = [rank + 1, names[rank], number(scores[rank]), number(margin)] if correct.any() else [""] * 4
+        numbers = [format_number(value) for value in (scores[rank], margin)]
+        first_correct = [rank + 1, names[rank], *numbers] if correct.any() else [""] * 4
         lines.append([rankings.queries[query], names[0], *first_correct])
     write_csv(path, ("query", "prediction", "rank", "correct_image", "score", "margin"), lines)
 
@@ -78,7 +79,7 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return [*csv.DictReader(file)]
 
 
-def number(value: Any) -> str:
+def format_number(value: Any) -> str:
     """A number in a CSV file."""
     return f"{value:.7g}"
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool
 
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.rankings import number, write_csv
+from mfvpr.report.rankings import format_number, write_csv
 from mfvpr.scoring.histogram import HistogramOfShifts
 
 HEADER = ("query", "prediction", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale")
@@ -40,7 +40,7 @@ def write_shifts(
         numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None]], axis=1)
         lines = [
             [matched.sequence.images.names[query], names[predictions[query]],
-             *("" if np.isnan(value) else number(value) for value in row)]
+             *("" if np.isnan(value) else format_number(value) for value in row)]
             for query, row in zip(queries, numbers, strict=True)
         ]  # fmt: skip
         write_csv(evaluation.folder(folder, place) / "shifts.csv", HEADER, lines)

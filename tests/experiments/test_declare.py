@@ -73,7 +73,7 @@ def near(tmp_path, monkeypatch):
     monkeypatch.setitem(SCORERS, "near", Nearness)
     conf = tmp_path / "conf"
     shutil.copytree(CONF, conf)
-    declare.write(conf)
+    declare.write_declared_files(conf)
     for module in (command_line, groups, help_text, overrides, settings):
         monkeypatch.setattr(module, "CONF", conf)
     return conf
@@ -99,7 +99,7 @@ def test_every_field_of_a_scorer_is_a_setting_whose_default_is_its_own():
 
 def test_a_scorer_that_is_gone_leaves_no_file(near, monkeypatch):
     monkeypatch.delitem(SCORERS, "near")
-    declare.write(near)
+    declare.write_declared_files(near)
     assert {path.name: path.read_text() for path in near.rglob("*.yaml")} == {
         path.name: path.read_text() for path in CONF.rglob("*.yaml")
     }

@@ -43,7 +43,7 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
         yield
 
 
-def save(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
+def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
     """Write the checkpoint of a step above all earlier ones, and remove all but the last two.
 
     `state` is a pytree of arrays; `recipe` and `progress` are JSON values.

@@ -149,7 +149,7 @@ class _Training:
             if is_due := (step + 1) % self.every == 0:
                 state, history, losses = self.add_record(state, history, losses)
             if self.folder and (is_due or step + 1 == self.steps):
-                checkpoints.save(self.folder, step + 1, self.recipe, state, (history, losses))
+                checkpoints.save_checkpoint(self.folder, step + 1, self.recipe, state, (history, losses))
             if _out_of_patience(history, self.patience):
                 break
         if losses:  # after the checkpoint: a training of more steps would not validate here

@@ -32,7 +32,7 @@ def test_what_comes_back_is_what_was_saved(tmp_path):
     folder = tmp_path / "new" / "folder"
     assert checkpoints.restore(folder, RECIPE, STATE) is None
     for step in (3, 12, 100):
-        checkpoints.save(folder, step, RECIPE, STATE, [[step, None, 0.1 + 0.2]])
+        checkpoints.save_checkpoint(folder, step, RECIPE, STATE, [[step, None, 0.1 + 0.2]])
     assert sorted(path.name for path in folder.iterdir()) == ["100", "12"]
     restored = checkpoints.restore(folder, RECIPE, STATE)
     assert restored is not None
@@ -99,7 +99,7 @@ def test_folders_of_something_else_are_refused(tmp_path):
 def test_damage_is_told_and_the_one_before_still_serves(tmp_path, part, damage):
     state = {"only": np.random.default_rng(0).normal(size=(20, 30)).astype(np.float32)}
     for step in (1, 2):
-        checkpoints.save(tmp_path, step, {}, state, [step])
+        checkpoints.save_checkpoint(tmp_path, step, {}, state, [step])
     files = [path for path in (tmp_path / "2" / part).rglob("*") if path.is_file() and path.suffix != ".txt"]
     DAMAGE[damage](max(files, key=lambda path: path.stat().st_size))
     with pytest.raises(InputError, match=r"/2: damaged \(.+\); delete") as refusal:
@@ -112,7 +112,7 @@ def test_damage_is_told_and_the_one_before_still_serves(tmp_path, part, damage):
 
 
 def test_changed_progress_is_damage(tmp_path):
-    checkpoints.save(tmp_path, 1, {}, STATE, [[1, 0.25]])
+    checkpoints.save_checkpoint(tmp_path, 1, {}, STATE, [[1, 0.25]])
     path = tmp_path / "1" / "record" / "metadata"
     record = json.loads(path.read_text())
     path.write_text(json.dumps({**record, "progress": [[1, 0.75]]}))
@@ -125,7 +125,7 @@ def test_a_place_that_cannot_be_written_is_told(tmp_path):
     with pytest.raises(InputError, match=r"file/sub: .*checkpoint .*path"):
         train(tmp_path / "file" / "sub")
     with pytest.raises(InputError, match=r"file/sub: .*step 5 .*path"):
-        checkpoints.save(tmp_path / "file" / "sub", 5, RECIPE, STATE, [])
+        checkpoints.save_checkpoint(tmp_path / "file" / "sub", 5, RECIPE, STATE, [])
 
 
 def test_killed_while_saving_the_newest_whole_one_is_there(tmp_path):

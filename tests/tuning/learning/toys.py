@@ -102,7 +102,8 @@ def save_next(folder: Path) -> None:
     if stored:
         step = stored[1]
         assert all(np.all(leaf == step) for leaf in jax.tree.leaves(stored[0]))
-    checkpoints.save(folder, step + 1, RECIPE, jax.tree.map(lambda leaf: np.full_like(leaf, step + 1), state), step + 1)
+    state = jax.tree.map(lambda leaf: np.full_like(leaf, step + 1), state)
+    checkpoints.save_checkpoint(folder, step + 1, RECIPE, state, step + 1)
 
 
 def killed_savers(folder: Path, stride: int) -> None:
