@@ -16,7 +16,7 @@ from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
-from mfvpr.matching import LightGlueMatching, Matcher, Matching
+from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import (
     DescriptorFiles,
@@ -149,14 +149,14 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
 
 
-def matching(settings: dict[str, Any]) -> Matcher:
+def matcher(settings: dict[str, Any]) -> Matcher:
     """The matcher of an image pair."""
     name, options = settings["name"], _without(settings, "name")
     weights = options.pop("weights", None)
     if name == "neighbors":
-        return Matching(**_require_fields(options, Matching, "matching=neighbors"))
-    options = _require_fields(options, LightGlueMatching, "matching=lightglue")
-    return LightGlueMatching.of(_network("matching", ("lightglue",), weights), **options)
+        return NearestNeighborMatcher(**_require_fields(options, NearestNeighborMatcher, "matching=neighbors"))
+    options = _require_fields(options, LightGlueMatcher, "matching=lightglue")
+    return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
 
 
 def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:

@@ -95,7 +95,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     confidence = confidences.check_confidence(confidence, headline, settings, images)
     result = evaluation.evaluate(
         images.dataset, tools.extractor, tools.retriever, scorers, candidates=settings["candidates"],
-        matching=tools.matching, fused=fusions, cohort=cohort,
+        matcher=tools.matcher, fused=fusions, cohort=cohort,
         correlated={headline: frames} if frames else {}, ties=settings["ties"], cache=tools.cache, watch=watch,
         **tools.where,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from experiments.settings import CONF, SettingsError
 # File in conf/ -> the command below `python -m experiments`, and its job for `launch.import_job`.
 PROGRAMS = {
     "config": ("evaluate", "evaluation:evaluate"),
-    "sweep": ("sweep", "search:sweep"),
+    "sweep": ("sweep", "sweeping:sweep"),
     "learn": ("learn", "learning:learn"),
     "paper": ("paper", "paper.program:paper"),
     "map": ("map build", "maps:build_map"),

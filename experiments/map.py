@@ -14,7 +14,7 @@ def main() -> None:
         del sys.argv[1]
         launch("map")
         return
-    run_command(_MAP, "Ask a map with python -m experiments.localize. Settings of the first command: "
+    run_command(_MAP, "Localize images in a map with python -m experiments.localize. Settings of the first command: "
                 f"{_MAP} build --help.", _add_commands)  # fmt: skip
 
 
@@ -24,7 +24,7 @@ def _add_commands(parser: Parser) -> None:
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.set_defaults(run="maps:print_map")
-    command = commands.add_parser("add", help="add images, one by one; others may ask meanwhile")
+    command = commands.add_parser("add", help="add images, one by one; other processes may localize meanwhile")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")
     command.add_argument("--place", help="where they were taken; by default their names")

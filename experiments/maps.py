@@ -102,5 +102,5 @@ def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     describer: Any = retrieval.describer
     describer = describer.fitting if isinstance(describer, Aggregated) else describer
     [scorer] = build.scorers(settings["scorer"]).values()
-    return Map(folder, extractor, describer, scorer=scorer, matcher=build.matching(settings["matching"]),
+    return Map(folder, extractor, describer, scorer=scorer, matcher=build.matcher(settings["matching"]),
                candidates=settings["candidates"], **options)  # fmt: skip

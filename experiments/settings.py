@@ -122,7 +122,7 @@ def check(settings: Mapping[str, Any]) -> None:
     words, samples = (retrieval.get(name, 1) for name in ("num_words", "max_samples"))
     if samples < words:
         raise SettingsError(f"retrieval.max_samples={samples}: expected at least retrieval.num_words={words}")
-    if features.get("name") in ("sift", "ssm", "patch_netvlad", "selavpr") and features["image_size"] is None:
+    if features.get("name", "import") != "import" and features["image_size"] is None:
         raise SettingsError(f"features.image_size=null: expected width and height for features={features['name']}, "
                             "such as [336,336]")  # fmt: skip
     if method == "grid":

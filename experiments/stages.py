@@ -52,7 +52,7 @@ class Tools:
 
     extractor: Extractor | Source
     retriever: Retriever
-    matching: Matcher
+    matcher: Matcher
     cache: FeatureCache
     where: Mapping[str, Any]  # memory and devices
 
@@ -73,7 +73,7 @@ def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
     retrieval = build.retriever(settings["retrieval"], extractor, dataset)
-    return Tools(extractor, retrieval, build.matching(settings["matching"]), cache, build.where(settings))
+    return Tools(extractor, retrieval, build.matcher(settings["matching"]), cache, build.where(settings))
 
 
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
@@ -107,7 +107,7 @@ def match_data_set(
     """Matches and shortlist of the only sequence, from their store if it has all of them."""
     result = match_sequence(
         images.dataset, images.dataset.only, tools.extractor, tools.retriever, settings["candidates"],
-        matching=tools.matching, cache=tools.cache, watch=watch, **tools.where,
+        matcher=tools.matcher, cache=tools.cache, watch=watch, **tools.where,
     )  # fmt: skip
     return result.by_scale, result.candidates
 
@@ -115,7 +115,7 @@ def match_data_set(
 def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
     """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
     recipe = matches_recipe(
-        images.dataset, images.dataset.only, tools.extractor, tools.retriever, num_candidates, tools.matching,
+        images.dataset, images.dataset.only, tools.extractor, tools.retriever, num_candidates, tools.matcher,
         tools.cache,
     )  # fmt: skip
     scales = tools.extractor.scales

@@ -1,18 +1,17 @@
 """Model-free re-ranking for visual place recognition.
 
 Images become features; features become a shortlist and matches; matches become scores; scores become a ranking;
-rankings become recall. `evaluate` goes the whole way over a data set, a `Map` localizes one image at a time; the
-other names below are the core of that sentence, on arrays. The packages put it to work on images and files. `value`,
-`Scorer` and what follows from them is what a scorer of your own is written with; `mfvpr.testing.check_scorer` says
-whether it keeps the contract.
+rankings become recall. `evaluate` runs all stages on a data set; `Map` localizes one image at a time. The other names
+are the single stages as functions of arrays. The packages add images, files and caches. `value`, `Scorer` and the names
+after them are for a scorer of your own; `mfvpr.testing.check_scorer` tests its contract.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from mfvpr.datasets.positives import frame_positives, radius_positives
 from mfvpr.evaluation.recall import recall_at_k
-from mfvpr.matching.lightglue import LightGlueMatching
-from mfvpr.matching.matcher import Matcher, Matching, match_pairs
+from mfvpr.matching.lightglue import LightGlueMatcher
+from mfvpr.matching.matcher import Matcher, NearestNeighborMatcher, match_pairs
 from mfvpr.matching.nearest_neighbors import compact, filter_matches, match, match_candidates
 from mfvpr.matching.soft import soft_match
 from mfvpr.reranking.grids import score_grid
@@ -59,7 +58,7 @@ __all__ = [  # noqa: RUF022 (in the order of the stages)
     "retrieve",
     # matches of two images, and of a query with its candidates
     "match", "match_candidates", "match_pairs", "compact", "filter_matches", "soft_match",
-    "Matcher", "Matching", "LightGlueMatching",
+    "Matcher", "NearestNeighborMatcher", "LightGlueMatcher",
     # weights of matches
     "DescriptorDistanceWeight", "FeatureScoreWeight", "RatioWeight", "UnitWeight", "Weight", "match_weights",
     # scores of one pair

@@ -40,7 +40,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
     extractor = build.extractor(settings["features"], None)
-    retriever, matching = build.retriever(settings["retrieval"], extractor, None), build.matching(settings["matching"])
+    retriever, matcher = build.retriever(settings["retrieval"], extractor, None), build.matcher(settings["matching"])
     scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
@@ -51,7 +51,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
             part = replace(sequence, images=images, truth=None, excluded=None)
             evaluation.evaluate(
                 Dataset(dataset.name, database, (part,)), extractor, retriever, {main: scorers[main]},
-                candidates=candidates, matching=matching, cache=cache, watch=watch,
+                candidates=candidates, matcher=matcher, cache=cache, watch=watch,
             )  # fmt: skip
     return {step: watch.seconds.get(step, 0.0) / number for step in STEPS}
 

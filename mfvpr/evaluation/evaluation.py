@@ -39,7 +39,7 @@ Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q,
 
 def evaluate(
     dataset: Dataset, extractor: Extractor | Source, retriever: Retriever, scorers: Mapping[str, Scorer], *,
-    candidates: int | Literal["all"] = 50, matching: Matcher = NEIGHBORS,
+    candidates: int | Literal["all"] = 50, matcher: Matcher = NEIGHBORS,
     fused: Mapping[str, Fusion] | None = None, correlated: Mapping[str, FrameCorrelation] | None = None,
     cohort: int | None = None, ties: Ties = "retrieval", cache: FeatureCache | None = None, memory: float | None = None,
     devices: Sequence[Device] | None = None, watch: Stopwatch | None = None,
@@ -52,7 +52,7 @@ def evaluate(
         retriever: the retrieval, which finds candidates.
         scorers: by name.
         candidates: number of candidates of each query.
-        matching: matches a pair, see `mfvpr.Matcher`.
+        matcher: matches a pair, see `mfvpr.Matcher`.
         fused: by name of a scorer, how its score is combined with the retrieval's (system `name + retrieval`), or with
             other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused system, how its scores are correlated with those of the queries
@@ -75,7 +75,7 @@ def evaluate(
     check_request(scorers, fused, correlated, ties, memory, cohort=cohort is not None)
     cache = replace(cache or FeatureCache(), watch=watch)
     where = {"memory": memory, "devices": devices}
-    scoring = _Scoring(dataset, (extractor, retriever, candidates), scorers, matching, cache, where)
+    scoring = _Scoring(dataset, (extractor, retriever, candidates), scorers, matcher, cache, where)
     calls = [partial(scoring.score, sequence, watch) for sequence in dataset.sequences]
     of_cohort = [] if cohort is None else [partial(scoring.score_cohort, cohort, watch)]
     scored: list[Scored] = together(*of_cohort, *calls)
@@ -95,14 +95,14 @@ class _Scoring:
     dataset: Dataset
     tools: tuple[Extractor | Source, Retriever, int | Literal["all"]]  # the number of candidates last
     scorers: Mapping[str, Scorer]
-    matching: Matcher
+    matcher: Matcher
     cache: FeatureCache
     where: Mapping[str, Any]  # `memory` and `devices`
 
     def score(self, sequence: QuerySequence, watch: Stopwatch, label: str = "") -> Scored:
         """Match and score a sequence."""
         track = {"track": self.cache.track(f"{label}matching")} if label else {}
-        options = {"matching": self.matching, "cache": self.cache, "watch": watch, **self.where, **track}
+        options = {"matcher": self.matcher, "cache": self.cache, "watch": watch, **self.where, **track}
         matched = match_sequence(self.dataset, sequence, *self.tools, **options)
         options = {"devices": self.where["devices"], "track": self.cache.track(f"{label}scores")}
         with watch("scores"):

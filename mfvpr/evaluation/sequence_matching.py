@@ -34,7 +34,7 @@ _COMPLETE = "its images and queries are done"
 
 def match_sequence(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
-    candidates: int | Literal["all"] = 50, *, matching: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
+    candidates: int | Literal["all"] = 50, *, matcher: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
     watch: Stopwatch | None = None, **where: Any,
 ) -> Matched:  # fmt: skip
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
@@ -52,7 +52,7 @@ def match_sequence(
         InputError: as `evaluate`.
         NotYet: the cache has a shard: its queries are matched, or features of other shards are missing.
     """
-    check_matching(candidates, extractor, matching)
+    check_matching(candidates, extractor, matcher)
     cache, watch, database = cache or FeatureCache(), watch or Stopwatch(), dataset.database
     cache = cache if cache.watch else replace(cache, watch=watch)
     with watch("features"):
@@ -62,7 +62,7 @@ def match_sequence(
     with ExitStack() as stack:
         stores = []
         if cache.root is not None:
-            recipe = matches_recipe(dataset, sequence, extractor, retriever, candidates, matching, cache)
+            recipe = matches_recipe(dataset, sequence, extractor, retriever, candidates, matcher, cache)
             stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, cache)]
         if cache.shard is not None and all(store.done.all() for store in stores):
             raise NotYet(_COMPLETE)
@@ -70,7 +70,7 @@ def match_sequence(
         if matched is None:
             with watch("retrieval"):
                 retrieved = _find_candidates(sequence, database, retriever, candidates, cache, stores)
-            options = {"matcher": matching, "track": cache.track("matching"), **where}
+            options = {"matcher": matcher, "track": cache.track("matching"), **where}
             matched = _match(dataset, sequence, extractor, retrieved, stores, cache, watch, **options)
     _warn_of_queries_without_candidates(matched, cache)
     return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
@@ -188,9 +188,9 @@ def _read_matches(
 
 def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
-    candidates: int | Literal["all"], matching: Matcher, cache: FeatureCache,
+    candidates: int | Literal["all"], matcher: Matcher, cache: FeatureCache,
 ) -> dict[str, Any]:  # fmt: skip
-    """JSON values that determine a shortlist and its matches: images and features, retrieval, and matching."""
+    """JSON values that determine a shortlist and its matches: images and features, retrieval, and matcher."""
     excluded, database = sequence.excluded, dataset.database
     extractor, retriever = fit_to_database(extractor, database, cache), fit_to_database(retriever, database, cache)
     return {
@@ -198,7 +198,7 @@ def matches_recipe(
         "query": cache.recipe(sequence.images, extractor),
         "filter": cache.recipe_of(retriever),
         "candidates": _number(candidates, database),
-        "matching": cache.recipe_of(matching),
+        "matching": cache.recipe_of(matcher),
         "skip_bad": cache.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
     }

@@ -10,8 +10,8 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
-from mfvpr.matching.lightglue import LightGlueMatching
-from mfvpr.matching.matcher import Matcher, Matching
+from mfvpr.matching.lightglue import LightGlueMatcher
+from mfvpr.matching.matcher import Matcher, NearestNeighborMatcher
 from mfvpr.matching.nearest_neighbors import CrossCheck
 from mfvpr.reranking.fusion import Fusion
 from mfvpr.reranking.ranking import Ties
@@ -54,27 +54,27 @@ def check_request(
             check_bounds(scorer)
 
 
-def check_matching(candidates: Any, extractor: Extractor | Source, matching: Matcher) -> None:
+def check_matching(candidates: Any, extractor: Extractor | Source, matcher: Matcher) -> None:
     """Raise `InputError` if an argument of `mfvpr.evaluate` that concerns matches cannot be used."""
     is_whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
     if candidates != "all" and not (is_whole and candidates >= 1):
         raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
     if not extractor.scales:
         raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
-    if isinstance(matching, type) or not callable(matching):
-        got = f"the class {matching.__name__}" if isinstance(matching, type) else repr(matching)
-        raise InputError(f"matching: expected what maps the features of two images to Matches, got {got}; see "
+    if isinstance(matcher, type) or not callable(matcher):
+        got = f"the class {matcher.__name__}" if isinstance(matcher, type) else repr(matcher)
+        raise InputError(f"matcher: expected what maps the features of two images to Matches, got {got}; see "
                          "mfvpr.Matcher")  # fmt: skip
-    if isinstance(matching, Matching):
-        require_word("cross_check", matching.cross_check, CrossCheck)
-    if isinstance(matching, LightGlueMatching):
+    if isinstance(matcher, NearestNeighborMatcher):
+        require_word("cross_check", matcher.cross_check, CrossCheck)
+    if isinstance(matcher, LightGlueMatcher):
         for name in ("filter_threshold", "depth_confidence"):
-            if (share := getattr(matching, name)) is not None and not 0 <= share <= 1:
+            if (share := getattr(matcher, name)) is not None and not 0 <= share <= 1:
                 raise InputError(f"{name}={share}: expected a number from 0 to 1")
         dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
-        if isinstance(extractor, Sift) or {*dimensions} - {matching.dimension}:
+        if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
             got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
-            raise InputError(f"LightGlue: expected ALIKED's features, of {matching.dimension} dimensions, got {got}; "
+            raise InputError(f"LightGlue: expected ALIKED's features, of {matcher.dimension} dimensions, got {got}; "
                              "extract these, or match nearest neighbors")  # fmt: skip
 
 

@@ -30,7 +30,7 @@ class PatchNetVladFeatures:
         image_size: (width, height) px.
         interpolation: see `mfvpr.datasets.images.resize`.
         patch_sizes: sides of the patches, in positions of the map; each size is a scale.
-        scale_weights: weight of each scale's score, see `mfvpr.fuse_scales`; None = equal weights.
+        scale_weights: weight of each scale's score, see `mfvpr.reranking.fuse_scales`; None = equal weights.
         batch_size: images per call.
 
     Raises:

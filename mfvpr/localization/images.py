@@ -178,7 +178,7 @@ class MapImages:
         """Add one image.
 
         Args:
-            image: as of `ask`.
+            image: see `Map.localize_with_evidence`.
             place: where it was taken, any JSON value.
             name: text; None = the file's absolute path, see `canonical_name`; an array needs one.
 

@@ -1,9 +1,9 @@
 __all__ = [
     "CrossCheck",
-    "LightGlueMatching",
+    "LightGlueMatcher",
     "MatchSet",
     "Matcher",
-    "Matching",
+    "NearestNeighborMatcher",
     "Scales",
     "compact",
     "filter_matches",
@@ -13,8 +13,8 @@ __all__ = [
     "soft_match",
 ]
 
-from .lightglue import LightGlueMatching
+from .lightglue import LightGlueMatcher
 from .match_set import MatchSet, Scales
-from .matcher import Matcher, Matching, match_pairs
+from .matcher import Matcher, NearestNeighborMatcher, match_pairs
 from .nearest_neighbors import CrossCheck, compact, filter_matches, match, match_candidates
 from .soft import soft_match

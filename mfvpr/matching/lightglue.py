@@ -1,7 +1,7 @@
 """LightGlue as a matcher: a network, trained for certain features, that predicts matches and their confidence."""
 
 from dataclasses import field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ if TYPE_CHECKING:  # Flax takes half a second
 
 
 @value
-class LightGlueMatching:
+class LightGlueMatcher:
     """Mutual maxima of LightGlue's assignment that are above a threshold.
 
-        matcher = LightGlueMatching.of(load_model("aliked_lightglue"), depth_confidence=0.95)
+        matcher = LightGlueMatcher.of(load_model("aliked_lightglue"), depth_confidence=0.95)
 
     The assignment is the `confidence` of a match; `distance` and `ratio` are those of the descriptors, as in
     `mfvpr.match`. The published weights are for ALIKED's features of 128 dimensions, and useless for other features.
@@ -38,6 +38,8 @@ class LightGlueMatching:
         chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
 
+    recipe_name: ClassVar[str] = "LightGlueMatching"  # in stored recipes
+
     weights: Packed
     network: str = field(metadata={"static": True})
     filter_threshold: float = 0.1
@@ -45,7 +47,7 @@ class LightGlueMatching:
     chunk_size: int | None = field(default=None, metadata={"static": True})
 
     @classmethod
-    def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatching":
+    def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatcher":
         """Matcher from a model (`mfvpr.checkpoints.load_model`) and further attributes."""
         return cls(jax.jit(type(model).pack)(model), fingerprint(recipe_of(model)), **options)
 

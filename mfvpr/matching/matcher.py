@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import field, replace
 from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ matched at the same time; without it, or if None, memory decides, assuming one s
 
 
 @value
-class Matching:
+class NearestNeighborMatcher:
     """Nearest neighbors with their ratio, see `mfvpr.match` and `mfvpr.filter_matches`.
 
     Attributes:
@@ -32,6 +33,8 @@ class Matching:
         max_matches: see `filter_matches`.
         chunk_size: see `match_candidates`; changes only memory and the last bits.
     """
+
+    recipe_name: ClassVar[str] = "Matching"  # in stored recipes
 
     cross_check: CrossCheck = field(default="mutual", metadata={"static": True})
     max_distance: float | None = None
@@ -44,7 +47,7 @@ class Matching:
         return filter_matches(matches, max_distance=self.max_distance, max_matches=self.max_matches)
 
 
-NEIGHBORS = Matching()
+NEIGHBORS = NearestNeighborMatcher()
 
 
 def match_pairs(

@@ -1,7 +1,8 @@
-"""Scores of one pair of images from its matches alone, one score per file: Matches -> a number.
+"""Scores of one pair of images from its matches alone: Matches -> a number.
 
 Read first: scorer (the contract), aggregate (the shortest score), histogram, anchor, then the others; weights (of
-matches), fields (units, bounds and choices of settings), registry (scores by name).
+matches), fields (units, bounds and choices of settings), registry (scores by name). Parts of scores: shifts, lattice
+and tallest (histogram), planes and quads (homography), parameters (by dotted name).
 
 Imports types, utils.
 """

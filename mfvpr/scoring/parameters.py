@@ -26,7 +26,7 @@ def numbers_by_name(scorer: Any) -> dict[str, Any]:
 
 
 def whole_numbers(scorer: Any) -> set[str]:
-    """Names of the `numbers` that are integers, such as indices, and must remain integers."""
+    """Names of the numbers that are integers, such as indices, and must remain integers."""
     is_whole = lambda number: jnp.issubdtype(jnp.result_type(number), jnp.integer)  # noqa: E731
     return {name for name, number in numbers_by_name(scorer).items() if number is not None and is_whole(number)}
 

@@ -34,7 +34,9 @@ from mfvpr.utils.progress import Stopwatch, Track, no_progress
 from mfvpr.utils.versions import versions
 
 DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
-DECODING = "0.2.0"  # raise it to the version of mfvpr that decodes or resizes a file to other pixels
+# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.images` gives other
+# pixels, set it to the next version: stored features are then extracted again.
+DECODING = "0.2.0"
 AGGREGATED = 16  # images at a time
 _MB = 1e6
 

@@ -11,8 +11,8 @@
 One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, so that no folder holds too many files.
 A segment has two row stores (`mfvpr.storage.rows`) and a file of tokens: a random number of each row, which the files
 of both stores know as well. So features and entries that were not written together are noticed. A row exists when its
-token does, which is written last: no process sees half a row, and a file that is removed later is missed. A process
-that is killed leaves out row numbers.
+token does, which is written last: no process sees half a row, and the next reader notices if a file is removed
+later. A process that is killed leaves out row numbers.
 
 The file of tokens grows before the files of a row are written: a row beyond its end shows that the file was cut. Until
 the tokens are written it lacks one byte: its size changes with every new row, even where the clock stands still.

@@ -62,8 +62,10 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
 
 
 def _name(kind: type) -> str:
-    """The name of a class, with its module unless the class is ours, which may move."""
-    return kind.__qualname__ if _is_ours(kind) else f"{kind.__module__}.{kind.__qualname__}"
+    """The name of a class; of ours without the module, which may change, and as it was first in a recipe."""
+    if _is_ours(kind):
+        return getattr(kind, "recipe_name", kind.__qualname__)
+    return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _class(kind: type, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.matching import Matching
+from mfvpr.matching import NearestNeighborMatcher
 from mfvpr.matching import match_set as match_sets
 from mfvpr.reranking import ranking
 from mfvpr.retrieval import Retrieval
@@ -49,7 +49,7 @@ def matches(features, candidates):
 def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
     assert matches.capacity % 64 == 0
     assert matches.counts.max() <= matches.capacity < matches.counts.max() + 64
-    few = stages.match(features[1], features[0], candidates, Matching(max_matches=10, max_distance=0.9))
+    few = stages.match(features[1], features[0], candidates, NearestNeighborMatcher(max_matches=10, max_distance=0.9))
     assert few.counts.max() <= 10
     assert few.capacity == 64
 

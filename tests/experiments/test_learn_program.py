@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import evaluation, learning, search
+from experiments import evaluation, learning, sweeping
 from mfvpr.scoring.weight_files import read_weight
 from mfvpr.tuning.learning import checkpoints, teaching
 from mfvpr.tuning.learning.splits import TrainingSplit
@@ -99,7 +99,7 @@ def test_pictures_and_weights(learned):
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
     grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
-    search.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
+    sweeping.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
     swept = results(tmp_path / "out")
     rows = rows_of(learned[1])
     assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]

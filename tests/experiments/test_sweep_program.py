@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import axes, evaluation, launch, search
+from experiments import axes, evaluation, launch, sweeping
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import matches as match_store
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small, snapshot
@@ -29,8 +29,8 @@ def sweep(root):
     def call(out, *overrides, pictures=False):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
-                patch.setattr(search.sweeps, "heat_maps", lambda *_: [])
-            search.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
+                patch.setattr(sweeping.sweeps, "heat_maps", lambda *_: [])
+            sweeping.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
         return results(out)
 
     return call

@@ -17,7 +17,7 @@ from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, V
 from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
-from mfvpr.matching import Matching
+from mfvpr.matching import NearestNeighborMatcher
 from mfvpr.networks import SsmVgg
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.thorough
 
 SMALL = (48, 40)  # px: 4 x 3 cells
 RETRIEVAL = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)))
-CANDIDATE = Matching(cross_check="candidate")
+CANDIDATE = NearestNeighborMatcher(cross_check="candidate")
 
 
 def network(seed=0):
@@ -299,7 +299,7 @@ def test_parts_of_retrievers_are_learned_as_well(cells, model, dataset):
 def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, dataset, tmp_path):
     labels, database = [], small_street / "database"
     several = sequences_dataset(database, [small_street / "queries", database], ground_truth="none")
-    options = {"candidates": 3, "matching": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
+    options = {"candidates": 3, "matcher": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
     report = mfvpr.evaluate(several, cells, RETRIEVAL, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = report.matched
@@ -315,7 +315,7 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
     self_dataset = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
-    options = {"matching": CANDIDATE, "cache": FeatureCache(tmp_path)}
+    options = {"matcher": CANDIDATE, "cache": FeatureCache(tmp_path)}
     report = mfvpr.evaluate(self_dataset, square, RETRIEVAL, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
     [ranked] = report.systems["grid"]
     np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))

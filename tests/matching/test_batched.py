@@ -16,7 +16,7 @@ import mfvpr
 from mfvpr import Matches
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet, InMemory
-from mfvpr.matching import Matching, MatchSet, batched, filter_matches
+from mfvpr.matching import NearestNeighborMatcher, MatchSet, batched, filter_matches
 from mfvpr.matching.batched import QUERIES
 from mfvpr.matching.match_set import batches, shapes, slots, split_pairs
 from mfvpr.reranking.ranking import rank_shortlist
@@ -121,7 +121,7 @@ def assert_same(first, second):
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
     candidates = shortlist_of()
-    match_set = stages.match(queries, database, candidates, Matching(**options), memory=memory)
+    match_set = stages.match(queries, database, candidates, NearestNeighborMatcher(**options), memory=memory)
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
     assert match_set.counts.sum() > 300
@@ -192,7 +192,7 @@ def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
     def matched(seed, change):
         counts0, counts1 = ([max(0, count - change) for count in counts] for counts in (COUNTS0, COUNTS1))
         sides = (FeatureSet.of(images_of(counts, seed)) for counts in (counts0, counts1))
-        return stages.match(*sides, shortlist_of(seed), Matching(max_distance=1.0 - change / 10))
+        return stages.match(*sides, shortlist_of(seed), NearestNeighborMatcher(max_distance=1.0 - change / 10))
 
     matched(0, 0)
     compilations.reset()
@@ -306,7 +306,7 @@ def test_some_queries_are_matched_as_all_of_them():
     queries = FeatureSet.of([make_features(rng, count) for count in (20, 200, 150)])
     database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
     listed = make_shortlist([[0, 1], [2, 3], [3, 2]])
-    options = {"matcher": Matching(), "memory": None, "devices": jax.local_devices()[:1]}
+    options = {"matcher": NearestNeighborMatcher(), "memory": None, "devices": jax.local_devices()[:1]}
     sizes, call = [], batched.match_pairs
 
     def counted(first, second, *rest, **more):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr import InputError, LightGlueMatching, Matching
+from mfvpr import InputError, LightGlueMatcher, NearestNeighborMatcher
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.validation import check_matching
 from mfvpr.features import FeatureSet, Scale, Sift
@@ -29,7 +29,7 @@ OPTIONS = {"filter_threshold": 1e-3}  # random weights are sure of little
 
 @cache
 def matcher(sure=None, seed=0, **options):
-    return LightGlueMatching.of(small_network(seed, sure), **OPTIONS | options)
+    return LightGlueMatcher.of(small_network(seed, sure), **OPTIONS | options)
 
 
 def empty(features):
@@ -139,10 +139,10 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
 
 def test_what_changes_matches_changes_their_recipe():
     changed = matcher(seed=1), matcher(filter_threshold=0.2), matcher(depth_confidence=0.9)
-    recipes = [str(recipe_of(matching)) for matching in (Matching(), matcher(), *changed)]
+    recipes = [str(recipe_of(matching)) for matching in (NearestNeighborMatcher(), matcher(), *changed)]
     assert len({*recipes}) == len(recipes)
     assert recipes[1] == str(recipe_of(matcher(chunk_size=5)))
-    assert recipes[1] == str(recipe_of(LightGlueMatching.of(small_network(), **OPTIONS)))
+    assert recipes[1] == str(recipe_of(LightGlueMatcher.of(small_network(), **OPTIONS)))
 
 
 class Extractor:
@@ -157,15 +157,15 @@ def test_features_of_another_kind_are_one_line():
     for extractor, got in ((Sift(), "Sift of 128"), (Extractor(16, 64), "Extractor of 16, 64")):
         with pytest.raises(InputError, match=expected.format(got)):
             check_matching(50, extractor, matcher())
-        check_matching(50, extractor, Matching())
+        check_matching(50, extractor, NearestNeighborMatcher())
     check_matching(50, Extractor(16), matcher())
     check_matching(50, Extractor(0), matcher())  # not known before they are read
     with pytest.raises(InputError, match=r"^LightGlue: .*16 dimensions, got 8\b"):
         match_one(matcher(), *pair(COUNTS, 8, 0))
     with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1$"):
         check_matching(50, Extractor(16), matcher(depth_confidence=95))
-    with pytest.raises(InputError, match=r"^matching: .*the class Matching; .*mfvpr.Matcher"):
-        check_matching(50, Extractor(16), Matching)
+    with pytest.raises(InputError, match=r"^matcher: .*the class NearestNeighborMatcher; .*mfvpr.Matcher"):
+        check_matching(50, Extractor(16), NearestNeighborMatcher)
 
 
 # Matchers of one's own

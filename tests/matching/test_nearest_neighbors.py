@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import compact, filter_matches, match, match_candidates, retrieve
-from mfvpr.matching import Matching, match_pairs, nearest_neighbors
+from mfvpr.matching import NearestNeighborMatcher, match_pairs, nearest_neighbors
 from mfvpr.types import per_keypoint, per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, stack, unit
@@ -129,12 +129,12 @@ def test_compact_moves_real_matches_to_the_front_in_order():
 @pytest.mark.parametrize("counts", [(0, 0), (0, 5), (5, 0)])
 def test_images_without_a_single_slot(mode, counts):
     features0, features1 = (make_features(np.random.default_rng(6), count) for count in counts)
-    batch = stack([features1] * 5)
+    batch, matcher = stack([features1] * 5), NearestNeighborMatcher(mode)
     for matches in (
         match_once(features0, features1, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode),
         match_candidates_once(features0, batch, cross_check=mode, chunk_size=2),
-        match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, Matching(mode)),
+        match_pairs_once(jax.tree.map(lambda leaf: leaf[None], features0), batch, PAIRS, 2, matcher),
     ):
         assert matches.mask.shape[-1] == counts[mode == "candidate"]
         assert not matches.mask.any()
@@ -228,11 +228,11 @@ def test_half_precision_gives_what_single_precision_of_the_same_values_gives():
 def test_whoever_calls_it_matching_compiles_once(compilations):
     rng = np.random.default_rng(6)
     query, *candidates = (make_features(rng, 20) for _ in range(5))
-    batch = stack(candidates)
+    batch, matcher = stack(candidates), NearestNeighborMatcher(max_matches=7)
     calls = [
         lambda limit: match_candidates(query, batch),
         lambda limit: match_candidates(query, batch, with_ratio=True),
-        lambda limit: match_pairs(batch, batch, PAIRS, int(limit) + 1, Matching(max_distance=limit, max_matches=7)),
+        lambda limit: match_pairs(batch, batch, PAIRS, int(limit) + 1, replace(matcher, max_distance=limit)),
         lambda limit: retrieve(query.descriptors, batch.descriptors[0], num_candidates=3),
     ]
     for call in calls:
@@ -253,7 +253,7 @@ def test_pairs_are_matched_as_each_of_them(chunk_size):
     )
     pairs = np.array([(0, 0), (1, 2), (0, 1), (1, 0), (0, 2), (0, 0), (1, 1)], np.int32)
     for count in (0, 1, 5, 7):
-        matcher = Matching(max_distance=1.1, max_matches=3, chunk_size=chunk_size)
+        matcher = NearestNeighborMatcher(max_distance=1.1, max_matches=3, chunk_size=chunk_size)
         got = match_pairs(stack(queries), stack(candidates), pairs, count, matcher)
         for place, (query, candidate) in enumerate(pairs[:count]):
             alone = match_once(queries[query], candidates[candidate], with_ratio=True)

@@ -12,7 +12,7 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import LIGHTGLUE
-from mfvpr.matching import LightGlueMatching
+from mfvpr.matching import LightGlueMatcher
 from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
@@ -50,7 +50,7 @@ def real_golden():
 @pytest.fixture(scope="module")
 def matcher():
     """With the published weights."""
-    return LightGlueMatching.of(fill_published("aliked_lightglue", read_checkpoint(random_checkpoints.LIGHTGLUE)))
+    return LightGlueMatcher.of(fill_published("aliked_lightglue", read_checkpoint(random_checkpoints.LIGHTGLUE)))
 
 
 match_one = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))

@@ -96,8 +96,8 @@ def sweep(
         candidates: their shortlist.
         views: candidates that are ranked; by default one view, all of the shortlist.
         depth: number of rows of a ranking to return.
-        ties: as in `reranking.rank_shortlist`.
-        retrieval_score: as in `reranking.fuse_shortlist`.
+        ties: see `mfvpr.reranking.ranking.rank_shortlist`.
+        retrieval_score: see `mfvpr.reranking.ranking.fuse_shortlist`.
         settings_per_block: by default 64. The result does not depend on it.
         queries_per_block: by default as many as fit into 256 MB. The result does not depend on it.
         folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
