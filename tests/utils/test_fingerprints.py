@@ -15,6 +15,7 @@ from flax import nnx
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.networks import blueprint
 from mfvpr.features import AlikedFeatures, Sift, Vlad, VladFitting
+from mfvpr.matching import NearestNeighborMatcher
 from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -35,6 +36,7 @@ def test_classes_of_one_name_are_told_apart():
     for module, name in modules.items():
         assert recipe_of(dataclass(type("Sift", (), {"__module__": module}))())["class"] == name
     assert recipe_of(Sift())["class"] == "Sift"
+    assert recipe_of(NearestNeighborMatcher())["class"] == "Matching"  # its first name, as in stores of 0.2.0
 
 
 def made_by(number, *, gain=1, default=3):
