@@ -169,7 +169,7 @@ def test_other_names_are_refused(path, call, words):
     [
         (typed("O8", OBJECT), "got O8 at conv.weights"),
         (typed("f2"), "got f2 at conv.weights"),
-        (typed("V8", (3, "|", (typed(), (2,)), None, None, 8, 4, 0)), "got V8"),
+        (typed("f4", (3, "<", (typed(), (2,)), None, None, 8, 4, 0)), "got f4"),
         (typed("f4", (3, "=", None, None, None, -1, -1, 0)), "got f4"),
         (typed("f4", (3, "f4,", None, None, None, -1, -1, 0)), "got f4"),
         (typed("f4", OBJECT), "damaged"),
