@@ -14,12 +14,6 @@ class Tiny(nnx.Module):
         self.bn = nnx.BatchNorm(4, rngs=rngs)
         self.mix = nnx.List([nnx.Linear(4, 5, rngs=rngs), nnx.Linear(5, 2, rngs=rngs)])
 
-    def __call__(self, x):
-        x = self.bn(self.conv(x))
-        for layer in self.mix:
-            x = layer(x)
-        return x
-
 
 _NORM = {"weight": "scale", "bias": "bias", "running_mean": "mean", "running_var": "var"}
 TABLE = Table(

@@ -7,7 +7,7 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import Layout, Rule, Table, convert
+from mfvpr.checkpoints.conversion import Rule, Table, convert
 from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
 from mfvpr.utils import InputError
 from tests import random_checkpoints as checkpoints
@@ -82,11 +82,6 @@ def test_filled_twice_and_ambiguous_rules(source):
     assert "1 missing (bn.bias)" in text
 
 
-def test_a_message_stays_short(source):
-    foreign = {f"{place}{500 * '.long'}": np.zeros(3, np.float32) for place in range(500)}
-    assert "500 unknown (0.long.long" in message(foreign)
-
-
 @pytest.mark.parametrize("dtype", [np.float16, np.int64, np.complex64, bool])
 def test_other_types_than_float32_and_float64_are_refused(source, dtype):
     source["net.mix.0.bias"] = np.ones(5, dtype)
@@ -95,15 +90,6 @@ def test_other_types_than_float32_and_float64_are_refused(source, dtype):
     del source["net.mix.0.bias"]
     source["net.bn.num_batches_tracked"] = np.ones(3, dtype)  # ignored, whatever it is
     assert message(source) == "keys do not fit the network: 1 missing (mix.0.bias)"
-
-
-def test_float64_is_rounded_and_scalars_stay():
-    table = Table((Rule("a", "a", Layout.LINEAR), Rule("s", "s")))
-    third = np.float64([1, 2, 3]) / 3
-    parameters = convert({"a": np.stack([third, -third]), "s": np.float64(2)}, table, {"a": (3, 2), "s": ()})
-    np.testing.assert_array_equal(parameters["a"], np.stack([third, -third], 1).astype(np.float32))
-    assert parameters["a"].dtype == np.float32
-    assert parameters["s"].shape == ()
 
 
 @pytest.mark.parametrize(
@@ -190,9 +176,7 @@ def test_biases_of_places365_may_have_more_axes():
 
 @pytest.mark.parametrize("change", [lambda source: source, with_names_of_torchvision])
 def test_vgg16_of_other_classes_is_not_that_of_places365(change):
-    source = change(vacant(places365_shapes("weight")))
-    layer = "fc8a_1" if "fc8a_1.weight" in source else "classifier.6"
-    source |= vacant({f"{layer}.weight": (1000, 4096), f"{layer}.bias": (1000,)})
+    source = change(vacant(places365_shapes("weight") | {"fc8a_1.weight": (1000, 4096), "fc8a_1.bias": (1000,)}))
     with pytest.raises(InputError, match=r"weight: expected \(365, 4096\), got \(1000, 4096\)"):
         places365(source)
 

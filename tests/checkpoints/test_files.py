@@ -9,12 +9,12 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from safetensors.numpy import save as serialized
 
 from mfvpr.checkpoints import REGISTRY, WeightsError, files, install, load_model, weights_folder
 from mfvpr.checkpoints.files import load, read_manifest, save
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
+from tests.io.checks import one_line_error
 from tests.random_checkpoints import d2net_shapes, random_checkpoint, write_legacy, write_zip
 
 
@@ -61,15 +61,6 @@ def test_saved_arrays_come_back(installed, folder, arrays, save_tiny):
     assert installed.read_bytes() == content
 
 
-def test_model(installed, arrays):
-    model = load_model("tiny")
-    np.testing.assert_array_equal(model.conv.kernel[...], arrays["conv.kernel"])
-    np.testing.assert_array_equal(model.mix[1].bias[...], arrays["mix.1.bias"])
-    np.testing.assert_array_equal(model.bn.var[...], arrays["bn.var"])
-    image = np.random.default_rng(0).standard_normal((1, 6, 6, 3)).astype(np.float32)
-    np.testing.assert_array_equal(model(image), model(image))  # evaluation mode: no statistics are gathered
-
-
 def test_arrays_of_another_network_are_refused(save_tiny, arrays):
     arrays["conv.extra"] = arrays.pop("conv.bias")
     arrays["mix.0.kernel"] = arrays["mix.0.kernel"].T
@@ -85,11 +76,6 @@ def test_a_flipped_bit_is_refused(installed, place):
     content[int(place * len(content))] ^= 1
     installed.write_bytes(content)
     refused("sha256")
-
-
-def test_a_truncated_file_is_refused(installed):
-    installed.write_bytes(installed.read_bytes()[:-1])
-    refused(f"expected {installed.stat().st_size + 1} bytes, got {installed.stat().st_size}")
 
 
 @pytest.mark.parametrize(
@@ -115,13 +101,10 @@ def test_other_manifests_are_refused(installed, text, words):
     "content",
     [
         struct.pack("<Q", 2**62) + b"{}",
-        struct.pack("<Q", 2**27) + b"{" + b" " * 1000,
         struct.pack("<Q", 2) + b"{}" + b"more",
-        b"",
-        serialized({"a": np.zeros(3)})[:-4],
         struct.pack("<Q", 60) + b'{"a":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}'.ljust(60) + bytes(4),
     ],
-    ids=["endless header", "huge header", "uncovered", "empty", "short", "bfloat16"],
+    ids=["endless header", "uncovered", "bfloat16"],
 )
 def test_what_is_no_safetensors_file_is_refused_even_with_its_hash(installed, content):
     installed.write_bytes(content)
@@ -143,11 +126,6 @@ def test_a_crash_between_file_and_manifest_leaves_nothing_that_looks_complete(ar
     with patch.object(files, "write_text", side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         save_tiny(arrays)
     refused("sha256")
-
-
-def test_not_installed_is_told_with_file_place_and_license(folder):
-    refused("tiny: not installed in")
-    refused("tiny.pth from https://example.org/tiny.pth (code MIT, weights none stated)")
 
 
 @pytest.mark.parametrize("name", ["../tiny", "", "/etc/passwd", "unknown"])
@@ -186,7 +164,7 @@ class TestInstall:
         [
             (random_checkpoint(d2net_shapes()), "expected the keys of another network, got those of d2net"),
             ({f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES}, "its keys begin with module."),
-            ({f"layer{place}.weight": np.zeros(2) for place in range(500)}, "500 unknown (layer0.weight), 10 missing"),
+            ({f"{place}{99 * '.long'}": np.zeros(2) for place in range(500)}, "500 unknown (0.long.long"),
             ({"net.conv.weight": np.zeros(2, np.float16)}, "got Half at net.conv."),
         ],
         ids=["another network", "prefix", "unknown network", "half"],
@@ -194,13 +172,8 @@ class TestInstall:
     def test_foreign_files_are_one_short_line(self, checkpoint, folder, tensors, words):
         path, _ = checkpoint
         write_zip(path, tensors)
-        with pytest.raises(InputError) as caught:
+        with one_line_error(None, str(path), words, "use the official"):
             install(path, "tiny")
-        message = str(caught.value).removeprefix(f"{path}: ")
-        assert words in message
-        assert "use the official" in message
-        assert "\n" not in message
-        assert len(message) < 250
         assert not folder.exists()
 
     def test_float64_is_rounded_and_that_is_noted(self, checkpoint):
@@ -209,16 +182,13 @@ class TestInstall:
         unused = {"net.bn.num_batches_tracked": np.array(7.0)}  # float64 as well
         write_legacy(path, tensors | {"net.conv.bias": third} | unused)
         before = path.read_bytes()
-        install(path, "tiny")
+        manifest = install(path, "tiny").with_suffix(".json")
         assert path.read_bytes() == before
         np.testing.assert_array_equal(load("tiny")["conv.bias"], third.astype(np.float32))
         np.testing.assert_array_equal(load_model("tiny").mix[0].kernel[...], tensors["net.mix.0.weight"].T)
         assert read_manifest("tiny").rounded == 1
-
-    def test_manifests_without_the_number_of_rounded_tensors_are_read(self, checkpoint):
-        manifest = install(checkpoint[0], "tiny").with_suffix(".json")
         values = json.loads(manifest.read_text())
-        del values["rounded"]
+        del values["rounded"]  # as older manifests, which lack it
         manifest.write_text(json.dumps(values))
         assert read_manifest("tiny").rounded == 0
 

@@ -78,13 +78,9 @@ def refused_array(path, instructions):
 @pytest.mark.parametrize("protocol", range(5))
 def test_every_protocol(path, arrays, protocol):
     assert_same(read_checkpoint(write_numpy(path, layered(arrays), protocol=protocol)), arrays)
-    theirs = np.load(path, allow_pickle=True).item()
-    assert theirs["conv1_1"]["bias"].tolist() == arrays["conv1_1.bias"].tolist()
 
 
 def test_files_of_this_numpy_and_of_older_ones(path, arrays):
-    np.save(path, layered(arrays))
-    assert_same(read_checkpoint(path), arrays)
     content = pickle.dumps(np.array(layered(arrays), dtype=object), protocol=3)
     old = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
     assert old != content
@@ -140,18 +136,8 @@ def test_written_byte_by_byte(path):
 
 
 @pytest.mark.parametrize("protocol", range(5))
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        lambda bad: bad,
-        lambda bad: {"conv": bad},
-        lambda bad: {"conv": {"weights": bad}},
-        lambda bad: {"conv": {"weights": np.zeros(3), "bias": np.array([bad, 1])}},
-        lambda bad: {"conv": {"weights": np.zeros(3)}, "notes": [1, (bad,)]},
-    ],
-)
-def test_code_is_refused_and_not_executed(path, tmp_path, protocol, wrap):
-    code = wrap(Runs(tmp_path / "made"))
+def test_code_is_refused_and_not_executed(path, tmp_path, protocol):
+    code = {"conv": {"weights": np.zeros(3), "bias": np.array([Runs(tmp_path / "made"), 1])}}
     for content in (pickle.dumps(code, protocol), code):  # without an array, in one
         assert "it asks for posix.mkdir" in refused(write_numpy(path, content, protocol=protocol))
     assert not (tmp_path / "made").exists()
@@ -162,22 +148,14 @@ def test_code_is_refused_and_not_executed(path, tmp_path, protocol, wrap):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (Call(RECONSTRUCT, (Global("os", "mkdir"), ("/made",), "b")), "it asks for numpy.core.multiarray._reconstruct"),
         (Call(RECONSTRUCT, (Global("os", "mkdir"), (0,), "b")), "it asks for os.mkdir"),
-        (Call(RECONSTRUCT, (Global("numpy", "matrix"), (0,), "b")), "it asks for numpy.matrix"),
         (Call(RECONSTRUCT, (NDARRAY, (10**12,), "b")), "it asks for numpy.core.multiarray._reconstruct"),
         (Call(RECONSTRUCT, (NDARRAY, (0,), "O")), "it asks for numpy.core.multiarray._reconstruct"),
         (Call(RECONSTRUCT, ()), "it asks for numpy.core.multiarray._reconstruct"),
         (Call(NDARRAY, ((2, 3),)), "it asks for numpy.ndarray"),
-        (Call(Global("numpy", "zeros"), (10**12,)), "it asks for numpy.zeros"),
         (Call(Global("numpy", "load"), ("other.npy", None, True)), "it asks for numpy.load"),
         (Call(Global("numpy.core.multiarray", "scalar"), (TYPE, "abcd")), "it asks for numpy.core.multiarray.scalar"),
-        (Call(Global("numpy.core.numeric", "_frombuffer"), ("abcd", TYPE, (1,), "C")), "it asks for numpy.core.num"),
-        (Call(Global("collections", "OrderedDict"), ()), "it asks for collections.OrderedDict"),
         (Call(Global("_codecs", "encode"), ("abcd", "rot13")), "it asks for _codecs.encode"),
-        (Call(Global("builtins", "eval"), ("1",)), "it asks for builtins.eval"),
-        (Call(Global("os", "\x1b[2J\nsystem"), ()), "damaged"),
-        (Call("os.mkdir", ("/made",)), "damaged"),
     ],
 )  # fmt: skip
 def test_other_names_are_refused(path, call, words):
@@ -191,25 +169,16 @@ def test_other_names_are_refused(path, call, words):
     [
         (typed("O8", OBJECT), "got O8 at conv.weights"),
         (typed("f2"), "got f2 at conv.weights"),
-        (typed("c8"), "got c8"),
-        (typed("S4", (3, "|", None, None, None, 4, 1, 0)), "got S4"),
-        (typed("V4", (3, "|", None, ("a",), {"a": (typed(), 0)}, 4, 1, 16)), "got V4"),
-        (typed("V8", (3, "|", (typed(), (2,)), None, None, 8, 4, 0)), "got V8"),
-        (typed("f4", (4, "<", None, None, None, -1, -1, 0, {"a": 1})), "got f4"),
-        (typed("M8", (4, "<", None, None, None, -1, -1, 0, ({}, ("s", 1, 1, 1)))), "got M8"),
+        (typed("f4", (3, "<", (typed(), (2,)), None, None, 8, 4, 0)), "got f4"),
         (typed("f4", (3, "=", None, None, None, -1, -1, 0)), "got f4"),
-        (typed("f4", (3, "6", None, None, None, -1, -1, 0)), "got f4"),
         (typed("f4", (3, "f4,", None, None, None, -1, -1, 0)), "got f4"),
         (typed("f4", OBJECT), "damaged"),
         (typed("u1"), "damaged"),
-        (typed("f4", ()), "got f4"),
-        (typed("6f4"), "got 6f4"),
         (typed("f4,f4"), "got f4,f4"),
         (typed(1000 * "long"), "got longlong"),
         (put(Call(Global("numpy", "dtype"), ("f4", 0, 1))), "damaged"),  # not filled
         (built(typed(), PLAIN), "got f4"),  # filled twice
         (put("f4"), "damaged"),
-        (put(Global("numpy", "float32")), "damaged"),
     ],
 )
 def test_other_types_are_refused(path, kind, words):
@@ -264,10 +233,8 @@ def test_arrays_are_filled_once(path):
         (outer({"conv": {}}, shape=(1,)), "expected a dictionary of layers"),
         (outer({"conv": {}}, values=[{"a": {}}, {}]), "expected a dictionary of layers"),
         (outer({"conv": {}}, kind=typed()), "expected a dictionary of layers"),
-        (b"\x80\x02" + array() + b".", "expected a dictionary of layers"),
         (b"\x80\x02}.", "expected a dictionary of layers"),
         (outer({"conv": array()}), "expected arrays by layer, got Array at conv"),
-        (outer({"conv": {"weights": [1.0, 2.0]}}), "expected arrays by layer, got list at conv.weights"),
         (outer({"conv": {"weights": Global("os", "system")}}), "expected arrays by layer, got Name at conv.weights"),
         (outer({"a\n\x1b[2J": {"b": "text"}}), r"got str at a\n\x1b[2J.b"),
         (outer({3: {"weights": array()}}), "damaged"),
@@ -275,12 +242,7 @@ def test_arrays_are_filled_once(path):
         (outer({"a.b": {"c": array()}, "a": {"b.c": array()}}), "damaged"),
         (outer({100 * "long": {"c": array()}}), "damaged"),
         (outer({"conv": {"weights": array()}}) + b"\0", "damaged"),
-        (b"", "damaged"),
-        (b"\x80\x02S'text'\n.", "its pickle is more than data (STRING)"),
         (b"\x80\x02S'\\d'\n.", "its pickle is more than data (STRING)"),  # Python's reader of strings warns of it
-        (b"\x80\x05\x96" + struct.pack("<Q", 4) + b"abcd.", "its pickle is more than data (BYTEARRAY8)"),
-        (b"\x80\x04\x8c\x02os\x8c\x05mkdir\x93)R.", "it asks for os.mkdir"),
-        (b"\x80\x02X\x02\0\0\0osQ.", "damaged"),
     ],
 )
 def test_other_content(path, content, words):
@@ -292,9 +254,7 @@ def test_other_content(path, content, words):
     [
         ("{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }", "expected a dictionary of layers, got an array"),
         (HEADER.replace("()", "(1,)"), "got another object"),
-        (HEADER.replace("|O", "|V4"), "got an array"),
         ("__import__('os').mkdir('made')", "got an array, __import__"),
-        ("9" * 117, "got an array"),
         (HEADER + "\n\x1b[2J", "got an array"),
         (HEADER.ljust(3000), None),
         (HEADER.replace(", }", "}"), None),
@@ -324,12 +284,9 @@ def test_nothing_grows_beyond_the_file(path):
     name = put("long" * 25_000) + keep
     long_names = entries((name if place == 0 else recall, entries([(str(place), empty)])) for place in range(3))
     with memory_below(30e6):
-        for length in (b"\x8e\0\0\0\0\0\1\0\0", b"\x8d\0\0\0\0\0\1\0\0", b"B\xff\xff\xff\xff", b"T\xff\xff\xff\x7f"):
-            assert "damaged" in refused(write_numpy(path, b"\x80\x04" + length))  # of up to 1 TB
         assert "no more values than the file stores" in refused(write_numpy(path, outer({"a": shared_values})))
         assert "no more values than the file stores" in refused(write_numpy(path, outer(shared_layers)))
         assert "damaged" in refused(write_numpy(path, outer(long_names)))
-        refused(write_numpy(path, b"\x80\x02" + 20_000 * b"(" + b"N" + 20_000 * b"t" + b"."))
         path.write_bytes(b"\x93NUMPY\x02\0\xff\xff\xff\xff" + HEADER.encode())
         assert "damaged" in refused(path)
 

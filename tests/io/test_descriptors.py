@@ -66,10 +66,8 @@ def test_written_and_read(tmp_path, descriptors, suffix, half):
     "file, arrays, message",
     [
         ("g.npy", np.ones((2, 8)), r"descriptors \[3, D\].* got \[2, 8\]"),
-        ("g.npy", np.ones(3), r"descriptors \[3, D\].* got \[3\]"),
         ("g.npy", np.ones((3, 0)), r"descriptors \[3, D\].* got \[3, 0\]"),
         ("g.npy", np.ones((3, 8), int), "floating-point .*got int64"),
-        ("g.npy", np.full((3, 8), np.nan), r"finite .*nan at \[0, 0\]"),
         ("g.npy", np.full((3, 4), 1.5), r"g\.npy: .*unit length, got length 3 "),
         ("g.npy", np.array([[{}]], object), "got objects"),
         ("g.npz", {"names": NAMES}, "got no descriptors"),
@@ -77,7 +75,6 @@ def test_written_and_read(tmp_path, descriptors, suffix, half):
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": np.arange(3)}, r"got int64\[3\] and \[3, 8\]"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got 1 again"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": [*NAMES[:2], "x"]}, r"first without is image10\.jpg"),
-        ("g.npz", {"descriptors": np.ones(3), "names": NAMES}, r"expected descriptors \[3, D\] .* got \[3\]"),
         ("g.npz", {"descriptors": np.array([{}, 1, 2], object)}, "got objects"),
         ("g.csv", None, r"expected a file named \.npy, \.npz, \.h5, \.hdf5, got \.csv"),
     ],

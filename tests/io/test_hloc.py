@@ -155,18 +155,14 @@ def spoiled(part, value, row=3):
     [
         (spoiled("keypoints", np.nan), r"keypoints: .*finite .*nan at \[3, 0\]"),
         (spoiled("descriptors", np.inf), r"descriptors: .*finite .*inf at \[3, 0\]"),
-        (spoiled("scores", np.nan), r"scores: .*finite .*nan at \[3\]"),
         (lambda p: p | {"scores": np.full(30, 1e300)}, "scores: .*finite .*1e.300"),
         (lambda p: p | {"descriptors": p["descriptors"] * 2}, r"got length 2.* lengths='normalize'"),
         (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "floating-point .*got uint8"),
         (lambda p: p | {"keypoints": np.zeros((30, 2), np.complex64)}, "keypoints: .*numbers, got complex64"),
         (lambda p: p | {"scores": p["scores"][1:]}, r"expected 30 keypoints with scores .* got 30, 29 and \[30, 16\]"),
-        (lambda p: p | {"scores": np.zeros(30, bool)}, "scores: .*floating-point .*got bool"),
         (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .* got \[640, 0\]"),
         (lambda p: p | {"image_size": np.array([640, 480, 3])}, r"image_size: expected .* got \[640, 480, 3\]"),
         (spoiled("keypoints", 700), r"keypoints .*640 x 480 .*got \(700, 700\)"),
-        (spoiled("keypoints", -20), r"got \(-20, -20\)"),
-        (lambda p: p | {"keypoints": np.full((30, 2), (100, 600))}, r"got \(100, 600\)"),
     ],
 )
 def test_values_that_cannot_be_used(path, change, message):

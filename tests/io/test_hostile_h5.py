@@ -64,7 +64,6 @@ def of_type(dtype):
         (lambda group, *_: group.create_dataset("scores", data=h5py.Empty("f")), ".*values, got .*without"),
         (of_type(h5py.string_dtype()), ".*array of numbers .*got objects"),
         (of_type([("x", "f4")]), ".*array of numbers .*got objects"),
-        (of_type(h5py.ref_dtype), ".*array of numbers .*got objects"),
     ],
 )
 def test_other_data_sets_are_refused(path, secret, put, message):

@@ -25,16 +25,14 @@ FILE = Path("feats.h5")
         (["a/1.jpg", "b/1.jpg"], ["/data/db/a/1.jpg", "/data/db/b/1.jpg"], ["/data/db/a/1.jpg", "/data/db/b/1.jpg"]),
         (["a/1.jpg"], ["a/1", "a/2"], ["a/1"]),
         (["a/1.jpg"], ["a/1.png", "1.jpg"], ["1.jpg"]),  # the suffix as well, before without
-        (["a/1.jpg"], ["a/1.png"], ["a/1.png"]),
+        (["a/1.JPG"], ["a/1.tiff"], ["a/1.tiff"]),
         (["@5.25@4.50@.jpg"], ["@5.25@4.50@", "@5.25@4.50"], ["@5.25@4.50@"]),
         (["a/1.jpg"], ["b/1.jpg"], [None]),  # another folder is another image
         (["img.jpg", "img.1.jpg"], ["img.1"], [None, "img.1"]),  # stems may hold dots
         (["img.jpg"], ["img.1"], [None]),
         (["img.1.jpg"], ["img"], [None]),
-        (["a/1.JPG"], ["a/1.tiff"], ["a/1.tiff"]),
         (["a/1.jpg", "b/1.jpg"], ["a/1.jpg", "1.png.h5"], ["a/1.jpg", None]),
         (["1.jpg", "x/1.jpg"], ["1.jpg"], ["1.jpg", None]),  # what is matched whole is not matched again
-        (["a.jpg"], ["queries/b.jpg"], [None]),
         (["a\udce9.jpg"], ["a\udce9.jpg"], ["a\udce9.jpg"]),  # bytes that are no UTF-8 ...
         (["a\udce9.jpg"], [r"a\udce9.jpg"], [r"a\udce9.jpg"]),  # ... as text can hold them
         (["a\udce9.jpg"], ["a\udce9.jpg", r"a\udce9.jpg"], ["a\udce9.jpg"]),  # bytes and text in one file

@@ -134,16 +134,6 @@ def test_pickles_are_never_loaded(tmp_path):
                 list(open_features(path, ["1.jpg"]).read())
 
 
-def test_truncated_at_any_place(tmp_path):
-    path = tmp_path / "1.jpg.npz"
-    np.savez(path, **parts_of(feature(0)))
-    content = path.read_bytes()
-    for length in (0, 10, 100, len(content) // 2, len(content) - 1):
-        path.write_bytes(content[:length])
-        with one_line_error(r"1\.jpg\.npz: cannot be read"):
-            list(open_features(tmp_path, ["1.jpg"]).read())
-
-
 def npy(header, values=b""):
     """The bytes of a `.npy` whose header says whatever it likes."""
     text = header.encode() + b" " * (117 - len(header)) + b"\n"
@@ -161,7 +151,6 @@ TRILLION = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000, 2)
         (npy(TRILLION.replace("1000000000000", "-3")), "cannot be read|expected"),
         (npy("__import__('os').system('true')"), "cannot be read"),
         (b"\x93NUMPY\x09\x00", r"expected an array of NumPy's format 1\.0 or 2\.0"),
-        (b"text", "cannot be read"),
     ],
 )
 def test_forged_arrays(tmp_path, content, message):

@@ -88,7 +88,6 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
         ("q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg", r"query image, got 'd/1\.jpg'"),
         ("q/1.jpg", "line 1: expected the names"),
         ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
-        ("q/1.jpg, d/1.jpg, high", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected the names"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend.*distances"),

@@ -153,7 +153,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def run_here(call: str, *, prefix: tuple[str, ...] = ()) -> str:
-    """Standard output of a call of test_store_faults' functions in a process of its own."""
+    """Standard output of a call of test_faults' functions in a process of its own."""
     command = [*prefix, sys.executable, "-c", f"from tests.storage.test_faults import *; {call}"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -212,11 +212,7 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
         FeatureCache(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
     assert extractor.seen == len(folder)
     [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
-    assert lines[0].startswith(
-        "summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: about 0.2 MB"
-    )
-    assert lines[1].startswith("summer features: 0.")
-    assert " features an image; as the paper stores them, in float32, 0." in lines[1]
+    assert lines[0].startswith("summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: ")
     assert lines[2] == f"winter features: all 10 images from {path}"
 
 

@@ -16,6 +16,7 @@ from mfvpr.storage.features import forecast_bytes, open_store
 from mfvpr.storage.manifest import recipe_fingerprint, store_path
 from mfvpr.storage.matches import open_match_store
 from mfvpr.storage.rows import require_space
+from tests.io.checks import one_line_error
 from tests.storage.synthetic_features import (
     FEATURES,
     MATCH_RECIPE,
@@ -72,8 +73,6 @@ OTHER_LENGTH = r'row 1: descriptors="float16\[32\]", expected "float16\[16\]" as
         (FEATURES, 1, changed_features(keypoints=np.inf), "finite"),
         (FEATURES, 1, changed_features(scores=np.nan), "finite"),
         (FEATURES, 1, features_of(1, dimension=32), OTHER_LENGTH),
-        (MATCHES, 0, matches_of(0), "row 0 is done"),
-        (MATCHES, 3, matches_of(3), "does not exist"),
         (MATCHES, 1, matches_of(1, mask=np.arange(60) < 50), "real matches"),
         (MATCHES, 1, replace(matches_of(1), counts=np.array([30, 0, 25, 4], np.int32)), "as many as counted"),
         (MATCHES, 1, matches_of(1, (3, 4, 5)), "expected 4 candidates"),
@@ -156,7 +155,6 @@ OPEN_OTHER_FEATURES = [
     ({"num_images": 4}, "num_images=3, expected 4"),
     ({"recipe": _other_extractor(max_keypoints=400)}, "recipe.extractor.max_keypoints=800, expected 400"),
     ({"recipe": _other_extractor(image_size=[336, 240])}, r"recipe.extractor.image_size\[1\]=336, expected 240"),
-    ({"recipe": _other_extractor(name="sift")}, 'recipe.extractor.name="d2net", expected "sift"'),
     ({"recipe": _other_extractor(clip=3)}, "recipe.extractor.clip=nothing, expected 3"),
     ({"recipe": {**RECIPE, "weights": None}}, 'recipe.weights={"sha256": "(ab)+"}, expected null'),
     ({"recipe": {**RECIPE, "images": RECIPE["images"][:2]}}, r"recipe.images\[2\]=.*, expected nothing"),
@@ -180,9 +178,8 @@ OPEN_MATCHES = partial(open_match_store, recipe=MATCH_RECIPE, num_queries=3, num
 )
 def test_stores_of_another_recipe_are_refused(tmp_path, subject, open_other, difference):
     fill(tmp_path / "s", subject=subject)
-    with pytest.raises(InputError, match=rf"s/manifest\.json: .*{difference}; .*delete") as error:
+    with one_line_error(rf"s/manifest\.json: .*{difference}; .*delete"):
         open_other(tmp_path / "s")
-    assert "\n" not in str(error.value)
     assert fill(tmp_path / "s", subject=subject) == []
 
 
@@ -240,9 +237,8 @@ def test_files_of_something_else_are_refused_and_left_alone(tmp_path, subject, n
     (tmp_path / name).write_bytes(content)
     before, kind = digests(tmp_path), subject.kind
     message = message.format(content=kind.content, store=kind.store, format=kind.format)
-    with pytest.raises(InputError, match=rf"below/s.*{message}.*; \w+") as error, subject.open(tmp_path / "below/s", 3):
+    with one_line_error(rf"below/s.*{message}.*; \w+"), subject.open(tmp_path / "below/s", 3):
         pass
-    assert "\n" not in str(error.value)
     assert digests(tmp_path) == before
 
 

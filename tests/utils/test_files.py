@@ -2,8 +2,8 @@
 
 import pytest
 
-from mfvpr.utils import InputError
 from mfvpr.utils.files import path_inside
+from tests.io.checks import one_line_error
 
 
 @pytest.fixture
@@ -32,7 +32,5 @@ def test_files_of_a_folder(root, monkeypatch):
 @pytest.mark.parametrize("name", ["/etc/passwd", "../secret", "a/../../secret", "a/../a/0.png", "out", "up/secret",
                                   "around", "a\0b", "../\n", "x" * 5000 + "/.."])  # fmt: skip
 def test_names_that_lead_elsewhere(root, name):
-    with pytest.raises(InputError, match="expected the name of a file below") as refused:
+    with one_line_error("expected the name of a file below"):
         path_inside(root, name)
-    assert len(str(refused.value)) < 500
-    assert "\n" not in str(refused.value)

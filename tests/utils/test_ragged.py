@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,11 +43,6 @@ def test_split_reverses_join(counts):
     jax.tree.map(np.testing.assert_array_equal, ragged.split(flat, np.array(counts)), rows)
 
 
-def test_a_row_longer_than_the_capacity_is_an_error():
-    with pytest.raises(ValueError, match="broadcast"):
-        ragged.pad_rows(rows_of([3]), 2)
-
-
 @given(st.lists(st.integers(0, 500), max_size=40), st.sampled_from([8, 32]))
 def test_capacities_are_few_and_hold_every_row(counts, step):
     counts = np.array(counts, int)
@@ -73,11 +67,6 @@ def test_a_capacity_is_worth_what_it_saves():
 def test_empty_rows_make_no_capacity_smaller():
     for empty in (0, 50):
         assert ragged.sizes(np.array([0] * empty + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]
-
-
-def test_the_last_entry_is_repeated():
-    np.testing.assert_array_equal(ragged.repeat_last(np.array([[1, 2], [3, 4]]), 4), [[1, 2], [3, 4], [3, 4], [3, 4]])
-    np.testing.assert_array_equal(ragged.repeat_last(np.array([5]), 1), [5])
 
 
 compact = jax.jit(ragged.compact, static_argnums=2)
