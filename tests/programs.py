@@ -95,6 +95,13 @@ def typed(monkeypatch, capsys, program, *arguments):
     return code, *capsys.readouterr()
 
 
+def output_of(monkeypatch, capsys, program, *arguments, code=0):
+    """Stdout and stderr of a command line that must end with an exit code."""
+    exit_code, stdout, stderr = typed(monkeypatch, capsys, program, *arguments)
+    assert exit_code == code, stderr
+    return stdout, stderr
+
+
 def results(place):
     """results.json of a run folder, but for its seconds."""
     content = json.loads((place / "results.json").read_text())

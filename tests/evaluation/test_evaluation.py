@@ -314,10 +314,6 @@ def test_programs_take_sequences_and_files(split, imported, tmp_path, monkeypatc
     assert {"sequences/first/predictions.csv", "sequences/second/predictions/count_retrieval.csv", "table.csv"} <= names
     table = (tmp_path / "out" / "table.csv").read_text().splitlines()
     assert [line.split(",")[1] for line in table[1:5]] == ["first", "second", "mean", "pooled"]
-    code, _, stderr = typed(monkeypatch, capsys, "sweep", *common[:-3], "scorer=histogram", "grid.sigma=[10,20]",
-                            f"out={tmp_path}/swept")  # fmt: skip
-    assert code == 2
-    assert "expected one query sequence, got 2" in stderr
 
 
 def test_a_sweep_takes_features_whose_files_tell_the_image_size(

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-from tests.programs import shared, typed
+from tests.programs import output_of, shared, typed
 
 
 @pytest.fixture(scope="session")
@@ -21,15 +21,9 @@ def call(monkeypatch, capsys):
 
 
 @pytest.fixture
-def succeed(call):
+def succeed(monkeypatch, capsys):
     """Runs a command line that must succeed: stdout, stderr."""
-
-    def run(program, *arguments):
-        code, stdout, stderr = call(program, *arguments)
-        assert code == 0, stderr
-        return stdout, stderr
-
-    return run
+    return partial(output_of, monkeypatch, capsys)
 
 
 @pytest.fixture

@@ -1,11 +1,8 @@
 """The networks of the benchmark do the same on both sides, so that equals are compared."""
 
 import json
-import subprocess
-import sys
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +13,9 @@ from mfvpr.checkpoints.tables import SELAVPR
 from mfvpr.features import Sift
 from mfvpr.networks import SelaVpr
 from mfvpr.scoring import MatchCount
+from tests.programs import run
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -133,10 +129,7 @@ def test_every_benchmark_is_a_module(name):
 
 
 def test_help_needs_no_jax():
-    done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "experiments.benchmark", "--help"],
-        cwd=ROOT, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+    done = run("--help", program="benchmark", PYTHONPROFILEIMPORTTIME="1")
     assert done.returncode == 0
     assert all(f"{name} " in done.stdout and about in done.stdout for name, about in BENCHMARKS.items())
     assert " jax\n" not in done.stderr

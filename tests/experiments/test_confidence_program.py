@@ -1,14 +1,11 @@
 """Confidence of predictions in the run folder: curves, refused queries, re-ranking of uncertain queries."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-import mfvpr
 from mfvpr.evaluation import precision_recall, read_confidences, reliability
 from tests.programs import QUERIES, csv_rows, small
 
@@ -16,7 +13,6 @@ pytestmark = pytest.mark.thorough
 
 SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
 LINES = ("scorer=histogram", "figures=0")
-LEARNED = Path(mfvpr.__file__).parent / "scoring" / "learned" / "learned_aliked.json"
 
 
 @pytest.fixture
@@ -51,7 +47,7 @@ def content(confidence):
 
 
 def test_a_run_says_how_sure_its_answers_are(evaluate):
-    out, _, stdout = evaluate("first", "figures=1")
+    out, _, stdout = evaluate("first")
     assert "ECE" not in stdout  # said in files, until it is asked for
     gains, top = csv_rows(out / "gains.csv"), csv_rows(out / "top_predictions.csv")
     hits = {system: np.array([line[system] == "1" for line in gains]) for system in SYSTEMS}
@@ -80,10 +76,6 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
     shares = csv_rows(out / "rerank_share.csv")
     for line, system in ((shares[0], "retrieval"), (shares[-1], "histogram")):
         assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
-    for name in ("precision_recall", "reliability", "rerank_share"):
-        picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
-        assert min(picture.shape) > 200
-        assert picture.std() > 10
 
 
 def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
@@ -141,15 +133,6 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confide
     last = [line for line in csv_rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
     assert float(last["recall"]) == pytest.approx(hits.count("1") / (QUERIES - 1))
     assert float(last["precision"]) == pytest.approx(hits.count("1") / QUERIES)
-
-
-@pytest.mark.parametrize(("settings", "words"), [
-    (["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
-    (["threshold=2"], "threshold=2: expected a number from 0 to 1"),
-    (["confidence=/none.json"], "/none.json: expected the confidence.json"),
-])  # fmt: skip
-def test_what_cannot_say_how_sure_answers_are_is_refused(refused, settings, words):
-    assert words in refused(*settings)
 
 
 def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
@@ -212,17 +195,6 @@ def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, co
     (tmp_path / "other.json").write_text(json.dumps(content | {"made": origin}))
     _, stderr, _ = evaluate("out", f"confidence={tmp_path}/other.json")
     assert "other settings of features" in stderr
-
-
-def test_a_weight_is_known_by_what_it_holds(evaluate, tmp_path):
-    for name in ("one", "other"):
-        shutil.copy(LEARNED, tmp_path / f"{name}.json")
-    first, *_ = evaluate("first", f"scorer.weight={tmp_path}/one.json")
-    confidence = f"confidence={first}/confidence.json"
-    _, stderr, _ = evaluate("second", confidence, f"scorer.weight={tmp_path}/other.json")
-    assert "other settings" not in stderr
-    _, stderr, _ = evaluate("third", confidence, "scorer.weight=ratio")
-    assert "other settings of scorer" in stderr
 
 
 def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_path):

@@ -1,22 +1,19 @@
 """Data sets as a program: listed, and checked beside what is published."""
 
+from functools import partial
+
 import pytest
 from PIL import Image
 
 from mfvpr.datasets.published import PUBLISHED
 from tests.datasets.test_published import put
+from tests.programs import output_of
 
 
 @pytest.fixture
-def program(call):
+def program(monkeypatch, capsys):
     """Runs a command: output and errors."""
-
-    def run(*arguments, code=0):
-        exit_code, stdout, stderr = call("data", *arguments)
-        assert exit_code == code, stderr
-        return stdout, stderr
-
-    return run
+    return partial(output_of, monkeypatch, capsys, "data")
 
 
 def test_all_are_listed_with_their_numbers(program):
@@ -68,7 +65,6 @@ def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     (["check", "gardens_point", "root=/no/such"], "expected the folder of gardens_point, got nothing"),
     (["check", "garden"], "expected data sets such as"),
     (["check"], "the following arguments are required: NAME"),
-    ([], "the following arguments are required: COMMAND"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(program, arguments, words):
     _, stderr = program(*arguments, code=2)

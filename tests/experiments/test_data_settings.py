@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import stages
 from experiments.evaluation import evaluate
 from mfvpr.datasets import read_image
-from tests.programs import composed, csv_rows, folder, matches_path
+from tests.programs import composed, csv_rows, folder
 
 pytestmark = pytest.mark.thorough
 
@@ -78,15 +77,6 @@ def test_nothing_right_is_told_beforehand(small_street, run):
     assert set(recall(rows).values()) == {0.0}
 
 
-def test_matches_are_kept_apart_by_what_is_left_out(small_street, tmp_path):
-    store = f"cache={tmp_path}"
-    paths = {
-        matches_path(composed(*same(small_street, "dataset.ground_truth=order", "candidates=4", store, *more)))[0]
-        for more in ([], ["dataset.exclude_neighbors=0"], ["dataset.exclude_neighbors=1"])
-    }
-    assert len(paths) == 3
-
-
 def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
     for side in ("database", "query"):
         lines = [f"{row:04d}.png,floor {row // 5}\n" for row in range(10)]
@@ -145,14 +135,6 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
               "dataset.bits=12", name="off")  # fmt: skip
     assert "so that they come out cut off; dataset.bits=16 would use their range" in off[1].err
     assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
-
-
-def test_a_second_run_is_told_the_same_of_its_images(small_street, tmp_path):
-    settings = composed(*folder(small_street, f"cache={tmp_path}/store"))
-    first, second = (stages.prepare(settings, stages.Stopwatch())[1] for _ in range(2))
-    assert first.fingerprints == second.fingerprints
-    assert first.reading == second.reading
-    assert len(list((tmp_path / "store" / "contents").iterdir())) == 2
 
 
 @pytest.mark.parametrize("value", ["", None, "elsewhere"])

@@ -40,17 +40,6 @@ def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, refuse
         assert refuse_at_once("evaluate", "-m", setting, "candidates=4,8") == message
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["launcher=joblib"], "launcher=joblib: expected one, and --multirun"),
-    (["-m", "launcher=joblib,slurm"], "launcher=joblib,slurm: expected one, and --multirun"),
-    (["-m", "launcher=job"], "the nearest is joblib"),
-    (["-m", "launcher=null"], "leave it out for none"),
-    (["-m", "hydra/launcher=nope"], "nope: this launcher is not installed; there are basic joblib"),
-])  # fmt: skip
-def test_wrong_launchers(arguments, words, refuse_at_once):
-    assert words in refuse_at_once("evaluate", *arguments)
-
-
 def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
     without, _ = succeed("evaluate", "--help")
     assert "  launcher=null           joblib, slurm, submitit_local\n" in without

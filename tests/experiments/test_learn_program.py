@@ -194,11 +194,6 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
     assert saved[4:6] == [("first_half-gradient_retrieval", 4), ("first_half-match_weights", 2)]
 
 
-def test_what_is_trained_already_is_not_trained_again(learn, learned, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoints, "save", lambda *_: pytest.fail("trained again"))
-    assert learn(tmp_path / "out", *SHORT) == learned[1]
-
-
 def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, refuse):
     [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
     before = snapshot(root)
@@ -260,12 +255,6 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step, 
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
     assert words in refuse_at_once("learn", *small(root), *arguments)
-
-
-def test_too_few_queries_are_refused(root, tmp_path, refuse):
-    few = ("recall.tolerances=[0,3]", *SUM, f"out={tmp_path}/out")
-    assert "split=first_half: expected queries" in refuse("learn", *small(root), *few)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):

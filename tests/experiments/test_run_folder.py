@@ -232,18 +232,6 @@ def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, ca
     assert list(tmp_path.iterdir()) == []
 
 
-def test_whoever_is_refused_leaves_the_folder_where_it_is(tmp_path):
-    with runs.claim_run_folder(tmp_path / "out") as first:
-        with (
-            pytest.raises(InputError, match="another run is using this folder"),
-            runs.claim_run_folder(tmp_path / "out"),
-        ):
-            pytest.fail("it was claimed twice")
-        with runs.writing(first) as new:
-            (new / "table.md").write_text("whole")
-    assert (tmp_path / "out" / "table.md").read_text() == "whole"
-
-
 def test_the_claim_of_a_killed_run_is_free(tmp_path):
     code = ("import sys; from pathlib import Path; from mfvpr.report import runs\n"
             "with runs.claim_run_folder(Path(sys.argv[1])) as folder, runs.writing(folder) as new:\n"

@@ -7,11 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 
 from mfvpr.storage.disk import lock_store
-from tests.programs import ROOT, run, small, typed
+from tests.programs import ROOT, run, small
 
 pytestmark = pytest.mark.slow
 
@@ -29,11 +30,8 @@ def plain(settings, tmp_path_factory):
 
 
 @pytest.fixture
-def evaluate(monkeypatch, capsys, settings, tmp_path):
-    def start(*more):
-        return typed(monkeypatch, capsys, "evaluate", *settings, f"cache={tmp_path}/store", *more)
-
-    return start
+def evaluate(call, settings, tmp_path):
+    return partial(call, "evaluate", *settings, f"cache={tmp_path}/store")
 
 
 def tables(place):
@@ -70,21 +68,6 @@ def test_a_plain_run_computes_the_parts_of_missing_shards(evaluate, plain, tmp_p
     assert evaluate("shard=1/3")[0] == 0
     assert evaluate(f"out={tmp_path}/out")[0] == 0
     assert tables(tmp_path / "out") == tables(plain)
-
-
-@pytest.mark.parametrize(
-    "typed_in, words",
-    [
-        (("shard=2/2",), "shard=2/2: expected i/n with i from 0"),
-        (("shard=1",), "shard=1: expected i/n"),
-        (("shard=0/2", "cache=null"), "shard=0/2: expected cache=DIR as well"),
-    ],
-)
-def test_wrong_settings(evaluate, typed_in, words):
-    code, _, error = evaluate(*typed_in)
-    assert code == 2
-    assert error.startswith(f"error: {words}")
-    assert error.count("\n") == 1
 
 
 def test_the_same_shard_twice_at_the_same_time_is_refused(evaluate, tmp_path):

@@ -101,11 +101,11 @@ def test_programs_rank_by_a_file_as_by_the_equal_word(run, file, tmp_path):
     assert rankings[0] == rankings[1] != rankings[2]
 
 
-def test_a_changed_file_is_another_setting_of_a_confidence(run, file, tmp_path):
+def test_a_file_of_other_content_is_another_setting_of_a_confidence(run, tmp_path):
     warnings = []
     for number, weight in enumerate((WEIGHT, WEIGHT, replace(WEIGHT, output=np.float32([3, 0, 1])))):
+        file = tmp_path / f"{number}.json"
         write_weight(file, weight, {})
-        os.utime(file, ns=(number, number))
         confidence = [f"confidence={tmp_path}/0/confidence.json"] if number else []
         code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / str(number)), *confidence)
         assert code == 0, stderr

@@ -15,8 +15,6 @@ AVERAGES = {
     "mix_hist_comb_10": (87.88, 93.27, 95.42), "mix_hist_comb_50": (89.13, 94.19, 96.17),
 }  # fmt: skip
 QUERIES = {"dawn": 218, "dusk": 179, "night": 183, "night-rain": 218, "overcast-winter": 195, "rain": 192, "snow": 226}
-
-
 SMALL = (*BERLIN, "gardens_point", "nordland_1415")
 
 
