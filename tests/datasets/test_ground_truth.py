@@ -63,8 +63,7 @@ def test_utm_reads_the_file_name_only(tmp_path):
 
 @pytest.mark.parametrize("kind", [None, "names"])
 def test_ground_truth_must_be_chosen_even_if_counts_agree(folders, kind):
-    choices = ("order (query i shows", "index (a file", "utm (positions", "label (two", "none (rankings")
-    with one_line_error(None, *choices):
+    with one_line_error(r"order \(.*index \(.*utm \(.*label \(.*none \("):
         folder_dataset(folders[0], folders[0], ground_truth=kind)
 
 
@@ -222,7 +221,6 @@ def twice(path):
     [
         ("missing.csv", None, "got nothing"),
         ("gt.csv", f"query,database\n0,0\n1,{5000 * '1'}\n", "(5000 characters)'"),
-        ("gt.csv", f"query,database\n0,0\n1,{5000 * '0'}1\n", "(5001 characters)'"),
         ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read as .json"),
         ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
         ("gt.json", 100_000 * "[", "cannot be read as .json"),

@@ -27,12 +27,6 @@ def photo():
     return np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("name", ["a.png", "with space.png", "ünïcode-é-日本.png", "@1@2@.png", "x.bmp", "x.tiff"])
-def test_lossless_files_come_back(tmp_path, photo, name):
-    Image.fromarray(photo).save(tmp_path / name)
-    np.testing.assert_array_equal(read_image(tmp_path / name), photo)
-
-
 @pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "P", "1", "LA"])
 def test_every_mode_decodes_to_pillows_rgb(tmp_path, photo, mode):
     image = Image.fromarray(photo).convert(mode)
@@ -203,15 +197,13 @@ def write_deep(path, values):
 @pytest.mark.parametrize("factor", [256, 257])
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.tiff", "a.pgm"])
 def test_16_bit_copies_are_their_originals(tmp_path, photo, name, factor):
-    gray = photo[..., 0]
-    write_deep(tmp_path / name, gray.astype(np.uint16) * factor)
-    np.testing.assert_array_equal(read_image(tmp_path / name), np.repeat(gray[..., None], 3, axis=2))
-    if name in ("a.png", "a.tif"):
-        write_deep(tmp_path / name, photo.astype(np.uint16) * factor)
-        np.testing.assert_array_equal(read_image(tmp_path / name), photo)
-    header = read_header((tmp_path / name).read_bytes())
-    last_written = photo if name in ("a.png", "a.tif") else gray
-    assert header == (1, 0 if name == "a.pgm" else factor * int(last_written.max()))
+    path, gray = tmp_path / name, photo[..., 0]
+    for values in (gray, photo) if name in ("a.png", "a.tif") else (gray,):
+        write_deep(path, values.astype(np.uint16) * factor)
+        original = photo if values.ndim == 3 else np.repeat(gray[..., None], 3, axis=2)
+        np.testing.assert_array_equal(read_image(path), original)
+        largest = 0 if name == "a.pgm" else factor * int(values.max())
+        assert read_header(path.read_bytes()) == (1, largest)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])

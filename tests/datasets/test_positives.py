@@ -8,7 +8,6 @@ from hypothesis.extra.numpy import arrays
 
 from mfvpr import InputError
 from mfvpr.datasets import Positives, positives
-from tests.oracles import radius_positives
 
 sizes = st.tuples(st.integers(0, 7), st.integers(0, 9))
 matrices = sizes.flatmap(lambda shape: arrays(bool, shape))
@@ -120,13 +119,3 @@ def test_values_that_do_not_fit_are_errors():
         got.among(np.ones(5, bool))
     with pytest.raises(InputError, match="expected a matrix"):
         Positives.from_matrix(np.ones(3, bool))
-
-
-def test_neighbors_within_a_radius_by_blocks(monkeypatch):
-    monkeypatch.setattr(positives, "_QUERIES_AT_A_TIME", 3)
-    rng = np.random.default_rng(0)
-    queries, database = rng.uniform(0, 100, (10, 2)), rng.uniform(0, 100, (30, 2))
-    check_same(
-        Positives.from_rows(positives.rows_within(queries, database, 25.0), 30), radius_positives(queries, database, 25)
-    )
-    assert [list(rows) for rows in positives.rows_within(queries[:2], database[:0], 25.0)] == [[], []]

@@ -4,7 +4,6 @@ import csv
 import itertools
 import os
 
-import cv2
 import numpy as np
 import pytest
 
@@ -12,17 +11,13 @@ from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
 from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE
 from mfvpr.utils import InputError
+from tests.builders import fill
 from tests.io.checks import one_line_error
 from tests.random_checkpoints import write_matlab
 
-IMAGE = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
-
 
 def put(root, *names):
-    for name in names:
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(IMAGE)
+    fill(root, names)
 
 
 def rows(dataset, threshold, sequence=0):
@@ -63,12 +58,8 @@ def test_a_gap_is_an_error_because_the_table_counts_numbers(ssm, side, number):
 
 def test_faults_of_ssm_vprs(ssm):
     table = ssm / "GroundTruth.csv"
-    for text, words in (
-        ("Reference,Live\n0,0\n12,1\n4,2\n", "from 0 to 11, got '12'"),
-        ("Reference,Live\n0,0\n4,2\n", "expected lines for all 3 queries"),
-    ):
-        table.write_text(text)
-        check_error("gardens_point", ssm, words)
+    table.write_text("Reference,Live\n0,0\n12,1\n4,2\n")
+    check_error("gardens_point", ssm, "from 0 to 11, got '12'")
     table.unlink()
     check_error("gardens_point", ssm, "GroundTruth.csv: expected")
     check_error("gardens_point", ssm / "no", "no: expected the folder of gardens_point")
@@ -137,7 +128,6 @@ def test_faults_of_robotcar(tmp_path):
     for line, words in (
         ("dawn/rear/1.jpg 1 2 3", "line 1: expected a name and the 16 numbers"),
         ("dawn/rear/1.jpg " + "nan " * 16, "line 1: expected a name and the 16 numbers"),
-        ("dawn/rear/1.jpg " + "x " * 16, "line 1: expected a name and the 16 numbers"),
         (f"dawn/rear/1.jpg {pose.replace('7.0', '7_0')}", "line 1: expected a name and the 16 numbers"),
         (f"dawn/rear/1.jpg {transposed}", "the last 0 0 0 1"),
         (f"dawn/rear/1.jpg {scaled}", "the last 0 0 0 1"),

@@ -19,14 +19,10 @@ def shown(seed, tolerance=2):
     )  # fmt: skip
 
 
-def rising(places):
-    """In the direction of the first drive."""
-    return places if places[0] < places[PLACES - 1] else places.max() - places
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_neighbors_follow_whatever_the_rows_of_the_map_are(seed):
-    places = rising(places_along_path(shown(seed), "m"))
+    places = places_along_path(shown(seed), "m")
+    places = places if places[0] < places[PLACES - 1] else places.max() - places  # in the direction of the first drive
     assert np.abs(places - DRIVES).max() <= 2  # at the ends images are shown by few queries
     assert (np.diff(places[2 : PLACES - 2]) == 1).all()
     np.testing.assert_array_equal(places[PLACES:][::-1], places[:PLACES:2])

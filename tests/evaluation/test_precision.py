@@ -38,12 +38,8 @@ def test_curve_is_that_of_counting_answers_at_every_threshold(seed):
         assert curve.recall_at(wanted) == max(reached, default=0)
 
 
-def test_perfect_and_hopeless_confidences():
-    correct = np.arange(10) < 6
-    perfect = precision_recall(-np.arange(10.0), correct, correct)
-    assert (perfect.average_precision, perfect.recall_at(1.0)) == (1.0, 1.0)
-    assert precision_recall(np.arange(10.0), correct).recall_at(1.0) == 0
-    assert precision_recall(-np.arange(10.0), correct).recall_at(1.0) == 0.6
+def test_all_queries_have_positives_by_default_and_perhaps_no_prediction():
+    assert precision_recall(-np.arange(10.0), np.arange(10) < 6).recall_at(1.0) == 0.6
     for has_positives in (np.zeros(10, bool), None):
         none = precision_recall(np.full(10, np.nan), np.zeros(10, bool), has_positives)
         assert (none.average_precision, none.recall_at(0.5), len(none.thresholds)) == (0.0, 0.0, 0)

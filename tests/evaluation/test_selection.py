@@ -50,12 +50,6 @@ def test_halves_of_a_map_where_most_queries_wait_at_its_end():
     assert [len(half.report) for half in without_places] == [4, 4]
 
 
-def test_queries_without_a_place_may_be_tuned_on():
-    positives = Positives.from_matrix(frame_positives(np.array([0, -1, 8, 9]), np.arange(10), tolerance=1))
-    first, _ = halves(positives)
-    assert list(first.tune) == [0, 1]
-
-
 def test_neighbors_are_one_step_along_one_axis():
     axes = {"sigma": [1, 2, 3], "weight": ["fs", "dmf"]}  # numbers: 0 1 / 2 3 / 4 5
     assert neighboring_settings(axes, 2) == [0, 4, 3]

@@ -12,17 +12,6 @@ from mfvpr.evaluation.statistics import block_sign_flips, design_effect, recall_
 from mfvpr.utils import InputError
 
 
-def paths(recall, correlation, queries, count=200, seed=0):
-    """Hits `[count, queries]` of Markov chains with a recall and a correlation between neighbors."""
-    rng = np.random.default_rng(seed)
-    hits = np.empty((count, queries), bool)
-    hits[:, 0] = rng.random(count) < recall
-    for query in range(1, queries):
-        stay = correlation + (1 - correlation) * np.where(hits[:, query - 1], recall, 1 - recall)
-        hits[:, query] = (rng.random(count) < stay) == hits[:, query - 1]
-    return hits
-
-
 def latent_paths(recall, correlation, queries, count=200, systems=1, shared=0.0, seed=0):
     """Hits `[systems, count, queries]` where Gaussian sequences, which share a part, stay below a threshold."""
     rng = np.random.default_rng(seed)
@@ -55,7 +44,7 @@ def effect_oracle(values, events, sequences=None):
 
 @pytest.mark.parametrize("correlation", [0, 0.6, 0.9])
 def test_design_effect_equals_the_loops(correlation):
-    for hits in paths(0.7, correlation, 80, count=10, seed=1):
+    for hits in latent_paths(0.7, correlation, 80, count=10, seed=1)[0]:
         if hits.all() or not hits.any():
             continue
         rarer = min(hits.sum(), 80 - hits.sum())
@@ -64,7 +53,7 @@ def test_design_effect_equals_the_loops(correlation):
 
 @pytest.mark.parametrize("level", [0.9, 0.95])
 def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth(level):
-    for hits in paths(0.8, 0.5, 60, count=10, seed=2):
+    for hits in latent_paths(0.8, 0.5, 60, count=10, seed=2)[0]:
         worth = 60 / design_effect(hits)
         worth *= (stats.t(59).ppf((1 + level) / 2) / stats.t(worth - 1).ppf((1 + level) / 2)) ** 2
         correct, tail = hits.mean() * worth, (1 - level) / 2

@@ -9,6 +9,7 @@ from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import line_chart
 
 SYSTEMS = ["retrieval", *(f"histogram + anchor + cohort + retrieval {number}" for number in range(10))]
+QUERY = np.zeros((90, 90, 3), np.uint8)
 P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
 
 
@@ -16,27 +17,22 @@ def pixels(path):
     return np.asarray(Image.open(path).convert("L"))
 
 
-@pytest.fixture
-def query():
-    return np.zeros((90, 90, 3), np.uint8)
-
-
-def draw(path, query, name, **options):
-    prediction = figures.Candidate(query, f"incorrect: {name}, rank 1")
-    figures.histogram_figure(path, query, [prediction], title=f"histogram: {name} -> {name}", **options)
+def draw(path, name, **options):
+    prediction = figures.Candidate(QUERY, f"incorrect: {name}, rank 1")
+    figures.histogram_figure(path, QUERY, [prediction], title=f"histogram: {name} -> {name}", **options)
     return pixels(path)
 
 
-def test_a_long_name_leaves_the_figure_as_large(tmp_path, query):
-    short, long = (draw(tmp_path / f"{len(name)}.png", query, name) for name in ("x" * 30, "x" * 200))
+def test_a_long_name_leaves_the_figure_as_large(tmp_path):
+    short, long = (draw(tmp_path / f"{len(name)}.png", name) for name in ("x" * 30, "x" * 200))
     assert (short < 20).sum() == pytest.approx((long < 20).sum(), rel=0.1)  # of the images
     assert long.shape[1] == pytest.approx(short.shape[1], rel=0.1)
 
 
-def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path, query):
-    aspect = figures.pixel_aspect_of(np.zeros((384, 1024, 3)), query)
+def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path):
+    aspect = figures.pixel_aspect_of(np.zeros((384, 1024, 3)), QUERY)
     assert aspect == 384 / 1024
-    rows, columns = np.nonzero(draw(tmp_path / "a.png", query, "name", pixel_aspect=aspect) == 0)
+    rows, columns = np.nonzero(draw(tmp_path / "a.png", "name", pixel_aspect=aspect) == 0)
     half = columns[columns < np.mean(columns)]  # the two images stand side by side
     rows_of_images = [row for row in np.unique(rows) if (rows == row).sum() > 100]
     assert len(rows_of_images) / (half.max() - half.min()) == pytest.approx(aspect, rel=0.1)

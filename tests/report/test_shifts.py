@@ -90,8 +90,3 @@ def test_refused_answers_have_no_shift(root, tmp_path):
     places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
     assert 0 < len(places) < len(predictions)
     assert {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "shifts.csv")} == places
-
-
-def test_only_a_histogram_has_one(root, tmp_path):
-    evaluation.evaluate(composed(*small(root), "scorer=sum", "figures=0", f"out={tmp_path}/out"))
-    assert not (tmp_path / "out" / "shifts.csv").exists()

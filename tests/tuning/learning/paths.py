@@ -13,12 +13,6 @@ TOLERANCES = (0, 1, 2)  # frames; the middle one decides
 SIZES = (96, 200)  # px, of every other image: the first is the smaller
 
 
-def pairs_of(query, candidates, rng, sizes):
-    """Matches of one query with each of its candidates."""
-    return [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[c % 2],) * 2))
-            for c in candidates]  # fmt: skip
-
-
 def path(*, sizes=SIZES, only_right=(), seed=0):
     """Protocol, matches, candidates: all frames are those of every query, in an order of its own; of some, one is."""
     rng = np.random.default_rng(seed)
@@ -26,11 +20,15 @@ def path(*, sizes=SIZES, only_right=(), seed=0):
     mask = ~np.isin(np.arange(QUERIES), only_right)[:, None] | (indices == np.arange(QUERIES)[:, None])
     scores = -np.sort(-rng.random(indices.shape).astype(np.float32), axis=1)
     candidates = Shortlist(indices=indices, scores=scores, mask=mask)
-    matches = match_set_of([pairs_of(query, indices[query], rng, sizes) for query in range(QUERIES)], 16)
+    pairs = [
+        [random_matches(rng, int(rng.integers(4, 12)), sizes=((sizes[query % 2],) * 2, (sizes[row % 2],) * 2))
+         for row in indices[query]]
+        for query in range(QUERIES)
+    ]  # fmt: skip
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
     positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
     protocol = EvaluationProtocol(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
-    return protocol, matches, candidates
+    return protocol, match_set_of(pairs, 16), candidates
 
 
 def split(*, half=0, **options):

@@ -14,7 +14,7 @@ from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss
 from mfvpr.tuning.learning.models import Model
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.search import untracked_stages
-from tests.builders import random_matches
+from tests.builders import random_matches, stack
 from tests.tuning.learning.paths import QUERIES, SIZES, TOLERANCES, split
 
 pytestmark = pytest.mark.thorough
@@ -101,8 +101,7 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
 
 
 def test_anchors_start_near_the_hard_score():
-    matches = [random_matches(np.random.default_rng(seed), 200) for seed in range(10)]
-    matches = jax.tree.map(lambda *leaves: np.stack(leaves), *matches)
+    matches = stack([random_matches(np.random.default_rng(seed), 200) for seed in range(10)])
     model = Model.of(AnchorPoints(), 1.0)
     soft = scores_of_one(model.scorer_of(model.start), matches)
     hard = scores_of_one(AnchorPoints(temperature=None), matches)

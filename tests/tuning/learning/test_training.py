@@ -15,7 +15,6 @@ pytestmark = pytest.mark.thorough
 
 @pytest.fixture(scope="module")
 def uninterrupted():
-    """The training that nothing interrupts."""
     return train()
 
 
@@ -133,7 +132,6 @@ def test_an_ended_training_stays_ended(tmp_path):
         (lambda p, b: objective(p, b) + jnp.where(b[0][0] > 1e5, jnp.nan, 0.0), "loss"),
         (lambda p, b: objective(p, b) + jnp.sqrt(jnp.maximum(1e5 - b[0][0], 0.0)) * 0 * p["slope"], "gradient.slope"),
     ],
-    ids=["loss", "gradient"],
 )
 def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, uninterrupted, broken, culprit):
     def spiked(step):

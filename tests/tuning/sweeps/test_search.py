@@ -1,6 +1,5 @@
 """The search over a small path, against sweeps and loops over queries."""
 
-import json
 import math
 
 import numpy as np
@@ -79,16 +78,6 @@ def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outc
     np.testing.assert_array_equal(outcome.rows, rows)
 
 
-def test_own_values_that_the_grid_has_are_ranked_once(data):
-    axes = Axes(SUM, {"weight": ["fs", "dmf"]}, {"weight": "dmf"})
-    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, ks=[1])
-    assert (len(outcome.settings), outcome.own) == (2, 1)
-    [chosen] = outcome.chosen
-    assert outcome.recall[chosen, 1] == outcome.recall[:, 1].max()
-    assert [verdict.own.recall for verdict in outcome.report] == pytest.approx(outcome.recall[1])
-    assert [verdict.chosen.recall for verdict in outcome.report] == pytest.approx(outcome.recall[chosen])
-
-
 def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     """The scorer's own values are beside the grid, and never chosen."""
     right = outcome.protocol.positives[1]
@@ -122,46 +111,23 @@ def test_optuna_draws_within_the_axes():
     assert len({setting["tolerance"] for setting in drawn}) == 20
 
 
-def test_optuna_proposes_as_many_as_asked_after_the_scorers_own(data):
-    pytest.importorskip("optuna")
-    axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
-    outcome = sweeping.search_optuna(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, trials=3, seed=1, ks=[1])
-    assert outcome.settings[0] == axes.own
-    assert outcome.rows.shape == (1, 4, QUERIES, 1)
-    assert outcome.chosen == [int(np.argmax(outcome.recall[:, 1]))]
-    assert sweeps.heat_maps(outcome) == []
-    rows = sweeping.sweep(SUM, [axes.setting(plain) for plain in outcome.settings], *data, depth=1)
-    np.testing.assert_array_equal(outcome.rows, rows)
-
-
-def test_optuna_learns_from_the_queries_that_choose(data, monkeypatch):
+def test_optuna_proposes_after_the_scorers_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch):
     optuna = pytest.importorskip("optuna")
-    values = []
-    monkeypatch.setattr(optuna.Study, "tell", lambda study, trial, value: values.append(value))
+    values, tell = [], optuna.Study.tell
+    monkeypatch.setattr(optuna.Study, "tell", lambda *told: values.append(told[-1]) or tell(*told))
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
-    outcome = sweeping.search_optuna(
-        axes, evaluation_protocol(TRUTH, TOLERANCES, "both"), *data, trials=3, seed=1, ks=[1]
-    )
+    protocol = evaluation_protocol(TRUTH, TOLERANCES, "both")
+    outcome = sweeping.search_optuna(axes, protocol, *data, trials=3, seed=1, ks=[1])
+    assert outcome.settings[0] == axes.own
+    assert outcome.rows.shape == (3, 4, QUERIES, 1)
+    assert outcome.chosen == np.argmax(outcome.protocol.tuning(outcome.rows)[..., 1], axis=1).tolist()
+    assert sweeps.heat_maps(outcome) == []
+    settings = [axes.setting(plain) for plain in outcome.settings]
+    rows = sweeping.sweep(SUM, settings, *data, views=outcome.protocol.views, depth=1)
+    np.testing.assert_array_equal(outcome.rows, rows)
     tuning = outcome.protocol.tuning(outcome.rows)[:, 1:, outcome.protocol.main].mean(axis=0)
     np.testing.assert_array_equal(values, tuning)
     assert (tuning != outcome.recall[1:, outcome.protocol.main]).all()  # of all queries, reported ones among them
-
-
-def test_what_people_read_is_what_was_measured(outcome):
-    table = sweeps.settings_table(outcome)
-    assert table.header == ["weight", "c", "R@1 ±0", "R@1 ±1", "R@1 ±2", "R@5 ±1"]
-    for cells, setting, recall in zip(table.rows, outcome.settings, outcome.recall, strict=True):
-        assert cells[:2] == [str(value) for value in setting.values()]
-        assert cells[2:5] == [f"{100 * value:.1f}" for value in recall]
-    written = json.loads(json.dumps(sweeps.sweep_json(outcome)))
-    assert (written["split"], written["search"], written["ks"]) == ("both", "grid", [1, 5])
-    assert written["chosen"] == [outcome.settings[number] for number in outcome.chosen]
-    assert [entry["parameters"] for entry in written["settings"]] == outcome.settings
-    text = sweeps.sweep_summary(outcome)
-    for half in ("first_half", "second_half"):
-        assert text.count(f"queries of {half}, reported on the 16 of the other half: weight = ") == 1
-    assert text.count("95 % intervals") == 1
-    assert [name for name, _ in sweeps.heat_maps(outcome)] == ["weight_c.png"]
 
 
 def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
