@@ -1,6 +1,7 @@
 """A whole evaluation in one call: sequences, what is kept, and files of other programs in place of our own stages."""
 
 import csv
+import itertools
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -140,6 +141,23 @@ def test_only_candidates_are_extracted(dataset, tmp_path):
     [features] = FeatureCache(tmp_path).local(dataset.database, SIFT, [])
     assert np.flatnonzero(features.counts).tolist() == wanted.tolist()
     assert f"database features: {len(wanted)} of 10 images to do" in "\n".join(lines)
+
+
+def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
+    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
+
+    def only_scores(label):
+        assert label == "scores"
+        return progress.no_progress
+
+    again = mfvpr.evaluate(
+        replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
+        cache=FeatureCache(tmp_path, track=only_scores), memory=1e-5,
+    )  # fmt: skip
+    for name, system in itertools.product(again.systems, (first, again)):
+        [ranked], [expected] = system.systems[name], result.systems[name]
+        np.testing.assert_array_equal(ranked.rows, expected.rows)
+    np.testing.assert_array_equal(first.matched[0].candidates.indices, again.matched[0].candidates.indices)
 
 
 def test_whitening_is_fitted_on_the_database():

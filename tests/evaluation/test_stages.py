@@ -136,6 +136,23 @@ def test_features_that_are_not_finite_are_named_and_rank_last(dataset, value):
     assert (candidates.indices != 1).all()
 
 
+def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, matches, compilations):
+    def scores(sigma, bin_size, window, tolerance):
+        scorers = {
+            "histogram": mfvpr.HistogramOfShifts(sigma=sigma, bin_size=bin_size),
+            "anchor": mfvpr.AnchorPoints(window=window, tolerance=tolerance),
+        }
+        return stages.score(scorers, matches, candidates)
+
+    first = scores(22.5, 15.0, 10, 3.0)  # 672 px in 45 bins: a capacity of 48
+    compilations.reset()
+    second = scores(10, 14.5, 4, 1)
+    assert compilations.count == 0
+    assert all((first[name] != second[name]).any() for name in first)
+    scores(10, 13.0, 4, 1)  # 52 bins: the next capacity, one program more
+    assert compilations.count == 1
+
+
 @pytest.fixture(scope="module")
 def mixed_sizes():
     """Queries and candidates of two sizes, matches with a confidence."""

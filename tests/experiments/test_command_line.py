@@ -105,6 +105,7 @@ def test_version(succeed, program):
     ("evaluate", ["candidates=range(1,3)"], "requires --multirun"),
     ("evaluate", ["candidates=${nope}"], "candidates: Interpolation key 'nope' not found"),
     ("evaluate", ["store=DIR"], "store: unknown setting; its name is cache now"),
+    ("evaluate", ["fusion.filter_score=cosine"], "its name is fusion.retrieval_score now"),
     ("evaluate", ["dataset.cache=null"], "dataset.cache=null: expected a path"),
     ("evaluate", ["cache=${oc.env:NOPE}"], "cache=${oc.env:NOPE}: expected a path"),
     ("evaluate", ["out=runs/${x"], "out=runs/${x: expected a path"),
