@@ -141,5 +141,5 @@ def split(small_street, tmp_path_factory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def golden(request) -> dict[str, np.ndarray]:
-    """What public code computes (tests/golden), for the tests of `test_NAME.py` and `test_NAME_golden.py`."""
+    """Numbers of public code (tests/golden) for the tests of `test_NAME.py` and `test_NAME_golden.py`."""
     return read_golden(request.path.stem.removeprefix("test_").removesuffix("_golden"))
