@@ -1,6 +1,7 @@
 """Random and hand-made Features and Matches for the tests, in NumPy."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -153,3 +154,8 @@ def match_set_of(queries, capacity):
 def local(descriptions):
     """The local features of images, of the only scale."""
     return [description.features for description in descriptions]
+
+
+def read_golden(name):
+    """The arrays of `tests/golden/NAME.npz`."""
+    return dict(np.load(Path(__file__).parent / "golden" / f"{name}.npz"))

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -18,6 +19,7 @@ from mfvpr.checkpoints.networks import blueprint, network_of
 from mfvpr.datasets import Dataset, folder_dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
+from tests.builders import read_golden
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
@@ -135,3 +137,9 @@ def split(small_street, tmp_path_factory) -> list[Path]:
         lines = [f"{row:04d}.png,{row:04d}.png\n" for row in rows]
         (root / name / "truth.csv").write_text("query,database\n" + "".join(lines))
     return [root / "first", root / "second"]
+
+
+@pytest.fixture(scope="module")
+def golden(request) -> dict[str, np.ndarray]:
+    """Numbers of public code (tests/golden) for the tests of `test_NAME.py` and `test_NAME_golden.py`."""
+    return read_golden(request.path.stem.removeprefix("test_").removesuffix("_golden"))

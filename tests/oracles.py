@@ -11,6 +11,7 @@ which rounds once and so does not depend on the order of the summands.
 """
 
 import math
+import statistics
 from operator import mul
 
 import numpy as np
@@ -123,26 +124,6 @@ def histogram_of_shifts(
     return histogram, np.array(centers_x, np.float64), np.array(centers_y, np.float64)
 
 
-def refined_shift(shifts, weights, sigma, start):
-    """Local maximum of the continuous density behind eq. 1, by mean shift from `start` (not in the paper)."""
-    x, y = float(start[0]), float(start[1])
-    votes = [(sx, sy, w) for (sx, sy), w in zip(_rows(shifts, 2), _values(weights), strict=True) if w != 0]
-    if not votes:
-        return x, y
-    for _ in range(1_000_000):
-        exponents = [-((sx - x) ** 2 + (sy - y) ** 2) / (2 * sigma * sigma) for sx, sy, _ in votes]
-        largest = max(exponents)  # a common factor of numerator and denominator: far starts do not underflow
-        kernel = [w * math.exp(e - largest) for (_, _, w), e in zip(votes, exponents, strict=True)]
-        total = math.fsum(kernel)
-        next_x = math.fsum(k * sx for k, (sx, _, _) in zip(kernel, votes, strict=True)) / total
-        next_y = math.fsum(k * sy for k, (_, sy, _) in zip(kernel, votes, strict=True)) / total
-        step = math.hypot(next_x - x, next_y - y)
-        x, y = next_x, next_y
-        if step <= 1e-10:
-            return x, y
-    raise RuntimeError("mean shift did not converge")
-
-
 # --- anchor points ------------------------------------------------------------------------------------------
 
 
@@ -222,13 +203,6 @@ def anchor_points(
 # --- aggregated score ---------------------------------------------------------------------------------------
 
 
-def _median(values):
-    """Middle value, mean of the two middle values when even."""
-    ordered = sorted(values)
-    half = len(ordered) // 2
-    return ordered[half] if len(ordered) % 2 == 1 else (ordered[half - 1] + ordered[half]) / 2
-
-
 def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, confidence=None):
     """Aggregated score (paper eq. 3), 0 without matches. The unweighted mean counts the confidence."""
     shifts, weights = _rows(shifts, 2), _values(weights)
@@ -245,7 +219,7 @@ def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, c
         elif mean == "weighted":
             center.append(math.fsum(w * v for w, v in zip(weights, values, strict=True)) / total)
         else:
-            center.append(_median(values))
+            center.append(statistics.median(values))
 
     score = 0.0
     for shift, weight in zip(shifts, weights, strict=True):
@@ -304,13 +278,7 @@ def rank(scores, mask=None):
     numbers = [p for p, score in enumerate(scores) if mask[p] and not math.isnan(score)]
     nans = [p for p, score in enumerate(scores) if mask[p] and math.isnan(score)]
     masked = [p for p in range(len(scores)) if not mask[p]]
-    order = []
-    for position in numbers:  # insertion sort: a position passes only strictly smaller scores
-        place = len(order)
-        while place > 0 and scores[order[place - 1]] < scores[position]:
-            place -= 1
-        order.insert(place, position)
-    return order + nans + masked
+    return sorted(numbers, key=lambda position: -scores[position]) + nans + masked
 
 
 # --- evaluation ---------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import re
 import shlex
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -148,4 +147,4 @@ def test_settings_that_the_text_names_exist():
 def test_readme_names_no_machine_path():
     assert not re.search(r"/(work|tmp|root|home)/", "".join([README, *BESIDE]))
     assert len(README.splitlines()) <= 320
-    assert Path(ROOT / "LICENSE").read_text().startswith("MIT")
+    assert (ROOT / "LICENSE").read_text().startswith("MIT")

@@ -16,6 +16,7 @@ from mfvpr.datasets import image_folder, read_image, resize
 from mfvpr.datasets.contents import contents
 from mfvpr.datasets.images import MAX_PIXELS, read_header
 from mfvpr.utils.threads import ordered_map
+from tests.builders import read_golden
 from tests.golden import make_resize
 from tests.io.checks import one_line_error
 
@@ -90,7 +91,7 @@ def test_resize_is_the_librarys(photo, size):
     ("pil_bicubic", 1), ("torch_bilinear", 1e-3), ("torch_no_antialias", 1e-3),
 ])  # fmt: skip
 def test_resize_is_torchs(interpolation, tolerance):
-    golden = np.load(make_resize.GOLDEN)[interpolation]
+    golden = read_golden("resize")[interpolation]
     resized = resize(make_resize.image(), make_resize.SIZE, interpolation)
     assert resized.dtype == golden.dtype
     difference = np.abs(resized.astype(float) - golden)

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from tests.networks.conftest import golden  # noqa: F401  (a fixture)
 from tests.programs import typed
 
 

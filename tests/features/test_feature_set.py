@@ -106,11 +106,6 @@ def test_own_features_that_do_not_fit_are_refused(images, message):
     assert "\n" not in str(error.value)
 
 
-def test_lengths_are_free_where_said():
-    image = spoiled(descriptors=3 * images_of([5])[0].descriptors)
-    np.testing.assert_array_equal(FeatureSet.of([image], unit_length=False)[0].descriptors, image.descriptors)
-
-
 def test_rows_that_are_not_there_have_no_keypoints():
     [image] = images_of([5])
     feature_set = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})

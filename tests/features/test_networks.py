@@ -113,7 +113,6 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, tmp_pat
     (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
     (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
     (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's retrieval takes [224, 224] only"),
-    (["features=aliked", "features.weights=alikd-n16"], "expected weights of aliked: one of"),
     (["matching=lightglue"], "python -m experiments.weights download aliked_lightglue"),
     (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
     (["system=mix_hist_20"], "system=mix_hist_20: expected one of mfvpr"),

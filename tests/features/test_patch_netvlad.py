@@ -10,16 +10,16 @@ import pytest
 import mfvpr
 from experiments import stages
 from mfvpr.checkpoints.networks import plan_network
-from mfvpr.datasets import folder_dataset
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache, features, vectors
 from mfvpr.utils import InputError
+from tests.builders import read_golden
 from tests.features.conftest import read_rows
 from tests.golden import make_patch_scores as patch_scores
-from tests.golden.make_netvlad import GOLDEN, POSITIONS, image, name
+from tests.golden.make_netvlad import POSITIONS, image, name
 from tests.networks.checkpoints import fill_netvlad
 from tests.programs import results
 
@@ -42,11 +42,6 @@ def model():
     return fill_netvlad(4, 16)
 
 
-@pytest.fixture(scope="module")
-def dataset(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
-
-
 @pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.parametrize("position", POSITIONS, ids=map(str, POSITIONS))
@@ -54,7 +49,7 @@ def test_patches_are_where_the_public_code_has_them(model, position):
     size, patch = position
     extractor = PatchNetVladFeatures(model, size, patch_sizes=(patch,))
     [scale], [description] = extractor.scales, extractor(image(size))
-    expected = np.load(GOLDEN)[name("positions", *position)]
+    expected = read_golden("netvlad")[name("positions", *position)]
     np.testing.assert_array_equal(description.features.keypoints, expected)
     assert description.features.descriptors.shape == (len(expected), 16)
     assert scale == (16, len(expected), 1.0)
@@ -147,7 +142,7 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
 
     Where few patches show a place, RANSAC finds one more or less by luck; here most do.
     """
-    golden, height, width = np.load(patch_scores.GOLDEN), *(16 * side for side in patch_scores.MAP)
+    golden, height, width = read_golden("patch_scores"), *(16 * side for side in patch_scores.MAP)
     scores = []
     for patch in patch_scores.PATCHES:
         [places] = PatchNetVladFeatures(model, (width, height), patch_sizes=(patch,))(image((width, height)))

@@ -59,14 +59,6 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
     assert {row["parameters"]["single"] for row in rows if row["system"] == "count"} == {"zero"}
 
 
-@pytest.mark.slow
-def test_its_positions_serve_the_scores_of_shifts(program, tmp_path):
-    program("weights", "convert", checkpoint(tmp_path))
-    options = "features=selavpr", "features.image_size=[112,84]", "retrieval=same", "scorer=histogram", "candidates=6"
-    program("evaluate", *options, "figures=0")
-    assert {row["features"]["name"] for row in read_rows(tmp_path / "out")} == {"selavpr"}
-
-
 def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_path):
     without, with_registers = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
     stderr = program("weights", "convert", without, "--as", "selavpr_msls_registers", code=2)

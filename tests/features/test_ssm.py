@@ -7,10 +7,9 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from flax import nnx
 
 import mfvpr
-from mfvpr.datasets import ImageFolder, folder_dataset, sequences_dataset
+from mfvpr.datasets import ImageFolder, sequences_dataset
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
@@ -18,7 +17,6 @@ from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matching import NearestNeighborMatcher
-from mfvpr.networks import SsmVgg
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.scoring import GridAnchors
@@ -28,6 +26,7 @@ from mfvpr.utils import InputError
 from mfvpr.utils.fingerprints import difference, fingerprint
 from mfvpr.utils.whitening import Whitening, fit_whitening
 from tests.builders import local, make_shortlist
+from tests.networks.test_ssm_maps import published
 
 pytestmark = pytest.mark.thorough
 
@@ -36,27 +35,14 @@ RETRIEVAL = Retrieval(Aggregated(Sift(max_keypoints=60, image_size=(160, 120)), 
 CANDIDATE = NearestNeighborMatcher(cross_check="candidate")
 
 
-def network(seed=0):
-    """Random weights, no JAX program but those of the maps."""
-    shapes, rng = nnx.eval_shape(lambda: SsmVgg(rngs=nnx.Rngs(0))), np.random.default_rng(seed)
-    graph, state = nnx.split(shapes)
-    fill = lambda leaf: (rng.normal(size=leaf.shape) / np.sqrt(np.prod(leaf.shape[:-1]) / 2)).astype(np.float32)  # noqa: E731
-    return nnx.merge(graph, jax.tree.map(fill, state))
-
-
 @pytest.fixture(scope="module")
 def model():
-    return network()
+    return published(0)
 
 
 @pytest.fixture(scope="module")
 def cells(model):
     return SsmCells(model, SMALL, whitening=WindowFitting(6, seed=1))
-
-
-@pytest.fixture(scope="module")
-def dataset(small_street):
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +142,8 @@ def test_grids_and_windows_are_the_published_ones(model):
         assert SsmCells(model, (pixels, pixels), stride=stride).windows.grid == (side, side)
     assert SsmWindows(model).windows.dimension == 41472
     assert SsmWindows(model).vector_size == 36 * 125
+    assert SsmCells(model).scales == ((100, 1600, 1.0),)
+    assert [extractor(model).whitening.dtype for extractor in (SsmWindows, SsmCells)] == ["float32", "float64"]
 
 
 def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells):
@@ -167,19 +155,6 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
         cells(np.zeros((1, 40, 48, 3), np.uint8))
     with pytest.raises(InputError, match=r"SsmCells: .*whitening .*4608 .*got .*41472"):
         replace(cells, whitening=Whitening(np.zeros(41472), np.zeros((3, 41472))))(np.zeros((1, 40, 48, 3), np.uint8))
-
-
-@pytest.mark.parametrize(("images", "printed"), [(220, 161.5), (1415, 911.4)])
-def test_databases_are_of_the_published_size(model, images, printed):
-    """In MiB: vectors of both stages in float32, and both whitenings, the second in float64."""
-    arrays, whitenings = 0, 0
-    for extractor, vectors in ((SsmWindows(model), 36), (SsmCells(model), 1600)):
-        how, positions = extractor.whitening, extractor.windows
-        assert positions.count == vectors
-        arrays += 4 * vectors * how.dimension
-        whitenings += np.dtype(how.dtype).itemsize * (1 + how.dimension) * positions.dimension
-    assert (images * arrays + whitenings) / 2**20 == pytest.approx(printed, rel=0.01)
-    assert whitenings / 2**20 == pytest.approx(19.93 + 3.55, rel=0.01)
 
 
 def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
@@ -217,7 +192,7 @@ def test_what_is_learned_is_kept_and_made_once(cells, learned, dataset, tmp_path
 
 
 def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
-    cache, how, other = FeatureCache(tmp_path), cells.whitening, network(1)
+    cache, how, other = FeatureCache(tmp_path), cells.whitening, published(1)
     extractors = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
     assert len(kept(tmp_path)) == 2
     assert not np.array_equal(*(extractor.whitening.components for extractor in extractors))
@@ -240,7 +215,7 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
 def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, dataset, tmp_path):
     image = np.zeros((1, 40, 48, 3), np.uint8)
     for change in (
-        {"model": network(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
+        {"model": published(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
         {"image_size": (40, 48)},
     ):  # fmt: skip
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):

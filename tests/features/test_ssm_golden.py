@@ -13,18 +13,17 @@ from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.reranking import FrameCorrelation
 from mfvpr.retrieval.ssm_voting import vote
-from tests.builders import make_matches
 from tests.golden import make_ssm
 from tests.golden.make_ssm import CANDIDATES, DIMENSIONS, IMAGES, MAPS, made_up_map, picture
-from tests.networks.checkpoints import fill_published
-from tests.random_checkpoints import places365_shapes, random_checkpoint
+from tests.networks.test_ssm_maps import published
+from tests.scoring.batches import score
+from tests.scoring.test_grid import cells
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
 FITTINGS = WindowFitting(DIMENSIONS[0]), WindowFitting(DIMENSIONS[1], zero_row=True, dtype="float64")
 SIZES = 9, 3
 project = jax.jit(whiten_windows, static_argnames="stride")
-score = jax.jit(lambda scorer, matches: scorer(matches))
 match = jax.jit(mfvpr.match, static_argnames="cross_check")
 
 
@@ -51,8 +50,7 @@ def of_images(case, stage):
     """Whitened windows of the pictures by a network with random weights."""
     seed, pixels, *counts = IMAGES[case]
     size = (224, 224) if stage == 1 else (pixels, pixels)
-    model = fill_published("vgg16_places365", random_checkpoint(places365_shapes(full=False), seed))
-    maps = SsmMaps(model, stage, size)
+    maps = SsmMaps(published(seed), stage, size)
     computed = maps(np.stack([resize(picture(*row), size) for row in rows_of(*counts)]))
     return described(np.stack([result.vector.reshape(maps.shape) for result in computed]), stage, counts[0])
 
@@ -100,11 +98,8 @@ def test_scores_are_equal_as_whole_numbers(golden, case):
     """For the program's own matches; with its padding on a CPU, and on a GPU."""
     index = golden[f"{case}/index"]
     side = index.shape[-1]
-    cells = np.arange(side**2)
-    points = np.zeros((side**2, 2))
-    counts = {"count0": side**2, "count1": side**2}
     for place in np.ndindex(index.shape[:2]):
-        pair = make_matches(points, points, index0=index[place].reshape(-1), index1=cells, **counts)
+        pair = cells(index[place], side)
         assert int(score(GridAnchors(side), pair)) == golden[f"{case}/scores"][place]
         assert int(score(GridAnchors(side, outside="zero"), pair)) == golden[f"{case}/zero_scores"][place]
 

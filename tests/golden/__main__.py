@@ -2,8 +2,10 @@
 
 import sys
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 
-maker = import_module(f"tests.golden.make_{sys.argv[1]}")
-np.savez_compressed(maker.GOLDEN, **maker.main(*sys.argv[2:]))
+name, *arguments = sys.argv[1:]
+arrays = import_module(f"tests.golden.make_{name}").main(*arguments)
+np.savez_compressed(Path(__file__).parent / f"{name}.npz", **arrays)

@@ -16,8 +16,6 @@ from tests.golden.make_d2net import projections, samples, texture
 from tests.golden.torch_networks import fill, replace_module
 from tests.random_checkpoints import aliked_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "aliked.npz"
-
 
 class Case(NamedTuple):
     """A network, an image below IMAGES, and how it is processed; without an image, texture and random weights."""

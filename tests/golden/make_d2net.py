@@ -4,7 +4,6 @@ CLONE is a clone of https://github.com/mihaidusmanu/d2-net.
 """
 
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from tests.golden.torch_networks import fill
 from tests.random_checkpoints import d2net_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "d2net.npz"
 SAMPLES = 1000
 
 

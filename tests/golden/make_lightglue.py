@@ -15,7 +15,6 @@ from mfvpr.types import Features
 from tests.builders import make_features
 from tests.random_checkpoints import lightglue_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "lightglue.npz"
 SMALL = {"inputs": 16, "width": 32, "layers": 3, "heads": 2}
 IMAGES = np.array([[320, 240], [200, 360]], np.float32)  # px, of both sides
 SIZES = ((24, 31), (17, 5), (1, 9), (1, 1))  # keypoints of both images

@@ -19,7 +19,6 @@ from mfvpr.features import AlikedFeatures
 from mfvpr.types import Features
 from tests.golden.make_lightglue import as_tensors, public
 
-GOLDEN = Path(__file__).parent / "lightglue_real.npz"
 KEYPOINTS = 160
 QUERIES = (20, 70)  # of each place, with their own database images
 PAIRS = [f"{place}/{query}" for place in FOLDERS for query in QUERIES]

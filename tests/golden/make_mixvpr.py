@@ -6,14 +6,12 @@ both in float64, so that the file holds no rounding errors but its own.
 
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from tests.golden.make_netvlad import samples
 from tests.random_checkpoints import mixvpr_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "mixvpr.npz"
 SIZES = ((1024, 4), (256, 2), (64, 2))  # channels and rows of the published networks
 
 

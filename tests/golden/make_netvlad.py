@@ -17,7 +17,6 @@ import numpy as np
 from tests.golden.torch_networks import fill, replace_module
 from tests.random_checkpoints import gem_shapes, matlab_netvlad, netvlad_shapes, random_checkpoint, write_matlab
 
-GOLDEN = Path(__file__).parent / "netvlad.npz"
 SAMPLES = 1000
 PATCHES = {4096: (2, 5, 8), 512: (5,), 128: (5,)}  # sizes in the three published configurations, by their outputs
 # Of Patch-NetVLAD's networks: clusters, outputs, image size, seed. The first is the quickest.

@@ -5,14 +5,12 @@
 
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
 
 from tests.golden.make_relatives import MAP, PATCHES, place_patches
 
-GOLDEN = Path(__file__).parent / "patch_scores.npz"
 WEIGHTS = (0.45, 0.15, 0.4)  # of the sizes of patches
 DIMENSION = 32
 # Of candidates, so alike that RANSAC needs no luck: how far they are moved (columns, rows), and how many of the patches

@@ -7,13 +7,11 @@ https://github.com/oravus/lostX, whose functions are called with the inputs belo
 import importlib
 import sys
 import tempfile
-from pathlib import Path
 
 import numpy as np
 
 from tests.golden.torch_networks import replace_module
 
-GOLDEN = Path(__file__).parent / "relatives.npz"
 MAP = (10, 14)  # rows and columns of a feature map, 16 px each
 PATCHES = (2, 5, 8)
 SIZE = (320, 240)

@@ -1,10 +1,7 @@
 """Makes resize.npz: what torch's resampling gives. `python -m tests.golden resize`"""
 
-from pathlib import Path
-
 import numpy as np
 
-GOLDEN = Path(__file__).parent / "resize.npz"
 SIZE = (16, 12)  # width, height
 
 

@@ -6,7 +6,6 @@
 import sys
 import types
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from tests.golden.make_netvlad import name, normalized, samples
 from tests.golden.torch_networks import fill
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes
 
-GOLDEN = Path(__file__).parent / "selavpr.npz"
 SIZE = (224, 224)
 # Whole networks of the published width, which the code fixes, with few blocks: blocks, registers, seed.
 NETWORKS = ((2, 0, 0), (2, 0, 1), (1, 4, 2))

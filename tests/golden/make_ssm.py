@@ -20,7 +20,6 @@ from PIL import Image
 from tests.golden.torch_networks import replace_module
 from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "ssm.npz"
 DATABASE, QUERIES, CANDIDATES = 5, 4, 4
 MAPS = {"maps0": 0, "maps1": 1, "maps2": 2}  # seeds, by case
 IMAGES = {"images224": (1, 224, 5, 4), "images336": (0, 336, 2, 1)}  # seed, px of the second stage, database, queries

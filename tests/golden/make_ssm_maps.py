@@ -5,7 +5,6 @@ rounding errors but its own.
 """
 
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ from mfvpr.networks.imagenet import DEVIATION, MEAN
 from tests.golden.make_d2net import samples, texture
 from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 
-GOLDEN = Path(__file__).parent / "ssm_maps.npz"
 SEEDS = (0, 1, 2)
 
 

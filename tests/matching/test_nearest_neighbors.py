@@ -198,14 +198,6 @@ def test_a_broken_descriptor_costs_its_own_matches_only(mode, value):
     assert unbroken.mask.sum() >= len(expected)
 
 
-def test_numpy_features_may_stand_in_a_compiled_closure():
-    rng = np.random.default_rng(8)
-    features0, features1 = make_features(rng, 6), make_features(rng, 7)
-    expected = match_once(features0, features1)
-    got = jax.jit(lambda query: compact(match(query, features1), 6))(features0)
-    assert got.mask.sum() == expected.mask.sum()
-
-
 def test_options_without_meaning_are_refused():
     features = make_features(np.random.default_rng(9), 3)
     with pytest.raises(ValueError, match="expected one of mutual"):

@@ -69,11 +69,6 @@ def assert_golden(golden, case, features, scores, detections, descriptors):
     np.testing.assert_allclose(np.linalg.norm(descriptors[mask], axis=1), 1, atol=1e-6)
 
 
-def test_another_variant_is_refused():
-    with pytest.raises(InputError, match=r"ALIKED: .*aliked-t16, .*got aliked-n64"):
-        Aliked("aliked-n64", rngs=nnx.Rngs(0))
-
-
 @pytest.mark.optimized
 @pytest.mark.first_case
 @pytest.mark.skipif(
@@ -262,7 +257,9 @@ def test_no_images_and_dark_images_have_no_features(unlimited):
     assert features.scores.shape == features.mask.shape == (0,)
 
 
-def test_images_too_small_or_of_another_size_are_refused(drawn):
+def test_other_variants_and_images_too_small_or_of_another_size_are_refused(drawn):
+    with pytest.raises(InputError, match=r"ALIKED: .*aliked-t16, .*got aliked-n64"):
+        Aliked("aliked-n64", rngs=nnx.Rngs(0))
     with pytest.raises(InputError, match=r"ALIKED: .*5 x 5 px .*got 60 x 4$"):
         AlikedFeatures(drawn, (60, 4))
     with pytest.raises(InputError, match=r"ALIKED: .*40 x 60 px, got 60 x 40$"):

@@ -18,6 +18,7 @@ from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
 from mfvpr.utils import InputError
 from tests import random_checkpoints
+from tests.builders import double, read_golden, stack
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
 from tests.networks.checkpoints import fill, fill_published
@@ -44,7 +45,7 @@ def small(seed=0, sure=None, dtype=np.float32):
 
 @pytest.fixture(scope="module")
 def real_golden():
-    return dict(np.load(make_lightglue_real.GOLDEN))
+    return read_golden("lightglue_real")
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +55,6 @@ def matcher():
 
 
 match_one = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
-
-
-def as_double(features):
-    return jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, features)
 
 
 def padded(features, capacity, garbage=np.nan):
@@ -92,7 +89,7 @@ def test_assignments_are_the_public_codes(golden, counts, seed):
 @pytest.mark.slow
 def test_in_double_precision_nothing_but_rounding_is_left(golden):
     with jax.enable_x64(True):
-        assignments = assigned(small(dtype=np.float64), *map(as_double, pair(SIZES[0], INPUTS, 0)))
+        assignments = assigned(small(dtype=np.float64), *map(double, pair(SIZES[0], INPUTS, 0)))
     np.testing.assert_allclose(assignments, golden[f"random/0/{SIZES[0]}"], rtol=0, atol=1e-11)
 
 
@@ -121,10 +118,9 @@ def test_a_pair_depends_neither_on_its_padding_nor_on_its_batch():
     """One that stops early does not stop others."""
     pairs = [pair(counts, INPUTS, 5) for counts in ((20, 30), (30, 12), (7, 7))]
     weights = [small(0, sure) for sure in (0, None, 1)]
-    stacked = [jax.tree.map(lambda *leaves: np.stack(leaves), *([padded(image, 40) for image in side]))
-               for side in zip(*pairs, strict=True)]  # fmt: skip
+    stacked = [stack([padded(image, 40) for image in side]) for side in zip(*pairs, strict=True)]
     together = jax.jit(jax.vmap(partial(assignment, depth_confidence=DEPTH)))
-    batch = np.asarray(together(jax.tree.map(lambda *leaves: np.stack(leaves), *weights), *stacked))
+    batch = np.asarray(together(stack(weights), *stacked))
     for number, (features0, features1) in enumerate(pairs):
         count0, count1 = len(features0.mask), len(features1.mask)
         for garbage in (np.inf, 1e30):

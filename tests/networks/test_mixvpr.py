@@ -89,13 +89,6 @@ def test_extractor_gives_the_public_codes_descriptors_and_compiles_once(model, g
     assert_same_descriptors(floats, single)
 
 
-def test_bytes_and_floats_are_preprocessed_alike():
-    byte = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 16, 16, 3)
-    np.testing.assert_array_equal(preprocess(byte), preprocess(byte.astype(np.float32)))
-    expected = (np.arange(256)[:, None] / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
-    np.testing.assert_allclose(preprocess(byte).reshape(256, 3), expected, atol=1e-6)
-
-
 def test_other_image_sizes_are_refused(model):
     with pytest.raises(ValueError, match="320 x 320 px only, got 640 x 480"):
         model(jnp.zeros((1, 480, 640, 3)))

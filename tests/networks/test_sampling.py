@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr.networks.sampling import neighbors, sample, upsample
+from mfvpr.networks.sampling import sample, upsample
 from tests.networks import aliked_oracle as oracle
 
 
@@ -30,9 +30,3 @@ def test_the_finer_grid_has_the_same_corners(dense, height, width, factor):
     x = np.linspace(0, width - 1, width * factor)
     expected = [[oracle.sampled(dense, column, row) for column in x] for row in y]
     np.testing.assert_allclose(finer, expected, atol=1e-5)
-
-
-def test_a_window_is_cut_from_the_finer_grid():
-    line, window = neighbors(10, 320), neighbors(10, 320, slice(16, 300))
-    for of_line, of_window in zip(line, window, strict=True):
-        np.testing.assert_array_equal(of_line[16:300], of_window)

@@ -42,7 +42,6 @@ def matches():
 @pytest.mark.parametrize(
     ("scorer", "axes", "rtol"),
     [
-        (HistogramOfShifts, {"sigma": [10.0, 22.5, 40.0], "bin_size": [8.0, 15.0]}, 2e-6),
         (AnchorPoints, {"window": [2, 10], "tolerance": [1.0, 3.0, 4.5]}, 2e-6),
         (AnchorPoints, {"temperature": [0.1, 0.5]}, 2e-6),
         (Strongest, {"place": [0, 1, 3]}, 1e-7),  # whole numbers stay whole
@@ -105,7 +104,6 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
         (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
         (AnchorPoints(), {"weight": [1.0]}, "expected weights such as UnitWeight"),
         (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
-        (AggregatedScore(), {"sigma": [1.0]}, "no numeric parameter"),
     ],
 )
 def test_wrong_axes_raise(matches, scorer, axes, words):

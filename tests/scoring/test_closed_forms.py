@@ -13,7 +13,6 @@ from tests.builders import SIZE, make_matches, random_matches
 pytestmark = pytest.mark.thorough
 
 histogram = jax.jit(HistogramOfShifts.histogram)
-dominant_shift = jax.jit(HistogramOfShifts.dominant_shift, static_argnames="refine")
 
 
 def test_matches_agree_within_two_deviations_along_both_axes():

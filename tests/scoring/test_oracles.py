@@ -14,7 +14,6 @@ from mfvpr import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     HistogramOfShifts,
-    MatchCount,
     RatioWeight,
     UnitWeight,
 )
@@ -136,11 +135,6 @@ def test_aggregate(matches, weight, mean, clamp):
     np.testing.assert_allclose(got, expected, rtol=2e-5)
 
 
-@given(pairs())
-def test_count(matches):
-    np.testing.assert_allclose(MatchCount()(matches), certainty(matches).sum(), rtol=1e-6)
-
-
 @given(pairs(), st.sampled_from([(15.0, 22.5), (20.0, 8.0)]))
 def test_dominant_shift(matches, sizes):
     bin_size, sigma = sizes
@@ -183,15 +177,15 @@ def test_shift_interval_is_the_middle_of_the_mass(matches, sizes, mass):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_refined_shift_is_the_mode_that_mean_shift_finds(seed):
+def test_refined_shift_is_the_mode_of_the_votes(seed):
     rng = np.random.default_rng(seed)
     points0 = rng.uniform(60, 270, (50, 2))
     points1 = points0 + rng.uniform(-50, 50, 2) + rng.normal(0, 4, (50, 2))
     matches = make_matches(points0, points1, scores0=rng.uniform(0.2, 1, 50), scores1=rng.uniform(0.2, 1, 50))
     points0, points1, weights = oracle_inputs(matches, "fs")
     scorer = HistogramOfShifts(max_bins=45)
-    expected = oracles.refined_shift(points1 - points0, weights, 22.5, scorer.dominant_shift(matches))
-    refined = np.asarray(dominant_shift(scorer, matches, refine=True))
-    np.testing.assert_allclose(refined, expected, atol=2e-3)
+    refined = np.asarray(dominant_shift(scorer, matches, refine=True), float)
     density = lambda s: np.sum(weights * np.exp(-np.sum((points1 - points0 - s) ** 2, axis=1) / (2 * 22.5**2)))  # noqa: E731
     assert density(refined) >= scorer(matches)
+    for step in ([4e-3, 0], [-4e-3, 0], [0, 4e-3], [0, -4e-3]):
+        assert density(refined) > density(refined + step)

@@ -9,15 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import (
-    Features,
-    InputError,
-    LostScore,
-    MatchCount,
-    RapidSpatialScore,
-    VisualPhrases,
-    match,
-)
+from mfvpr import Features, InputError, LostScore, RapidSpatialScore, VisualPhrases, match
 from tests import relatives_oracles as oracles
 from tests.builders import SIZE, make_matches, random_matches, real
 from tests.golden import make_relatives as public
@@ -27,12 +19,6 @@ from tests.scoring.test_oracles import certainty, pairs
 pytestmark = pytest.mark.thorough
 
 match_features = jax.jit(match)
-
-
-@pytest.fixture(scope="module")
-def golden():
-    with np.load(public.GOLDEN) as file:
-        return dict(file)
 
 
 def confident(matches):
@@ -117,13 +103,6 @@ def test_rapid_per_feature_needs_the_number_of_keypoints():
     with pytest.raises(InputError, match=r"per_feature=True: .*\(count0\), got None"):
         RapidSpatialScore(per_feature=True)(pair)
     assert RapidSpatialScore(per_feature=True)(replace(pair, count0=np.int32(4))) == pytest.approx(SIZE**2 / 2)
-
-
-def test_a_single_match_may_count_nothing():
-    """However sure it is; two that are half sure are not single."""
-    points = np.full((3, 2), 9.0)
-    for confidence, count in (([0.25, 0, 0], 0), ([1, 0, 0], 0), ([0.5, 0.5, 0], 1), ([1, 1, 0.5], 2.5)):
-        assert MatchCount(single="zero")(make_matches(points, points, confidence=confidence)) == count
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 8])
