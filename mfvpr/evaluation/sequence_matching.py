@@ -23,7 +23,7 @@ from mfvpr.storage.matches import MatchStore
 from mfvpr.storage.shards import NotYet, together
 from mfvpr.types import Shortlist
 from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.files import write_once, write_text
+from mfvpr.utils.files import replacing, write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
 
@@ -94,7 +94,7 @@ def _find_candidates(
     if not path.exists():
         shortlist, *bad = retrieve()
         arrays = {"indices": shortlist.indices, "scores": shortlist.scores, "bad": np.array(json.dumps(bad))}
-        with write_once(path) as temporary:
+        with replacing(path, once=True) as temporary:
             write_arrays(temporary, arrays, key)
     arrays = read_arrays(path, key)
     bad_queries, bad_database = map(_by_row, json.loads(str(arrays["bad"])))
