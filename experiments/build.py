@@ -17,7 +17,7 @@ from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking import Fusion
 from mfvpr.retrieval import (
     DescriptorFiles,
     ExactSearch,
@@ -204,12 +204,6 @@ def fusion(settings: dict[str, Any]) -> Fusion:
     c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
     c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
     return Fusion(c, retrieval_score, weights or {})
-
-
-def frame_correlation(settings: dict[str, Any]) -> FrameCorrelation | None:
-    """The correlation with previous queries; None without them."""
-    previous = settings["previous_queries"]
-    return FrameCorrelation(previous) if previous else None
 
 
 def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:

@@ -25,7 +25,7 @@ from mfvpr.report.evaluations import (
     write_skipped,
 )
 from mfvpr.report.shifts import write_shifts
-from mfvpr.reranking import Fusion
+from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage import NotYet
@@ -56,7 +56,13 @@ def evaluate(settings: dict[str, Any]) -> None:
         _fill_store(settings)
         return
     with run_folder.claim(settings) as folder:
-        _write_results(folder, evaluation_of(settings))
+        outcome = evaluation_of(settings)
+        run_folder.write_results(
+            folder, settings, ground_truth(outcome), text=text(outcome),
+            write=lambda new: write_run_folder(new, outcome), figures=outcome.figures,
+        )  # fmt: skip
+        if page := run_folder.report_page(folder):
+            print(f"report: {page}")
 
 
 def _fill_store(settings: dict[str, Any]) -> None:
@@ -70,15 +76,6 @@ def _fill_store(settings: dict[str, Any]) -> None:
         print(f"shard {settings['shard']}: {end}; {advice}")
 
 
-def _write_results(folder: Path, outcome: Outcome) -> None:
-    run_folder.write_results(
-        folder, outcome.settings, ground_truth(outcome), text=text(outcome),
-        write=lambda new: write_run_folder(new, outcome), figures=outcome.figures,
-    )  # fmt: skip
-    if page := run_folder.report_page(folder):
-        print(f"report: {page}")
-
-
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
@@ -87,7 +84,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     tools, images = stages.prepare(settings, watch)
     figure_queries = query_rows(settings["figures"], images.dataset)
     headline = fusion.system(main) if settings["final"] == "combined" else main
-    frames = build.frame_correlation(settings)
+    frames = FrameCorrelation(previous) if (previous := settings["previous_queries"]) else None
     cohort, fused_systems = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
         fused_systems.append(f"{main} + {COHORT}")
