@@ -12,6 +12,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation import evaluation
+from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.features import Source
 from mfvpr.report import runs
 from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table, write_confidence
@@ -152,7 +153,7 @@ def heading(outcome: Outcome) -> str:
     return (
         f"{dataset.name}{incomplete}: {queries} queries{several}{_skip_note(bad_queries)}, "
         f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
-        f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
+        f"{num_candidates(settings['candidates'], dataset.database)} candidates ({settings['retrieval']['name']}), "
         f"{settings['features']['name']} features{check}; {truth.in_words(truth.describe(settings, dataset))}"
     )
 
@@ -182,7 +183,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "retrieval": settings["retrieval"],
         "features": settings["features"],
         "matching": settings["matching"],
-        "candidates": _num_candidates(outcome),
+        "candidates": num_candidates(settings["candidates"], dataset.database),
         "queries": sum(len(sequence.images) for sequence in dataset.sequences),
         "database": len(dataset.database),
         "dataset": dataset.name,
@@ -229,10 +230,6 @@ def _recalls(report: EvaluationReport, system: str) -> list[dict[str, Any]]:
         for sequence, recall in report.parts(system)
         for index, threshold in enumerate(report.thresholds)
     ]
-
-
-def _num_candidates(outcome: Outcome) -> int:
-    return int(outcome.report.result.matched[0].candidates.indices.shape[1])
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:

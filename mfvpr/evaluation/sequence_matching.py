@@ -83,7 +83,7 @@ def _find_candidates(
     """The shortlist; all runs use that of the first shard, since near ties may come out differently elsewhere."""
 
     def retrieve() -> RetrievalResult:
-        number = _number(candidates, database)
+        number = num_candidates(candidates, database)
         retrieved = retriever.shortlist(sequence, database, number, cache)
         return validate_candidates(retrieved, type(retriever).__name__, len(sequence.images), len(database), number)
 
@@ -157,7 +157,8 @@ def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -
                      "counts as a failure")  # fmt: skip
 
 
-def _number(candidates: int | Literal["all"], database: ImageFolder) -> int:
+def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
+    """Candidates of a query: as many as the setting says, if the database has so many images."""
     return len(database) if candidates == "all" else min(int(candidates), len(database))
 
 
@@ -197,7 +198,7 @@ def matches_recipe(
         "database": cache.recipe(database, extractor),
         "query": cache.recipe(sequence.images, extractor),
         "filter": cache.recipe_of(retriever),
-        "candidates": _number(candidates, database),
+        "candidates": num_candidates(candidates, database),
         "matching": cache.recipe_of(matcher),
         "skip_bad": cache.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
