@@ -59,12 +59,8 @@ class CalibratedPredictions:
         """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
         systems = self.evaluation.result.systems if self.evaluation.thresholds else ()
         inputs = {name: self._inputs(name) for name in systems}
-        return {name: fit_confidence(values, self.correct(name)) for name, values in inputs.items()
+        return {name: fit_confidence(values, self.evaluation.hits(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
-
-    def correct(self, system: str) -> Bool[np.ndarray, " queries"]:
-        """Whether the first prediction is correct, with ground truth."""
-        return self.evaluation.hits(system)
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
@@ -90,12 +86,12 @@ class CalibratedPredictions:
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by the confidence where it is known."""
         by_kind = {"score": self.scores(system), "confidence": self.probabilities.get(system)}
-        return {by: precision_recall(values, self.correct(system), self.has_positives)
+        return {by: precision_recall(values, self.evaluation.hits(system), self.has_positives)
                 for by, values in by_kind.items() if values is not None}  # fmt: skip
 
     def reliability(self, system: str) -> Reliability:
         """Reliability of the confidence."""
-        return reliability(self.probabilities[system], self.correct(system))
+        return reliability(self.probabilities[system], self.evaluation.hits(system))
 
     def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
@@ -104,7 +100,7 @@ class CalibratedPredictions:
 
     def _cross_fitted_probability(self, system: str) -> np.ndarray:
         """Confidence on each half of the path by a fit on the other, without what shows places of both."""
-        inputs, correct = self._inputs(system), self.correct(system)
+        inputs, correct = self._inputs(system), self.evaluation.hits(system)
         probability = np.full(len(correct), np.nan)
         for half in self.path_halves():
             if np.isfinite(inputs[half.tune]).all(axis=1).any():
@@ -139,7 +135,7 @@ def _confidence_row(calibrated: CalibratedPredictions, system: str) -> list[str]
     known = 3 if np.isnan(probabilities).all() else len(percent)  # an unknown confidence has empty cells
     cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
     if calibrated.threshold is not None:
-        correct, refused = calibrated.correct(system), calibrated.refusals(system)
+        correct, refused = calibrated.evaluation.hits(system), calibrated.refusals(system)
         counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
         cells += [str(int(selection.sum())) for selection in counts]
     return cells
@@ -162,7 +158,7 @@ def _recalls_by_share(calibrated: CalibratedPredictions) -> dict[str, np.ndarray
 
 def recall_by_share(calibrated: CalibratedPredictions, system: str) -> Float[np.ndarray, " shares"]:
     """Recall at 1, by `SHARES`, of a system that re-ranks the queries with the lowest confidence of retrieval."""
-    correct_by_retrieval, correct = calibrated.correct(RETRIEVAL), calibrated.correct(system)
+    correct_by_retrieval, correct = calibrated.evaluation.hits(RETRIEVAL), calibrated.evaluation.hits(system)
     unsure = np.argsort(np.nan_to_num(calibrated.probabilities[RETRIEVAL], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(correct[unsure].astype(int) - correct_by_retrieval[unsure])])
     counts = np.round(np.array(SHARES) * len(correct)).astype(int)
