@@ -177,7 +177,7 @@ def write_confidence(folder: Path, calibrated: CalibratedPredictions, provenance
         return
     for name, table in (("confidence", confidence_table(calibrated)), ("rerank_share", share_table(calibrated))):
         write_csv(folder / f"{name}.csv", table.header, table.rows)
-    points = [[name, by, *map(number, point)] for name in evaluation.result.systems
+    points = [[name, by, *map(format_number, point)] for name in evaluation.result.systems
               for by, curve in calibrated.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
     write_confidences(folder / "confidence.json", calibrated.fitted, provenance)

@@ -16,7 +16,7 @@ import mfvpr
 from mfvpr import Matches
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet, InMemory
-from mfvpr.matching import NearestNeighborMatcher, MatchSet, batched, filter_matches
+from mfvpr.matching import MatchSet, NearestNeighborMatcher, batched, filter_matches
 from mfvpr.matching.batched import QUERIES
 from mfvpr.matching.match_set import batches, shapes, slots, split_pairs
 from mfvpr.reranking.ranking import rank_shortlist
