@@ -17,14 +17,7 @@ from mfvpr.features import Source
 from mfvpr.report import runs
 from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
-from mfvpr.report.evaluations import (
-    EvaluationReport,
-    Figure,
-    query_figures,
-    recall_table,
-    write_rankings,
-    write_skipped,
-)
+from mfvpr.report.evaluations import EvaluationReport, query_figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
@@ -48,7 +41,7 @@ class Outcome:
     calibrated: CalibratedPredictions
     parameters: dict[str, dict[str, Any]]
     histogram: HistogramOfShifts | None
-    figures: list[Figure]
+    figures: list[runs.Figure]
 
 
 def evaluate(settings: dict[str, Any]) -> None:
