@@ -10,13 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence, write_confidences
-from mfvpr.evaluation.precision import (
-    PrecisionRecall,
-    Reliability,
-    chance_calibration_error,
-    precision_recall,
-    reliability,
-)
+from mfvpr.evaluation.precision import PrecisionRecall, chance_calibration_error, precision_recall, reliability
 from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.evaluations import EvaluationReport
@@ -89,10 +83,6 @@ class CalibratedPredictions:
         return {by: precision_recall(values, self.evaluation.hits(system), self.has_positives)
                 for by, values in by_kind.items() if values is not None}  # fmt: skip
 
-    def reliability(self, system: str) -> Reliability:
-        """Reliability of the confidence."""
-        return reliability(self.probabilities[system], self.evaluation.hits(system))
-
     def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
         pairs = zip(self.evaluation.result.systems[system], self.evaluation.result.systems[RETRIEVAL], strict=True)
@@ -130,12 +120,12 @@ def confidence_table(calibrated: CalibratedPredictions) -> Table:
 def _confidence_row(calibrated: CalibratedPredictions, system: str) -> list[str]:
     percent = [value for curve in calibrated.curves(system).values()
                for value in (curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99))]  # fmt: skip
-    probabilities = calibrated.probabilities[system]
-    percent += [calibrated.reliability(system).calibration_error, chance_calibration_error(probabilities)]
+    probabilities, correct = calibrated.probabilities[system], calibrated.evaluation.hits(system)
+    percent += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
     known = 3 if np.isnan(probabilities).all() else len(percent)  # an unknown confidence has empty cells
     cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
     if calibrated.threshold is not None:
-        correct, refused = calibrated.evaluation.hits(system), calibrated.refusals(system)
+        refused = calibrated.refusals(system)
         counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
         cells += [str(int(selection.sum())) for selection in counts]
     return cells
@@ -216,7 +206,8 @@ def confidence_figures(calibrated: CalibratedPredictions) -> list[Figure]:
     curves = {name: calibrated.curves(name) for name in calibrated.evaluation.result.systems}
     figures: list[Figure] = [("precision_recall.png", partial(precision_recall_figure, curves=curves))]
     if calibrated.probabilities:
-        reliabilities = {name: calibrated.reliability(name) for name in calibrated.probabilities}
+        reliabilities = {name: reliability(values, calibrated.evaluation.hits(name))
+                         for name, values in calibrated.probabilities.items()}  # fmt: skip
         figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliabilities)))
     if recalls := _recalls_by_share(calibrated):
         figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=recalls)))
