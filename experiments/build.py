@@ -17,17 +17,10 @@ from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.retrieval import (
-    DescriptorFiles,
-    ExactSearch,
-    FeatureFiles,
-    Retrieval,
-    Retriever,
-    ShortlistFiles,
-    WhitenedSearch,
-)
+from mfvpr.reranking import Fusion
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
+from mfvpr.retrieval.search import EXACT
 from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
@@ -112,7 +105,7 @@ def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: D
         from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
 
         return SsmVoting(_network_extractor("retrieval", name, options))
-    search = ExactSearch() if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
+    search = EXACT if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
     if name == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":
@@ -204,12 +197,6 @@ def fusion(settings: dict[str, Any]) -> Fusion:
     c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
     c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
     return Fusion(c, retrieval_score, weights or {})
-
-
-def frame_correlation(settings: dict[str, Any]) -> FrameCorrelation | None:
-    """The correlation with previous queries; None without them."""
-    previous = settings["previous_queries"]
-    return FrameCorrelation(previous) if previous else None
 
 
 def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 from experiments import build, truth
 from experiments.console import tell
 from experiments.settings import SettingsError
-from experiments.stages import Images, num_candidates
+from experiments.stages import Images
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import Confidence, read_confidences
+from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.utils.versions import versions
 
@@ -51,7 +52,7 @@ def check_confidence(
     if not any(file.systems[headline].weights):
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
     recall = [] if _threshold(settings, images) in (None, file.origin.get("correct_within")) else ["recall"]
-    candidates = num_candidates(settings, images)
+    candidates = num_candidates(settings["candidates"], images.dataset.database)
     other = {name: other_settings(file.origin, name, settings, candidates) + recall for name in file.systems}
     if other[headline]:
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: "
@@ -104,7 +105,7 @@ def provenance(settings: Mapping[str, Any], images: Images, evaluation: Evaluati
         "data_fingerprint": images.fingerprints,
         "queries": sum(len(sequence.images) for sequence in evaluation.sequences),
         "correct_within": _threshold(settings, images),
-        "candidates": num_candidates(settings, images),
+        "candidates": num_candidates(settings["candidates"], images.dataset.database),
         "ground_truth": truth.describe(settings, images.dataset),
         "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.describe_settings(settings["scorer"])},
         "command": settings.get("command"),

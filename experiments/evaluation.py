@@ -12,20 +12,14 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
 from mfvpr.evaluation import evaluation
+from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.features import Source
 from mfvpr.report import runs
 from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table, write_confidence
 from mfvpr.report.differences import write_gains
-from mfvpr.report.evaluations import (
-    EvaluationReport,
-    Figure,
-    query_figures,
-    recall_table,
-    write_rankings,
-    write_skipped,
-)
+from mfvpr.report.evaluations import EvaluationReport, query_figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
-from mfvpr.reranking import Fusion
+from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage import NotYet
@@ -47,7 +41,7 @@ class Outcome:
     calibrated: CalibratedPredictions
     parameters: dict[str, dict[str, Any]]
     histogram: HistogramOfShifts | None
-    figures: list[Figure]
+    figures: list[runs.Figure]
 
 
 def evaluate(settings: dict[str, Any]) -> None:
@@ -56,7 +50,13 @@ def evaluate(settings: dict[str, Any]) -> None:
         _fill_store(settings)
         return
     with run_folder.claim(settings) as folder:
-        _write_results(folder, evaluation_of(settings))
+        outcome = evaluation_of(settings)
+        run_folder.write_results(
+            folder, settings, ground_truth(outcome), text=text(outcome),
+            write=lambda new: write_run_folder(new, outcome), figures=outcome.figures,
+        )  # fmt: skip
+        if page := run_folder.report_page(folder):
+            print(f"report: {page}")
 
 
 def _fill_store(settings: dict[str, Any]) -> None:
@@ -70,15 +70,6 @@ def _fill_store(settings: dict[str, Any]) -> None:
         print(f"shard {settings['shard']}: {end}; {advice}")
 
 
-def _write_results(folder: Path, outcome: Outcome) -> None:
-    run_folder.write_results(
-        folder, outcome.settings, ground_truth(outcome), text=text(outcome),
-        write=lambda new: write_run_folder(new, outcome), figures=outcome.figures,
-    )  # fmt: skip
-    if page := run_folder.report_page(folder):
-        print(f"report: {page}")
-
-
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
@@ -87,7 +78,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     tools, images = stages.prepare(settings, watch)
     figure_queries = query_rows(settings["figures"], images.dataset)
     headline = fusion.system(main) if settings["final"] == "combined" else main
-    frames = build.frame_correlation(settings)
+    frames = FrameCorrelation(previous) if (previous := settings["previous_queries"]) else None
     cohort, fused_systems = settings["cohort"], [main]
     if cohort is not None and fusion.members(main) == [main]:
         fused_systems.append(f"{main} + {COHORT}")
@@ -155,7 +146,7 @@ def heading(outcome: Outcome) -> str:
     return (
         f"{dataset.name}{incomplete}: {queries} queries{several}{_skip_note(bad_queries)}, "
         f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
-        f"{_num_candidates(outcome)} candidates ({settings['retrieval']['name']}), "
+        f"{num_candidates(settings['candidates'], dataset.database)} candidates ({settings['retrieval']['name']}), "
         f"{settings['features']['name']} features{check}; {truth.in_words(truth.describe(settings, dataset))}"
     )
 
@@ -185,7 +176,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
         "retrieval": settings["retrieval"],
         "features": settings["features"],
         "matching": settings["matching"],
-        "candidates": _num_candidates(outcome),
+        "candidates": num_candidates(settings["candidates"], dataset.database),
         "queries": sum(len(sequence.images) for sequence in dataset.sequences),
         "database": len(dataset.database),
         "dataset": dataset.name,
@@ -232,10 +223,6 @@ def _recalls(report: EvaluationReport, system: str) -> list[dict[str, Any]]:
         for sequence, recall in report.parts(system)
         for index, threshold in enumerate(report.thresholds)
     ]
-
-
-def _num_candidates(outcome: Outcome) -> int:
-    return int(outcome.report.result.matched[0].candidates.indices.shape[1])
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:

@@ -12,7 +12,7 @@ from experiments.stages import dataset_of
 from mfvpr.features import Aggregated
 from mfvpr.localization import Map
 from mfvpr.storage.disk import used_bytes
-from mfvpr.utils.files import printable, write_text_once
+from mfvpr.utils.files import printable, write_text
 
 SETTINGS = "settings.json"
 _FORMAT = "mfvpr map 1"
@@ -51,7 +51,7 @@ def map_of_settings(settings: Mapping[str, Any]) -> Map:
         raise SettingsError(f"map={folder}: expected a new or empty folder, or a map; name another")
     robot_map = map_of(folder, map_settings)  # before settings.json is written, since it may fail
     text = json.dumps({"format": _FORMAT} | map_settings, indent=1, ensure_ascii=False) + "\n"
-    write_text_once(folder / SETTINGS, text)
+    write_text(folder / SETTINGS, text, once=True)
     _compare(folder, map_settings)  # another process may have written it first
     return robot_map
 

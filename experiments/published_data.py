@@ -101,7 +101,6 @@ def _unreadable(side: str, folder: ImageFolder) -> list[str]:
 
 def _truth_lines(sequence: QuerySequence, queries: Contents, database: Contents) -> Iterator[str]:
     """Extent of a sequence's ground truth, and number of queries that are database images."""
-
     if sequence.truth is None:
         yield "no ground truth"
     else:

@@ -15,7 +15,7 @@ from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation import match_sequence
-from mfvpr.evaluation.sequence_matching import matches_recipe
+from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
 from mfvpr.features import Extractor, Source
 from mfvpr.matching import Matcher, MatchSet, Scales
 from mfvpr.retrieval import Retriever
@@ -96,7 +96,7 @@ def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
     _warn_of_reading(images)
     if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
         tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
-    _note_candidates(settings, num_candidates(settings, images))
+    _note_candidates(settings, num_candidates(settings["candidates"], dataset.database))
     _warn_of_weights(settings, images)
     return images
 
@@ -112,20 +112,13 @@ def match_data_set(
     return result.by_scale, result.candidates
 
 
-def recipe(tools: Tools, images: Images, num_candidates: int) -> dict[str, Any]:
+def recipe(tools: Tools, images: Images, candidates: int) -> dict[str, Any]:
     """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
     recipe = matches_recipe(
-        images.dataset, images.dataset.only, tools.extractor, tools.retriever, num_candidates, tools.matcher,
-        tools.cache,
+        images.dataset, images.dataset.only, tools.extractor, tools.retriever, candidates, tools.matcher, tools.cache,
     )  # fmt: skip
     scales = tools.extractor.scales
     return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
-
-
-def num_candidates(settings: Mapping[str, Any], images: Images) -> int:
-    """The largest number of candidates of a query."""
-    number = len(images.dataset.database)
-    return number if settings["candidates"] == "all" else min(settings["candidates"], number)
 
 
 def dataset_of(settings: dict[str, Any]) -> Dataset:

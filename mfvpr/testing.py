@@ -66,7 +66,8 @@ def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | Non
         close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
         _check_padding(score_of, pair, score, close)
         _check_order(score_of, pair, score, close)
-    _check_batch(scorer, pairs, scores, close)
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
+    close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
     if on_host(scorer):
         return
     _check_one_trace(scorer, pairs[-1], close)
@@ -118,11 +119,6 @@ def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callab
     order = np.random.default_rng(1).permutation(len(pair.mask))
     shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
     close(scorer(shuffled), score, "the order of the matches, and where padding stands among them, changes the score")
-
-
-def _check_batch(scorer: Scorer, pairs: list[Matches], scores: np.ndarray, close: Callable[..., None]) -> None:
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
-    close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
 
 
 def _check_one_trace(scorer: Scorer, pair: Matches, close: Callable[..., None]) -> None:

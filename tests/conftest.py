@@ -15,7 +15,7 @@ from hypothesis import settings
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
-from mfvpr.checkpoints.networks import blueprint, network_of
+from mfvpr.checkpoints.networks import NETWORKS, blueprint
 from mfvpr.datasets import Dataset, folder_dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
@@ -109,7 +109,7 @@ def weights(tmp_path_factory) -> Path:
         entry, source = entry_of(name), root / f"{name}.source"
         source.write_text("not published")
         plan = blueprint(entry)
-        arrays = convert(tensors, network_of(entry).table, plan.shapes)
+        arrays = convert(tensors, NETWORKS[name].table, plan.shapes)
         save(name, arrays, source, parameters=plan.parameters, folder=root)
     return root
 

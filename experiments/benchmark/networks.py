@@ -16,7 +16,7 @@ import numpy as np
 from experiments.benchmark.harness import Entry, Results, Seconds, compete
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.checkpoints.files import load
-from mfvpr.checkpoints.networks import blueprint, network_of
+from mfvpr.checkpoints.networks import NETWORKS, blueprint
 from mfvpr.datasets import read_image, resize
 from mfvpr.datasets.streets import draw_streets
 from mfvpr.features import (
@@ -164,7 +164,7 @@ def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np
     torch.backends.cudnn.benchmark = True
     module, _, function = str(contest.peer).partition(".")
     network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
-    device, table = "cuda" if torch.cuda.is_available() else "cpu", network_of(entry_of(contest.checkpoint)).table
+    device, table = "cuda" if torch.cuda.is_available() else "cpu", NETWORKS[contest.checkpoint].table
 
     def run_with(layout: torch.memory_format) -> Callable[[list[np.ndarray]], list[Any]]:
         weights = torch_weights(arrays, table, device, layout)

@@ -42,10 +42,6 @@ class SyntheticSet:
         rows = np.random.default_rng([self.images, self.queries]).permutation(self.images)
         return rows[: self.queries * VIEWS].reshape(self.queries, VIEWS)
 
-    def query_by_row(self) -> dict[int, int]:
-        """Row of a database image -> the query of the same place, if there is one."""
-        return {row: query for query, rows in enumerate(self.similar().tolist()) for row in rows}
-
     def query(self, row: int) -> Features:
         """Features `[N, ...]` of a query."""
         rng = np.random.default_rng([0, row])
@@ -74,10 +70,10 @@ class SyntheticSet:
 
     def stores(self, root: Path) -> tuple[FeatureStore, FeatureStore]:
         """Complete stores of queries and database below `root`; missing features are made first."""
-        queries = self.query_by_row()
+        query_of = {row: query for query, rows in enumerate(self.similar().tolist()) for row in rows}
         return (
             self._complete_store(root, "queries", self.queries, self.query),
-            self._complete_store(root, "database", self.images, lambda row: self.image(row, queries.get(row))),
+            self._complete_store(root, "database", self.images, lambda row: self.image(row, query_of.get(row))),
         )
 
     def _complete_store(self, root: Path, side: str, total: int, make: Callable[[int], Features]) -> FeatureStore:

@@ -2,19 +2,18 @@
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import hydra
 import jax
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments import evaluation, run_folder
+from experiments.overrides import compose_program
 from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
-from experiments.settings import CONF, SettingsError, check
+from experiments.settings import SettingsError, check
 from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.report.runs import write_json
 from mfvpr.utils.files import remove_leftovers
@@ -49,9 +48,7 @@ def lock_output(out: Path) -> Iterator[None]:
 def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The checked settings of an evaluation."""
     chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
-    running = GlobalHydra.instance().is_initialized()
-    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed: Any = OmegaConf.to_container(hydra.compose("config", chosen), resolve=True)
+    composed: Any = OmegaConf.to_container(compose_program("config", chosen), resolve=True)
     composed |= {name: settings[name] for name in _SHARED}
     composed["out"] = str(folder_of(run, place, settings))
     check(composed)

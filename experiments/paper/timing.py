@@ -36,7 +36,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     """
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
     number = min(QUERIES, len(sequence.images))
-    candidates = min(int(settings["candidates"]), len(dataset.database)) if settings["candidates"] != "all" else "all"
+    candidates = settings["candidates"]
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
     extractor = build.extractor(settings["features"], None)

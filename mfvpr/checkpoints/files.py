@@ -13,7 +13,7 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.checkpoints.conversion import convert, is_ignored
-from mfvpr.checkpoints.networks import blueprint, network_of, resemblance
+from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
 from mfvpr.checkpoints.registry import REGISTRY, Entry, entry_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, write_text
@@ -62,7 +62,7 @@ def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
     entry = entry_of(name)
-    network = network_of(entry)
+    network = NETWORKS[name]
     require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
     check_published(checkpoint, entry)
     tensors = read_checkpoint(checkpoint)

@@ -98,10 +98,6 @@ class Blueprint:
         return module
 
 
-def network_of(entry: Entry) -> Network:
-    return NETWORKS[entry.name]
-
-
 def resemblance(keys: Sequence[str], expected: Network) -> str | None:
     """Reason why keys do not fit: they are another network's, or have a prefix; None = neither."""
     if known_share(keys, expected.table) > _LIKELY_SHARE:
@@ -118,7 +114,7 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
 
 def blueprint(entry: Entry) -> Blueprint:
     """Blueprint of the entry's network."""
-    return plan_network(network_of(entry).builder())  # imports before tracing, which would trace the module's constants
+    return plan_network(NETWORKS[entry.name].builder())  # imports first: tracing would trace the module's constants
 
 
 def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:

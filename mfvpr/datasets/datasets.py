@@ -90,11 +90,6 @@ class Dataset:
         """Ground truth of the only sequence."""
         return self.only.truth
 
-    @property
-    def excluded(self) -> Positives | None:
-        """Excluded database images of the only sequence."""
-        return self.only.excluded
-
 
 def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
     """All images below `root`, in subfolders and linked folders as well; hidden files and folders are skipped.

@@ -23,7 +23,7 @@ from mfvpr.storage.matches import MatchStore
 from mfvpr.storage.shards import NotYet, together
 from mfvpr.types import Shortlist
 from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.files import write_once, write_text
+from mfvpr.utils.files import replacing, write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
 
@@ -83,7 +83,7 @@ def _find_candidates(
     """The shortlist; all runs use that of the first shard, since near ties may come out differently elsewhere."""
 
     def retrieve() -> RetrievalResult:
-        number = _number(candidates, database)
+        number = num_candidates(candidates, database)
         retrieved = retriever.shortlist(sequence, database, number, cache)
         return validate_candidates(retrieved, type(retriever).__name__, len(sequence.images), len(database), number)
 
@@ -94,7 +94,7 @@ def _find_candidates(
     if not path.exists():
         shortlist, *bad = retrieve()
         arrays = {"indices": shortlist.indices, "scores": shortlist.scores, "bad": np.array(json.dumps(bad))}
-        with write_once(path) as temporary:
+        with replacing(path, once=True) as temporary:
             write_arrays(temporary, arrays, key)
     arrays = read_arrays(path, key)
     bad_queries, bad_database = map(_by_row, json.loads(str(arrays["bad"])))
@@ -157,7 +157,8 @@ def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -
                      "counts as a failure")  # fmt: skip
 
 
-def _number(candidates: int | Literal["all"], database: ImageFolder) -> int:
+def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
+    """Candidates of a query: as many as the setting says, if the database has so many images."""
     return len(database) if candidates == "all" else min(int(candidates), len(database))
 
 
@@ -197,7 +198,7 @@ def matches_recipe(
         "database": cache.recipe(database, extractor),
         "query": cache.recipe(sequence.images, extractor),
         "filter": cache.recipe_of(retriever),
-        "candidates": _number(candidates, database),
+        "candidates": num_candidates(candidates, database),
         "matching": cache.recipe_of(matcher),
         "skip_bad": cache.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),

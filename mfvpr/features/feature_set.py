@@ -8,7 +8,7 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, Protocol
 
 import jax
@@ -249,12 +249,10 @@ def empty_slots(rows: Features, number: int) -> Features:
     return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
 
 
+@partial(compiled, donate_argnums=0)  # the arrays may be as large as the memory allows
 def write_slots(arrays: Features, slots: Int[Array, " rows"], rows: Features) -> Features:
     """Write rows `[R, N, ...]` to slots in place; rows with a slot beyond the last are dropped."""
     return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
-
-
-write_slots = compiled(write_slots, donate_argnums=0)  # the arrays may be as large as the memory allows
 
 
 def stack_features(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:

@@ -40,7 +40,10 @@ def write_features(
         write_npz(path, ((f"{name}/{part}", array) for name, arrays in parts for part, array in arrays.items()))
     else:
         for name, arrays in parts:
-            write_npz(path / f"{_below(name)}.npz", arrays.items())
+            inside = PurePosixPath(name)
+            if not inside.parts or inside.is_absolute() or ".." in inside.parts:
+                raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
+            write_npz(path / f"{name}.npz", arrays.items())
 
 
 def convert_floats(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
@@ -65,11 +68,3 @@ def _parts(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:
         for part in ("keypoints", "descriptors", "scores")
     }
     return arrays | {"image_size": size.astype(np.int64) if (size == np.round(size)).all() else size}
-
-
-def _below(name: str) -> str:
-    """The name, if it is a path below the folder; raises an InputError otherwise."""
-    parts = PurePosixPath(name).parts
-    if not parts or PurePosixPath(name).is_absolute() or ".." in parts:
-        raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
-    return name

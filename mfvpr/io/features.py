@@ -145,12 +145,15 @@ def open_features(
     for image, row in rows.items():
         counts[row] = _count(f"{path}: {shorten(image)}", contents[image], needs_size=sizes is None)
     transposed, dimension = _layout(path, contents, container.transposed)
+    without = [image for image, parts in contents.items() if _score_part(parts.names) is None]
+    if without and len(without) < len(contents):  # a missing score would become 1
+        raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
     return ImportedFeatures(
         path=path,
         paths=tuple(dict.fromkeys(container.entry(image).file for image in rows)),
         counts=counts,
         dimension=dimension,
-        scored=_has_scores(path, contents),
+        scored=not without,
         _container=container,
         _images=tuple(images),
         _transposed=transposed,
@@ -213,14 +216,6 @@ def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tupl
 
 def _score_part(parts: Collection[str]) -> str | None:
     return next((part for part in SCORES if part in parts), None)
-
-
-def _has_scores(path: Path, contents: Mapping[str, Contents]) -> bool:
-    """Whether all images have scores; some only is an error, since a missing score becomes 1."""
-    without = [image for image, parts in contents.items() if _score_part(parts.names) is None]
-    if without and len(without) < len(contents):
-        raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
-    return not without
 
 
 def _explicit_sizes(image_size: Any, count: int) -> Float32[np.ndarray, "images 2"]:

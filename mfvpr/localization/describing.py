@@ -56,11 +56,11 @@ class Describing:
         self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
     ) -> Iterator[dict[int, Described]]:
         """Describe some images of a folder: batches of descriptions by row; raises as `image`."""
-        for batch in _batches(images, self.extractor, rows, track):
+        for batch in batches(images, self.extractor, rows, track):
             features = [round_as_stored(description.features) for description in batch.values()]
             descriptions = [*batch.values()]
             for describer in self._extractors[1:]:
-                parts = _batches(images, describer, [*batch], no_progress)
+                parts = batches(images, describer, [*batch], no_progress)
                 descriptions = [description for part in parts for description in part.values()]
             vectors = self._vectors(features, descriptions)
             yield dict(zip(batch, zip(features, vectors, strict=True), strict=True))
@@ -106,12 +106,6 @@ def _pixels(image: Any) -> np.ndarray:
     return pixels
 
 
-def extract_local_features(images: ImageFolder, extractor: Extractor, track: Track = no_progress) -> Iterator[Features]:
-    """Extract the local features of all images of a folder."""
-    for batch in _batches(images, extractor, range(len(images)), track):
-        yield from (round_as_stored(description.features) for description in batch.values())
-
-
 def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
     [description] = describe_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
     if description is None:
@@ -119,9 +113,10 @@ def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description
     return description
 
 
-def _batches(
+def batches(
     images: ImageFolder, extractor: Extractor, rows: Sequence[int], track: Track
 ) -> Iterator[dict[int, Description]]:
+    """Batches of descriptions by row; an image that is not finite raises an InputError, too."""
     bad: dict[int, str] = {}
     for batch in describe_folder(images, extractor, rows, bad, track=track):
         if bad:

@@ -53,16 +53,12 @@ class Vectors:
         rows = np.flatnonzero(self._is_candidate[:total])
         if not len(rows) or not query.any():
             return rows[:0], np.zeros(0, np.float32)
-        products = _products(self._values[:total], query)
+        # Own threads: those of BLAS spin while they wait, which costs a third of the time.
+        workers = available_cpus()
+        parts = np.array_split(self._values[:total], workers)
+        products = np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])
         if len(rows) > number:
             least = np.partition(products[rows], -number)[-number]
             rows = rows[products[rows] >= least]
         best = rows[np.argsort(-products[rows], kind="stable")][:number]
         return best, products[best]
-
-
-def _products(vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """`vectors @ query` on own threads: BLAS threads spin while they wait, which costs a third of the time."""
-    workers = available_cpus()
-    parts = np.array_split(vectors, workers)
-    return np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])

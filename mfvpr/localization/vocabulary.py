@@ -1,6 +1,5 @@
 """The vocabulary of a map whose global descriptors are VLAD: one file in the folder of the map, learned once."""
 
-import itertools
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,9 +12,9 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Extractor
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.describing import extract_local_features
+from mfvpr.localization.describing import batches
 from mfvpr.storage.disk import disk_errors_as_input_errors
-from mfvpr.storage.features import FeatureStore, open_store
+from mfvpr.storage.features import FeatureStore, open_store, round_as_stored
 from mfvpr.storage.maps import MAP, file_stamp, has_rows, write_settings
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
@@ -76,9 +75,8 @@ class VocabularyFile:
         shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed
         try:
             with open_store(folder, settings, num_images=len(images)) as store:
-                features = enumerate(extract_local_features(images, self._extractor, track))
-                while batch := dict(itertools.islice(features, self._extractor.batch_size)):
-                    store.write(batch)
+                for batch in batches(images, self._extractor, range(len(images)), track):
+                    store.write({row: round_as_stored(description.features) for row, description in batch.items()})
             vocabulary = self._fitting.fit(FeatureSet(store, {}))
             write_settings(self._folder, settings)
             with disk_errors_as_input_errors(self._folder, MAP.content):

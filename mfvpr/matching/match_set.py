@@ -97,8 +97,10 @@ class MatchSet:
         rows = [self._row(by_query[query], query, place) for query, place in pairs]
         entries, mask = ragged.pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
-            values = np.stack([_pair_value(by_query[query], name, place) for query, place in pairs])
-            entries[name] = ragged.repeat_last(values, len(mask))
+            values = [getattr(by_query[query], name) for query, _ in pairs]
+            if name.endswith("1"):  # of all candidates
+                values = [of_query[place] for of_query, (_, place) in zip(values, pairs, strict=True)]
+            entries[name] = ragged.repeat_last(np.stack(values), len(mask))
         return Matches(**entries, mask=mask)
 
     @cached_property
@@ -152,11 +154,6 @@ class Scales:
         """Image sizes of all scales, see `MatchSet.image_sizes`."""
         sizes0, sizes1 = zip(*(match_set.image_sizes for match_set in self.match_sets), strict=True)
         return np.concatenate(sizes0), np.concatenate(sizes1)
-
-
-def _pair_value(matches: Matches, name: str, place: int) -> np.ndarray:
-    values = getattr(matches, name)
-    return values if name.endswith("0") else values[place]
 
 
 def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:

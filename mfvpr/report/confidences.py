@@ -10,13 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence, write_confidences
-from mfvpr.evaluation.precision import (
-    PrecisionRecall,
-    Reliability,
-    chance_calibration_error,
-    precision_recall,
-    reliability,
-)
+from mfvpr.evaluation.precision import PrecisionRecall, chance_calibration_error, precision_recall, reliability
 from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.evaluations import EvaluationReport
@@ -59,12 +53,8 @@ class CalibratedPredictions:
         """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
         systems = self.evaluation.result.systems if self.evaluation.thresholds else ()
         inputs = {name: self._inputs(name) for name in systems}
-        return {name: fit_confidence(values, self.correct(name)) for name, values in inputs.items()
+        return {name: fit_confidence(values, self.evaluation.hits(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
-
-    def correct(self, system: str) -> Bool[np.ndarray, " queries"]:
-        """Whether the first prediction is correct, with ground truth."""
-        return self.evaluation.hits(system)
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
@@ -90,12 +80,8 @@ class CalibratedPredictions:
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by the confidence where it is known."""
         by_kind = {"score": self.scores(system), "confidence": self.probabilities.get(system)}
-        return {by: precision_recall(values, self.correct(system), self.has_positives)
+        return {by: precision_recall(values, self.evaluation.hits(system), self.has_positives)
                 for by, values in by_kind.items() if values is not None}  # fmt: skip
-
-    def reliability(self, system: str) -> Reliability:
-        """Reliability of the confidence."""
-        return reliability(self.probabilities[system], self.correct(system))
 
     def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
@@ -104,7 +90,7 @@ class CalibratedPredictions:
 
     def _cross_fitted_probability(self, system: str) -> np.ndarray:
         """Confidence on each half of the path by a fit on the other, without what shows places of both."""
-        inputs, correct = self._inputs(system), self.correct(system)
+        inputs, correct = self._inputs(system), self.evaluation.hits(system)
         probability = np.full(len(correct), np.nan)
         for half in self.path_halves():
             if np.isfinite(inputs[half.tune]).all(axis=1).any():
@@ -134,12 +120,12 @@ def confidence_table(calibrated: CalibratedPredictions) -> Table:
 def _confidence_row(calibrated: CalibratedPredictions, system: str) -> list[str]:
     percent = [value for curve in calibrated.curves(system).values()
                for value in (curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99))]  # fmt: skip
-    probabilities = calibrated.probabilities[system]
-    percent += [calibrated.reliability(system).calibration_error, chance_calibration_error(probabilities)]
+    probabilities, correct = calibrated.probabilities[system], calibrated.evaluation.hits(system)
+    percent += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
     known = 3 if np.isnan(probabilities).all() else len(percent)  # an unknown confidence has empty cells
     cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
     if calibrated.threshold is not None:
-        correct, refused = calibrated.correct(system), calibrated.refusals(system)
+        refused = calibrated.refusals(system)
         counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
         cells += [str(int(selection.sum())) for selection in counts]
     return cells
@@ -162,7 +148,7 @@ def _recalls_by_share(calibrated: CalibratedPredictions) -> dict[str, np.ndarray
 
 def recall_by_share(calibrated: CalibratedPredictions, system: str) -> Float[np.ndarray, " shares"]:
     """Recall at 1, by `SHARES`, of a system that re-ranks the queries with the lowest confidence of retrieval."""
-    correct_by_retrieval, correct = calibrated.correct(RETRIEVAL), calibrated.correct(system)
+    correct_by_retrieval, correct = calibrated.evaluation.hits(RETRIEVAL), calibrated.evaluation.hits(system)
     unsure = np.argsort(np.nan_to_num(calibrated.probabilities[RETRIEVAL], nan=-1.0), kind="stable")
     gains = np.concatenate([[0], np.cumsum(correct[unsure].astype(int) - correct_by_retrieval[unsure])])
     counts = np.round(np.array(SHARES) * len(correct)).astype(int)
@@ -220,7 +206,8 @@ def confidence_figures(calibrated: CalibratedPredictions) -> list[Figure]:
     curves = {name: calibrated.curves(name) for name in calibrated.evaluation.result.systems}
     figures: list[Figure] = [("precision_recall.png", partial(precision_recall_figure, curves=curves))]
     if calibrated.probabilities:
-        reliabilities = {name: calibrated.reliability(name) for name in calibrated.probabilities}
+        reliabilities = {name: reliability(values, calibrated.evaluation.hits(name))
+                         for name, values in calibrated.probabilities.items()}  # fmt: skip
         figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliabilities)))
     if recalls := _recalls_by_share(calibrated):
         figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=recalls)))

@@ -83,14 +83,13 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
         correct_by_system = [np.asarray(evaluation.is_correct(system, part), bool) for system in systems]
         lines = []
         for query, name in enumerate(sequence.images.names):
-            cells = [cell for correct in correct_by_system for cell in _hit_and_rank(correct[query])]
+            cells: list[int | str] = []
+            for correct in correct_by_system:
+                rank = int(np.argmax(correct[query])) + 1 if correct[query].any() else ""
+                cells += [int(correct[query, 0]), rank]
             lines.append([name, int(places_by_sequence[part][query]), *cells])
         write_csv(evaluation.folder(folder, part) / "gains.csv", header, lines)
     tests = differences(evaluation)
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"]
     write_csv(folder / "differences.csv", header, [test.cells for test in tests])
     write_text(folder / "differences.md", _table(systems, tests).markdown())
-
-
-def _hit_and_rank(correct: np.ndarray) -> tuple[int, int | str]:
-    return int(correct[0]), int(np.argmax(correct)) + 1 if correct.any() else ""

@@ -22,10 +22,10 @@ from mfvpr.types import Array, Matches
 from mfvpr.utils.numerics import (
     available_cpus,
     compiled,
+    device_of,
     holds_function,
     is_concrete,
     knows_own_context,
-    platform,
     with_static_functions,
 )
 
@@ -210,7 +210,7 @@ def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
     settings of JAX that threads do not inherit.
     """
     cores, count = available_cpus(), len(matches.mask)
-    if cores == 1 or count < 4 * cores or platform(matches) != "cpu" or not knows_own_context():
+    if cores == 1 or count < 4 * cores or device_of(matches).platform != "cpu" or not knows_own_context():
         return function(matches)
     size = -(-count // cores)
     starts = [min(core * size, count - size) for core in range(cores)]  # one size, one program; parts may overlap

@@ -14,24 +14,11 @@ _TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` 
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error."""
-    with _beside(path) as temporary:
-        yield temporary
-        os.replace(temporary, path)
+def replacing(path: Path, *, once: bool = False) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error.
 
-
-@contextmanager
-def write_once(path: Path) -> Iterator[Path]:
-    """As `replacing`, but an existing file stays: of several processes at the same time, the first counts."""
-    with _beside(path) as temporary:
-        yield temporary
-        with suppress(FileExistsError):
-            os.link(temporary, path)
-
-
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
+    If `once`, an existing file stays: of several processes at the same time, the first counts.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.fchmod(handle, 0o644)  # mkstemp's 0600 would surprise whoever shares the folder
@@ -39,6 +26,11 @@ def _beside(path: Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
+        if once:
+            with suppress(FileExistsError):
+                os.link(temporary, path)
+        else:
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -71,15 +63,9 @@ def clip_middle(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
 
 
-def write_text_once(path: Path, text: str) -> None:
-    """Write `printable` text unless the file exists."""
-    with write_once(path) as temporary:
-        temporary.write_text(printable(text), encoding="utf-8")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write `printable` text as UTF-8, atomically."""
-    with replacing(path) as temporary:
+def write_text(path: Path, text: str, *, once: bool = False) -> None:
+    """Write `printable` text as UTF-8, atomically; if `once`, only if there is no file."""
+    with replacing(path, once=once) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
 
 

@@ -208,11 +208,6 @@ def free_host_bytes() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def platform(tree: Any) -> str:
-    """Platform of the first array, "cpu" or "gpu"; without arrays, JAX's default."""
-    return device_of(tree).platform
-
-
 def device_of(tree: Any) -> Device:
     """Device of the first array; without arrays, JAX's default."""
     for leaf in jax.tree.leaves(tree):

@@ -143,27 +143,23 @@ def precision_charts(curves: Curves, by: str = "score", words: str = "by the sco
     return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
 
 
-def paired_tests_table(kind: str, lines: Sequence[Sequence[str]]) -> Table:
-    """Paired tests of systems or of runs (`kind`), of lines as in `differences.csv`."""
-    rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(line)]
-            for line in lines]  # fmt: skip
-    columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
-    return Table(columns, rows, text_columns=2)
-
-
-def paired_tests_words(kind: str) -> str:
-    """The explanation of `paired_tests_table`."""
-    return (
+def paired_tests(kind: str, lines: Sequence[Sequence[str]]) -> tuple[str, Table]:
+    """Explanation and table of paired tests of systems or of runs (`kind`), of lines as in `differences.csv`."""
+    words = (
         f"How many queries only one of two {kind}s predicts correctly, and how probable that is if neither is better, "
         "by McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
     )
+    rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(line)]
+            for line in lines]  # fmt: skip
+    columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
+    return words, Table(columns, rows, text_columns=2)
 
 
 def _differences_section(run: Run) -> Iterator[Section]:
     table = run.tables.get("differences.csv")
     if table and table.rows:
-        tables = {"Every two systems": paired_tests_table("system", table.rows)}
-        yield Section("differences", "Differences", paired_tests_words("system"), tables=tables)
+        words, tests = paired_tests("system", table.rows)
+        yield Section("differences", "Differences", words, tables={"Every two systems": tests})
 
 
 def _confidence_section(run: Run) -> Iterator[Section]:

@@ -14,8 +14,7 @@ from mfvpr.report.pages.one_run import (
     depths_chart,
     description,
     flat,
-    paired_tests_table,
-    paired_tests_words,
+    paired_tests,
     precision_charts,
     recall_bar,
     tolerance_charts,
@@ -109,10 +108,11 @@ def _pairs(runs: Mapping[str, Run]) -> Section:
         pair = run.all_gains.hits(run.headline), second.all_gains.hits(second.headline)
         tests = mcnemar(*pair), block_sign_flips(*pair, places=np.sort(run.all_gains.places))
         rows.append(Difference(f"{label}: {run.headline}", f"{other}: {second.headline}", *tests).cells)
-    tables = {"Every two runs of the same queries": paired_tests_table("run", rows)} if rows else {}
+    words, tests = paired_tests("run", rows)
+    tables = {"Every two runs of the same queries": tests} if rows else {}
     if incomparable:
         tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)
-    return Section("pairs", "Every two runs", paired_tests_words("run"), tables=tables)
+    return Section("pairs", "Every two runs", words, tables=tables)
 
 
 def _settings(runs: Mapping[str, Run]) -> Section:

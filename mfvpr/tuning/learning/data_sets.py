@@ -13,6 +13,7 @@ from mfvpr.evaluation.selection import Half
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.types import Matches, Shortlist, per_pair
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.ragged import repeat_last
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,4 @@ class _Chain(Sequence[Matches]):
         part = self._parts[number]
         matches = part[query - int(self._ends[number]) + len(part)]
         of_candidates = {name: values for name, values in per_pair(matches).items() if name.endswith("1")}
-        return replace(matches, **{name: self._pad_candidates(values) for name, values in of_candidates.items()})
-
-    def _pad_candidates(self, values: np.ndarray) -> np.ndarray:
-        """Pad `[C, ...]` to `[width, ...]` by repeating the last candidate."""
-        return np.pad(values, [(0, self._width - len(values)), *[(0, 0)] * (values.ndim - 1)], mode="edge")
+        return replace(matches, **{name: repeat_last(values, self._width) for name, values in of_candidates.items()})

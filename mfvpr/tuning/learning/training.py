@@ -147,22 +147,19 @@ class _Training:
             state, loss = self.advance(state, step)
             losses = [*losses, loss]
             if is_due := (step + 1) % self.every == 0:
-                state, history, losses = self.add_record(state, history, losses)
+                (state, history), losses = self.add_record(state, history, losses), []
             if self.folder and (is_due or step + 1 == self.steps):
                 checkpoints.save_checkpoint(self.folder, step + 1, self.recipe, state, (history, losses))
             if _out_of_patience(history, self.patience):
                 break
-        if losses:  # after the checkpoint: a training of more steps would not validate here
-            state, history, _ = self.add_record(state, history, losses)
-        return state, history
+        # After the checkpoint: a training of more steps would not validate here.
+        return self.add_record(state, history, losses) if losses else (state, history)
 
-    def add_record(
-        self, state: _State, history: list[Record], losses: list[float]
-    ) -> tuple[_State, list[Record], list[float]]:
-        """Validate; return the state with the best parameters so far, the history, and no losses."""
+    def add_record(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
+        """Validate; return the state with the best parameters so far, and the history."""
         step = history[-1].step + len(losses)
         history = [*history, Record(step, float(np.mean(losses)), self.validation(state.parameters, step))]
-        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history, []
+        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history
 
     def advance(self, state: _State, step: int) -> tuple[_State, float]:
         """Do one step; return the loss before it as well."""
