@@ -26,7 +26,7 @@ from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.storage import FeatureCache, Shard
-from mfvpr.utils import recipe_of
+from mfvpr.utils import Runtime, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
 # Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
@@ -178,18 +178,18 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["cache"] is None else expand_user(settings["cache"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
-    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", track=console.track, tell=console.tell,
-                        wait=settings.get("multirun", False), shard=shard)  # fmt: skip
+    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", wait=settings.get("multirun", False),
+                        shard=shard, runtime=runtime(settings))  # fmt: skip
 
 
-def where(settings: dict[str, Any]) -> dict[str, Any]:
-    """Memory and devices."""
+def runtime(settings: dict[str, Any]) -> Runtime:
+    """Devices, memory, progress and messages."""
     import jax
 
     devices, number = jax.local_devices(), settings["devices"]
     if number != "all" and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
-    return {"memory": settings["memory"], "devices": devices if number == "all" else devices[:number]}
+    return Runtime(devices if number == "all" else devices[:number], settings["memory"], console.track, console.tell)
 
 
 def fusion(settings: dict[str, Any]) -> Fusion:

@@ -1,7 +1,7 @@
 """Evaluate: images -> features -> shortlist and matches -> scores -> rankings -> recall, in a run folder."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from experiments.stages import Images, Tools
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
-from mfvpr.evaluation import evaluation
+from mfvpr.evaluation import System, evaluation
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.features import Source
 from mfvpr.report import runs
@@ -84,12 +84,10 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
         fused_systems.append(f"{main} + {COHORT}")
     fusions = {name: fusion.rename_main(main, name) for name in fused_systems}
     confidence = confidences.check_confidence(confidence, headline, settings, images)
-    result = evaluation.evaluate(
-        images.dataset, tools.extractor, tools.retriever, scorers, candidates=settings["candidates"],
-        matcher=tools.matcher, fused=fusions, cohort=cohort,
-        correlated={headline: frames} if frames else {}, ties=settings["ties"], cache=tools.cache, watch=watch,
-        **tools.where,
-    )  # fmt: skip
+    correlated = {headline: frames} if frames else {}
+    system = System(tools.pipeline, scorers, fusions, correlated, cohort, settings["ties"])
+    result = evaluation.evaluate(images.dataset, system, cache=tools.cache)
+    result = replace(result, seconds=watch.seconds | result.seconds)
     parameters = _parameters(settings, main, fusions)
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
@@ -98,7 +96,8 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     histogram = scorers.get("histogram")
     histogram = histogram if isinstance(histogram, HistogramOfShifts) else None
     calibrated = CalibratedPredictions(report, confidence and confidence.systems, settings["threshold"])
-    all_figures = query_figures(report, tools.extractor, figure_queries, calibrated.refused_of_headline, histogram)
+    extractor, refused = tools.pipeline.extractor, calibrated.refused_of_headline
+    all_figures = query_figures(report, extractor, figure_queries, refused, histogram)
     all_figures += confidence_figures(calibrated) if figure_queries else []
     deciding = histogram if main == "histogram" else None
     return Outcome(settings, images, tools, report, calibrated, parameters, deciding, all_figures)
@@ -203,7 +202,7 @@ def result_rows(outcome: Outcome) -> list[dict[str, Any]]:
 
 def _bytes_per_image(outcome: Outcome) -> int | None:
     """Expected bytes of an image's features on disk; None for imported features, which are not stored."""
-    extractor = outcome.tools.extractor
+    extractor = outcome.tools.pipeline.extractor
     if isinstance(extractor, Source):
         return None
     return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))

@@ -90,9 +90,9 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     tools, images = stages.prepare(settings, watch)
     protocol = truth.evaluation_protocol(settings, images.dataset)
-    matches, candidates = stages.match_data_set(settings, tools, images, watch)
+    matches, candidates = stages.match_data_set(tools, images, watch)
     assert not isinstance(matches, Scales)
-    recipe = stages.recipe(tools, images, candidates.mask.shape[1])
+    recipe = stages.recipe(tools, images)
     part = Part(label(settings["dataset"]), protocol, matches, candidates)
     return Prepared(part, images, recipe, truth.describe(settings, images.dataset))
 

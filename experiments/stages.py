@@ -14,11 +14,9 @@ from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.datasets.truth import threshold_words
-from mfvpr.evaluation import match_sequence
+from mfvpr.evaluation import Pipeline, match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
-from mfvpr.features import Extractor, Source
-from mfvpr.matching import Matcher, MatchSet, Scales
-from mfvpr.retrieval import Retriever
+from mfvpr.matching import MatchSet, Scales
 from mfvpr.scoring.weight_registry import provenance
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
@@ -48,13 +46,10 @@ class Images:
 
 @dataclass(frozen=True)
 class Tools:
-    """Extractor, retrieval and matcher, and the cache of their results."""
+    """A pipeline, and the cache of its results."""
 
-    extractor: Extractor | Source
-    retriever: Retriever
-    matcher: Matcher
+    pipeline: Pipeline
     cache: FeatureCache
-    where: Mapping[str, Any]  # memory and devices
 
 
 def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
@@ -72,8 +67,9 @@ def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
     extractor = build.extractor(settings["features"], dataset)
-    retrieval = build.retriever(settings["retrieval"], extractor, dataset)
-    return Tools(extractor, retrieval, build.matcher(settings["matching"]), cache, build.where(settings))
+    retriever = build.retriever(settings["retrieval"], extractor, dataset)
+    matcher = build.matcher(settings["matching"])
+    return Tools(Pipeline(extractor, retriever, matcher, settings["candidates"]), cache)
 
 
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
@@ -101,23 +97,16 @@ def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
     return images
 
 
-def match_data_set(
-    settings: dict[str, Any], tools: Tools, images: Images, watch: Stopwatch
-) -> tuple[MatchSet | Scales, Shortlist]:
+def match_data_set(tools: Tools, images: Images, watch: Stopwatch) -> tuple[MatchSet | Scales, Shortlist]:
     """Matches and shortlist of the only sequence, from their store if it has all of them."""
-    result = match_sequence(
-        images.dataset, images.dataset.only, tools.extractor, tools.retriever, settings["candidates"],
-        matcher=tools.matcher, cache=tools.cache, watch=watch, **tools.where,
-    )  # fmt: skip
+    result = match_sequence(images.dataset, images.dataset.only, tools.pipeline, cache=tools.cache, watch=watch)
     return result.by_scale, result.candidates
 
 
-def recipe(tools: Tools, images: Images, candidates: int) -> dict[str, Any]:
+def recipe(tools: Tools, images: Images) -> dict[str, Any]:
     """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
-    recipe = matches_recipe(
-        images.dataset, images.dataset.only, tools.extractor, tools.retriever, candidates, tools.matcher, tools.cache,
-    )  # fmt: skip
-    scales = tools.extractor.scales
+    recipe = matches_recipe(images.dataset, images.dataset.only, tools.pipeline, tools.cache)
+    scales = tools.pipeline.extractor.scales
     return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
 
 

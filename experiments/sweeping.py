@@ -9,7 +9,6 @@ from experiments.axes import require_memory, search_axes, with_final_axis
 from mfvpr.report import runs, sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome
-from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import fingerprint
@@ -23,12 +22,12 @@ def sweep(settings: dict[str, Any]) -> None:
         axes, watch = search_axes(settings), Stopwatch()
         tools, images = stages.prepare(settings, watch)
         protocol = truth.evaluation_protocol(settings, images.dataset)
-        matches, candidates = stages.match_data_set(settings, tools, images, watch)
-        blocks = _block_folder(settings, tools, images, candidates)
+        matches, candidates = stages.match_data_set(tools, images, watch)
+        blocks = _block_folder(settings, tools, images)
         options = {
             "ks": settings["recall"]["ks"], "ties": settings["ties"],
             "retrieval_score": settings["fusion"]["retrieval_score"], "folder": blocks, "track": console.track,
-            "devices": tools.where["devices"],
+            "devices": tools.cache.runtime.devices,
             "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
         }  # fmt: skip
         number = axes.size if settings["search"] == "grid" else settings["trials"]
@@ -57,13 +56,11 @@ def sweep(settings: dict[str, Any]) -> None:
         shutil.rmtree(blocks, ignore_errors=True)
 
 
-def _block_folder(
-    settings: dict[str, Any], tools: stages.Tools, images: stages.Images, candidates: Shortlist
-) -> Path | None:
+def _block_folder(settings: dict[str, Any], tools: stages.Tools, images: stages.Images) -> Path | None:
     """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
     if settings["cache"] is None:
         return None
-    recipe = stages.recipe(tools, images, candidates.mask.shape[1])
+    recipe = stages.recipe(tools, images)
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}

@@ -6,6 +6,7 @@ are the single stages as functions of arrays. The packages add images, files and
 after them are for a scorer of your own; `mfvpr.testing.check_scorer` tests its contract.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mfvpr.datasets.positives import frame_positives, radius_positives
@@ -44,9 +45,10 @@ from mfvpr.scoring.weights import (
 from mfvpr.types import Features, Matches, Ranking, Shortlist, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import masked, masked_mean, masked_median, safe_sqrt
+from mfvpr.utils.runtime import Runtime
 
 if TYPE_CHECKING:
-    from mfvpr.evaluation.evaluation import evaluate
+    from mfvpr.evaluation import Pipeline, System, evaluate
     from mfvpr.localization import Map
 
 __version__ = "0.2.0"
@@ -69,7 +71,7 @@ __all__ = [  # noqa: RUF022 (in the order of the stages)
     # what is correct, and recall
     "frame_positives", "radius_positives", "recall_at_k",
     # a whole data set, and one image at a time
-    "evaluate", "Map",
+    "evaluate", "Map", "Pipeline", "System", "Runtime",
     # tools for a scorer of your own; see mfvpr.testing.check_scorer
     "Scorer", "value", "image_sizes", "match_shifts", "masked", "masked_mean", "masked_median", "safe_sqrt",
     # mistakes of a caller, in one line
@@ -78,10 +80,8 @@ __all__ = [  # noqa: RUF022 (in the order of the stages)
 
 
 def __getattr__(name: str) -> Any:
-    """Import `evaluate` and `Map` at their first use: images take longer to import than arrays."""
-    if name not in ("evaluate", "Map"):
+    """Import what works on images at its first use: images take longer to import than arrays."""
+    packages = {"Map": "localization"} | dict.fromkeys(["Pipeline", "System", "evaluate"], "evaluation")
+    if name not in packages:
         raise AttributeError(f"module 'mfvpr' has no attribute {name!r}")
-    from mfvpr.evaluation.evaluation import evaluate
-    from mfvpr.localization import Map
-
-    return evaluate if name == "evaluate" else Map
+    return getattr(import_module(f"mfvpr.{packages[name]}"), name)

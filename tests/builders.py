@@ -8,10 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from mfvpr import Features, Matches, Shortlist, types
+import mfvpr
+from mfvpr import Features, Matches, Pipeline, Shortlist, System, types
 from mfvpr.matching import MatchSet
 
 SIZE = 336
+
+
+def evaluate_parts(dataset, extractor, retriever, scorers, *, cache=None, runtime=None, **options):
+    """Evaluate a system of these parts; options are fields of `Pipeline` and `System`."""
+    of_pipeline = {name: options.pop(name) for name in ("matcher", "candidates") if name in options}
+    system = System(Pipeline(extractor, retriever, **of_pipeline), scorers, **options)
+    return mfvpr.evaluate(dataset, system, cache=cache, runtime=runtime)
 
 
 def unit(array):

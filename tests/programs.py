@@ -69,7 +69,7 @@ def small(root, *more):
 def matches_path(settings):
     """The folder in which a program keeps the matches of its data set, and their recipe."""
     tools, images = stages.prepare(settings, stages.Stopwatch())
-    recipe = stages.recipe(tools, images, settings["candidates"])
+    recipe = stages.recipe(tools, images)
     return store_path(tools.cache.root, "matches", recipe, MATCHES), recipe
 
 

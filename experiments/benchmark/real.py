@@ -14,7 +14,7 @@ from experiments.console import tell, track
 from experiments.overrides import compose_program
 from mfvpr.checkpoints import load_model
 from mfvpr.datasets import folder_dataset
-from mfvpr.evaluation import estimate, hits, match_sequence, stages
+from mfvpr.evaluation import Pipeline, estimate, hits, match_sequence, stages
 from mfvpr.features import Aggregated, AlikedFeatures, Extractor, Sift, VladFitting
 from mfvpr.report import Table
 from mfvpr.reranking import Matched
@@ -23,7 +23,7 @@ from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import InputError
+from mfvpr.utils import InputError, Runtime
 
 FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
 SIZE = (336, 336)
@@ -35,13 +35,14 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     if data is None:
         raise InputError(f"--data: expected a folder that has {' and '.join(FOLDERS)}, got none")
     folder = build.expand_user(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
-    cache, scorers = FeatureCache(folder / "features", track=track, tell=tell), compared_scorers()
+    cache, scorers = FeatureCache(folder / "features", runtime=Runtime(progress=track, log=tell)), compared_scorers()
     parts, tables = [], []
     for name, folders in FOLDERS.items():
         dataset = folder_dataset(*(data / name / folder for folder in folders), name=name, ground_truth="order")
         for features, extractor in extractors().items():
             retrieval = Retrieval(Aggregated(extractor, VladFitting()))
-            matched = match_sequence(dataset, dataset.only, extractor, retrieval, "all", cache=cache)
+            pipeline = Pipeline(extractor, retrieval, candidates="all")
+            matched = match_sequence(dataset, dataset.only, pipeline, cache=cache)
             rows = [measure(matched, score, scorers, rounds or 1) for score in (RETRIEVAL, *scorers)]
             tables.append({"matches": f"{name}, {features}", "rows": rows})
             parts += [f"{name}, {features}, {np.mean(matched.matches[0].counts):.0f} matches a pair", _table(rows)]

@@ -24,6 +24,7 @@ from mfvpr.report import Table
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.retrieval.search import EXACT
 from mfvpr.types import Features
+from mfvpr.utils import Runtime
 
 QUERIES, KEYPOINTS = 100, 700
 SETS = tuple(
@@ -150,7 +151,7 @@ def rank_queries(
     times = [time.perf_counter()]
     candidates = EXACT.shortlist(*vectors, CANDIDATES)
     times.append(time.perf_counter())
-    matches = stages.match(queries, database, candidates, memory=memory)
+    matches = stages.match(queries, database, candidates, runtime=Runtime(memory=memory))
     times.append(time.perf_counter())
     scores = stages.score({"histogram": HistogramOfShifts()}, matches, candidates)["histogram"]
     times.append(time.perf_counter())

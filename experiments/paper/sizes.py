@@ -17,14 +17,14 @@ _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 
 def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
     """Average bytes of what was already extracted: `local` features, and the `descriptor` of retrieval."""
-    cache = tools.cache
-    sources = cache.local(database, fit_to_database(tools.extractor, database, cache), [])  # extracts nothing
-    keypoint = 0 if isinstance(tools.extractor, _GRIDS) else _KEYPOINT
+    cache, pipeline = tools.cache, tools.pipeline
+    sources = cache.local(database, fit_to_database(pipeline.extractor, database, cache), [])  # extracts nothing
+    keypoint = 0 if isinstance(pipeline.extractor, _GRIDS) else _KEYPOINT
     local = 0.0
     for features in sources:
         counts = features.source.counts
         known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
         local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
-    describer: Any = fit_to_database(tools.retriever, database, cache)  # all of the paper's have one
+    describer: Any = fit_to_database(pipeline.retriever, database, cache)  # all of the paper's have one
     vectors = cache.vectors(database, describer.describer, database).values
     return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}

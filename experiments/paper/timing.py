@@ -12,10 +12,9 @@ import numpy as np
 
 from experiments import build
 from mfvpr.datasets import Dataset, ImageFolder
-from mfvpr.evaluation import evaluation
+from mfvpr.evaluation import Pipeline, System, evaluation
 from mfvpr.localization.vectors import Vectors
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import Stopwatch
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
@@ -41,19 +40,16 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
     extractor = build.extractor(settings["features"], None)
     retriever, matcher = build.retriever(settings["retrieval"], extractor, None), build.matcher(settings["matching"])
-    scorers, watch = build.scorers(settings["scorer"]), Stopwatch()
+    scorers, seconds = build.scorers(settings["scorer"]), dict[str, float]()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
         cache = FeatureCache(Path(folder) / "cache")
+        system = System(Pipeline(extractor, retriever, matcher, candidates), {main: scorers[main]})
         for turn in ("first", "second"):
-            watch = Stopwatch()
             images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
             part = replace(sequence, images=images, truth=None, excluded=None)
-            evaluation.evaluate(
-                Dataset(dataset.name, database, (part,)), extractor, retriever, {main: scorers[main]},
-                candidates=candidates, matcher=matcher, cache=cache, watch=watch,
-            )  # fmt: skip
-    return {step: watch.seconds.get(step, 0.0) / number for step in STEPS}
+            seconds = evaluation.evaluate(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
+    return {step: seconds.get(step, 0.0) / number for step in STEPS}
 
 
 def device() -> dict[str, Any]:

@@ -2,9 +2,11 @@ __all__ = [
     "Confidence",
     "EvaluationProtocol",
     "Half",
+    "Pipeline",
     "Recall",
     "Result",
     "Split",
+    "System",
     "Tally",
     "best_setting",
     "confidence_inputs",
@@ -34,3 +36,4 @@ from .results import Recall, Result
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .statistics import estimate, mcnemar
+from .system import Pipeline, System

@@ -11,13 +11,13 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.validation import check_matching, image_warnings, validate_candidates
+from mfvpr.evaluation.system import Pipeline
+from mfvpr.evaluation.validation import image_warnings, validate_candidates
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
-from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import RetrievalResult, Retriever
+from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.matches import MatchStore
 from mfvpr.storage.shards import NotYet, together
@@ -26,6 +26,7 @@ from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.files import replacing, write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.runtime import Runtime
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
 _SHORTLIST = "shortlist.npz"  # beside the matches of shards
@@ -33,57 +34,64 @@ _COMPLETE = "its images and queries are done"
 
 
 def match_sequence(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
-    candidates: int | Literal["all"] = 50, *, matcher: Matcher = NEIGHBORS, cache: FeatureCache | None = None,
-    watch: Stopwatch | None = None, **where: Any,
-) -> Matched:  # fmt: skip
+    dataset: Dataset,
+    sequence: QuerySequence,
+    pipeline: Pipeline,
+    *,
+    cache: FeatureCache | None = None,
+    runtime: Runtime | None = None,
+    watch: Stopwatch | None = None,
+) -> Matched:
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
     If the cache has a root, matches are kept below it. If they are all there, nothing else is read. If the cache has a
-    shard, only queries of the shard are matched. Arguments not listed here are those of `evaluate`.
+    shard, only queries of the shard are matched.
 
     Args:
         dataset: of the sequence.
         sequence: Q queries.
+        pipeline: how candidates are found and matched.
+        cache: see `evaluate`.
+        runtime: see `evaluate`.
         watch: gets the seconds of the stages.
-        **where: `memory`, `devices` and `track` of `stages.match`.
 
     Raises:
         InputError: as `evaluate`.
         NotYet: the cache has a shard: its queries are matched, or features of other shards are missing.
     """
-    check_matching(candidates, extractor, matcher)
     cache, watch, database = cache or FeatureCache(), watch or Stopwatch(), dataset.database
-    cache = cache if cache.watch else replace(cache, watch=watch)
+    cache = replace(cache, runtime=runtime or cache.runtime, watch=cache.watch or watch)
     with watch("features"):
-        extractor = fit_to_database(extractor, database, cache)
+        pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, database, cache))
     with watch("retrieval"):
-        retriever = fit_to_database(retriever, database, cache)
+        pipeline = replace(pipeline, retriever=fit_to_database(pipeline.retriever, database, cache))
     with ExitStack() as stack:
         stores = []
         if cache.root is not None:
-            recipe = matches_recipe(dataset, sequence, extractor, retriever, candidates, matcher, cache)
-            stores = [stack.enter_context(store) for store in _match_stores(sequence, extractor, recipe, cache)]
+            recipe = matches_recipe(dataset, sequence, pipeline, cache)
+            stores = [stack.enter_context(store) for store in _match_stores(sequence, pipeline, recipe, cache)]
         if cache.shard is not None and all(store.done.all() for store in stores):
             raise NotYet(_COMPLETE)
-        matched = _read_matches(sequence, stores, cache, watch, where.get("memory"))
+        matched = _read_matches(sequence, stores, cache, watch)
         if matched is None:
             with watch("retrieval"):
-                retrieved = _find_candidates(sequence, database, retriever, candidates, cache, stores)
-            options = {"matcher": matcher, "track": cache.track("matching"), **where}
-            matched = _match(dataset, sequence, extractor, retrieved, stores, cache, watch, **options)
+                retrieved = _find_candidates(sequence, database, pipeline, cache, stores)
+            matched = _match(dataset, sequence, pipeline, retrieved, stores, cache, watch)
     _warn_of_queries_without_candidates(matched, cache)
-    return replace(matched, weights=tuple(scale.weight for scale in extractor.scales))
+    return replace(matched, weights=tuple(scale.weight for scale in pipeline.extractor.scales))
 
 
 def _find_candidates(
-    sequence: QuerySequence, database: ImageFolder, retriever: Retriever, candidates: int | Literal["all"],
-    cache: FeatureCache, stores: Sequence[MatchStore],
-) -> RetrievalResult:  # fmt: skip
+    sequence: QuerySequence,
+    database: ImageFolder,
+    pipeline: Pipeline,
+    cache: FeatureCache,
+    stores: Sequence[MatchStore],
+) -> RetrievalResult:
     """The shortlist; all runs use that of the first shard, since near ties may come out differently elsewhere."""
 
     def retrieve() -> RetrievalResult:
-        number = num_candidates(candidates, database)
+        retriever, number = pipeline.retriever, num_candidates(pipeline.candidates, database)
         retrieved = retriever.shortlist(sequence, database, number, cache)
         return validate_candidates(retrieved, type(retriever).__name__, len(sequence.images), len(database), number)
 
@@ -103,12 +111,12 @@ def _find_candidates(
 
 
 def _match(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retrieved: RetrievalResult,
-    stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, **options: Any,
+    dataset: Dataset, sequence: QuerySequence, pipeline: Pipeline, retrieved: RetrievalResult,
+    stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch,
 ) -> Matched:  # fmt: skip
     """Extract features and match all scales; a shard matches its queries, and ends with `NotYet`."""
     with watch("features"):
-        sides, remarks = _extract(dataset, sequence, extractor, retrieved, cache)
+        sides, remarks = _extract(dataset, sequence, pipeline.extractor, retrieved, cache)
     for store in stores[:1]:  # for later runs, which read the matches and nothing else
         write_text(store.folder / _REMARKS, json.dumps(remarks))
     for line in remarks["warnings"]:
@@ -117,7 +125,7 @@ def _match(
     rows = None if shard is None else shard.rows(sequence.images.names)
     with watch("matching"):
         matches = tuple(
-            stages.match(*scale, shortlist, store=store, rows=rows, **options)
+            stages.match(*scale, shortlist, pipeline.matcher, store=store, rows=rows, runtime=cache.runtime)
             for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
         )
     if shard is not None:
@@ -167,8 +175,8 @@ def _by_row(*reasons: Mapping[Any, str]) -> dict[int, str]:
 
 
 def _read_matches(
-    sequence: QuerySequence, stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch, memory: float | None
-) -> Matched | None:  # fmt: skip
+    sequence: QuerySequence, stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch
+) -> Matched | None:
     """Matches of all scales from the stores; None if some are missing."""
     if not stores or not all(store.done.all() for store in stores):
         return None
@@ -178,7 +186,7 @@ def _read_matches(
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None  # so images are read again, but not matched
     with watch("matches read"):
-        scales = [stages.stored_matches(store, memory=memory) for store in stores]
+        scales = [stages.stored_matches(store, memory=cache.runtime.memory) for store in stores]
     match_sets, shortlists = zip(*scales, strict=True)
     if any((shortlist.indices != shortlists[0].indices).any() for shortlist in shortlists):
         return None  # scales with different shortlists: matching will raise
@@ -188,31 +196,30 @@ def _read_matches(
 
 
 def matches_recipe(
-    dataset: Dataset, sequence: QuerySequence, extractor: Extractor | Source, retriever: Retriever,
-    candidates: int | Literal["all"], matcher: Matcher, cache: FeatureCache,
-) -> dict[str, Any]:  # fmt: skip
+    dataset: Dataset, sequence: QuerySequence, pipeline: Pipeline, cache: FeatureCache
+) -> dict[str, Any]:
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matcher."""
     excluded, database = sequence.excluded, dataset.database
-    extractor, retriever = fit_to_database(extractor, database, cache), fit_to_database(retriever, database, cache)
+    extractor = fit_to_database(pipeline.extractor, database, cache)
     return {
         "database": cache.recipe(database, extractor),
         "query": cache.recipe(sequence.images, extractor),
-        "filter": cache.recipe_of(retriever),
-        "candidates": num_candidates(candidates, database),
-        "matching": cache.recipe_of(matcher),
+        "filter": cache.recipe_of(fit_to_database(pipeline.retriever, database, cache)),
+        "candidates": num_candidates(pipeline.candidates, database),
+        "matching": cache.recipe_of(pipeline.matcher),
         "skip_bad": cache.skip_bad,
         "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
     }
 
 
 def _match_stores(
-    sequence: QuerySequence, extractor: Extractor | Source, recipe: Mapping[str, Any], cache: FeatureCache
+    sequence: QuerySequence, pipeline: Pipeline, recipe: Mapping[str, Any], cache: FeatureCache
 ) -> Iterator[AbstractContextManager[MatchStore]]:
     """One store of matches per scale."""
-    several = len(extractor.scales) > 1
+    scales = pipeline.extractor.scales
     share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
-    for number, scale in enumerate(extractor.scales):
+    for number, scale in enumerate(scales):
         yield cache.matches(
-            {**recipe, "scale": number} if several else recipe, sequence.images.names, recipe["candidates"],
+            {**recipe, "scale": number} if len(scales) > 1 else recipe, sequence.images.names, recipe["candidates"],
             typical=scale.typical_count // share, label=f"{sequence.name} matches",
         )  # fmt: skip

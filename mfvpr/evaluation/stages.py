@@ -1,7 +1,6 @@
 """The stages of re-ranking a data set: match, score, explain. `mfvpr.reranking` fuses and ranks.
 
-Files and threads stay on the host; each computation is one compiled program per shape. `track` wraps the iterable of a
-stage, for a progress bar.
+Files and threads stay on the host; each computation is one compiled program per shape.
 """
 
 import itertools
@@ -27,8 +26,8 @@ from mfvpr.scoring.weights import match_weights
 from mfvpr.storage.matches import MatchStore, StoredMatches
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
-from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.numerics import at_least_single, compiled, device_of
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
@@ -38,8 +37,7 @@ STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
 
 def match(
     queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher = NEIGHBORS, *,
-    memory: float | None = None, devices: Sequence[Device] | None = None, store: MatchStore | None = None,
-    rows: Sequence[int] | None = None, track: Track = no_progress,
+    store: MatchStore | None = None, rows: Sequence[int] | None = None, runtime: Runtime = DEFAULT_RUNTIME,
 ) -> MatchSet:  # fmt: skip
     """Match every query with its candidates; matches include their ratio, which some weights use.
 
@@ -48,13 +46,10 @@ def match(
         database: M images.
         candidates: `[Q, C]` rows of the database.
         matcher: of one pair.
-        memory: GB that features of the database may take on the devices, and matches that are read from a store in
-            memory; None = a third of what is free.
-        devices: that share the queries; None = the one that JAX takes.
         store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
             batches; the result is read from it.
         rows: of the queries that are matched and returned; None = all.
-        track: progress, over queries.
+        runtime: devices that share the queries, memory, and progress over queries.
 
     Raises:
         InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
@@ -64,10 +59,10 @@ def match(
         raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
     match_rows = partial(
-        batched.match_queries, queries, database, candidates, matcher=matcher, memory=memory,
-        devices=devices or [device_of(())],
+        batched.match_queries, queries, database, candidates, matcher=matcher, memory=runtime.memory,
+        devices=runtime.devices or [device_of(())],
     )  # fmt: skip
-    requested = range(len(queries)) if rows is None else rows
+    requested, track = range(len(queries)) if rows is None else rows, runtime.progress("matching")
     if store is None:
         matched = [query for _, query in track(match_rows(requested), len(requested))]
         counts = np.array([query.counts for query in matched], np.int32).reshape(
@@ -80,7 +75,7 @@ def match(
         tracked = iter(track(match_rows(missing), len(missing)))
         while batch := dict(itertools.islice(tracked, STORE_BATCH)):
             store.write(batch)
-    match_set, shortlist = stored_matches(store, rows, memory=memory)
+    match_set, shortlist = stored_matches(store, rows, memory=runtime.memory)
     if not missing:
         _require_candidates(store, candidates, dict(zip(requested, shortlist.indices, strict=True)))
     return match_set

@@ -1,81 +1,16 @@
 """Checks of an evaluation: its arguments, candidates of user-defined retrievals, scores, and images."""
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
-from mfvpr.features.sift import Sift
-from mfvpr.matching.lightglue import LightGlueMatcher
-from mfvpr.matching.matcher import Matcher, NearestNeighborMatcher
-from mfvpr.matching.nearest_neighbors import CrossCheck
-from mfvpr.reranking.fusion import Fusion
-from mfvpr.reranking.ranking import Ties
-from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Matched, Ranked
+from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.retrieval.retriever import RetrievalResult
-from mfvpr.scoring.fields import check_bounds
-from mfvpr.scoring.registry import SCORERS
 from mfvpr.types import Shortlist
-from mfvpr.utils.errors import InputError, require_word
-
-
-def check_request(
-    scorers: Mapping[str, Any], fused: Mapping[str, Fusion], correlated: Iterable[str], ties: Ties,
-    memory: float | None, *, cohort: bool = False,
-) -> None:  # fmt: skip
-    """Raise `InputError` if an argument of `mfvpr.evaluate` that concerns scores cannot be used.
-
-    `cohort` = whether there is one.
-    """
-    require_word("ties", ties, Ties)
-    if memory is not None and not 0 < memory < math.inf:
-        raise InputError(f"memory={memory!r}: expected GB above 0, or None")
-    with_cohort = [f"{name} + {COHORT}" for name in scorers] if cohort else []
-    alone = [*scorers, *with_cohort]
-    for name, how in fused.items():
-        how.check(name, alone)
-    combined = [how.system(name) for name, how in fused.items()]
-    several = {*alone, *combined}
-    if unknown := [name for name in correlated if name not in several]:
-        raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
-                         f"{unknown[0]}")  # fmt: skip
-    reserved = {RETRIEVAL, *with_cohort, *combined, *(f"{system} + {FRAMES}" for system in correlated)}
-    for name, scorer in scorers.items():
-        if name in reserved:
-            raise InputError(f"scorers: {name} is the name of another system; choose another one")
-        if isinstance(scorer, type) or not callable(scorer):
-            got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
-            raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
-        if type(scorer) in SCORERS.values():
-            check_bounds(scorer)
-
-
-def check_matching(candidates: Any, extractor: Extractor | Source, matcher: Matcher) -> None:
-    """Raise `InputError` if an argument of `mfvpr.evaluate` that concerns matches cannot be used."""
-    is_whole = isinstance(candidates, int | np.integer) and not isinstance(candidates, bool)
-    if candidates != "all" and not (is_whole and candidates >= 1):
-        raise InputError(f"candidates={candidates!r}: expected a whole number from 1, or 'all'")
-    if not extractor.scales:
-        raise InputError(f"{type(extractor).__name__}: gives no local features; expected an extractor that does")
-    if isinstance(matcher, type) or not callable(matcher):
-        got = f"the class {matcher.__name__}" if isinstance(matcher, type) else repr(matcher)
-        raise InputError(f"matcher: expected what maps the features of two images to Matches, got {got}; see "
-                         "mfvpr.Matcher")  # fmt: skip
-    if isinstance(matcher, NearestNeighborMatcher):
-        require_word("cross_check", matcher.cross_check, CrossCheck)
-    if isinstance(matcher, LightGlueMatcher):
-        for name in ("filter_threshold", "depth_confidence"):
-            if (share := getattr(matcher, name)) is not None and not 0 <= share <= 1:
-                raise InputError(f"{name}={share}: expected a number from 0 to 1")
-        dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
-        if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
-            got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
-            raise InputError(f"LightGlue: expected ALIKED's features, of {matcher.dimension} dimensions, got {got}; "
-                             "extract these, or match nearest neighbors")  # fmt: skip
+from mfvpr.utils.errors import InputError
 
 
 def validate_candidates(

@@ -18,7 +18,7 @@ from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context, with_static_functions
-from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 from mfvpr.utils.threads import ordered_map
 
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
@@ -26,7 +26,7 @@ PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, a
 
 def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
-    devices: Sequence[Device] | None = None, track: Track = no_progress,
+    runtime: Runtime = DEFAULT_RUNTIME,
 ) -> dict[str, Scores]:  # fmt: skip
     """Scores, float32, by name of the scorer; NaN without a candidate.
 
@@ -37,8 +37,7 @@ def score(
         scorers: by name.
         match_set: matches of Q queries with C candidates; several scales are scored one by one and fused.
         candidates: shortlist of the queries.
-        devices: share the batches, without effect on the bits of the scores; None = JAX's default device.
-        track: progress over batches.
+        runtime: devices that share the batches, without effect on the bits of the scores; progress over batches.
     """
     if not scorers:
         return {}
@@ -53,11 +52,11 @@ def score(
     def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
         for part in parts:
             part_batches = all_batches(match_set, part, settings=1)
-            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=devices):
+            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=runtime.devices):
                 yield part, places, values
 
     total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
-    for part, places, values in track(score_parts(), total):
+    for part, places, values in runtime.progress("scores")(score_parts(), total):
         scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
         for name, pair_scores in values.items():
             scores[name][scale, part.start + query, place] = pair_scores

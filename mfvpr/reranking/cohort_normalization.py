@@ -3,13 +3,13 @@
 Hubs are database images that score high with any query.
 
     sequence = cohort_sequence(FeatureCache().contents(dataset.database), 5)
-    cohort = match_sequence(dataset, sequence, extractor, retriever)
+    cohort = match_sequence(dataset, sequence, system.pipeline)
     scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
     strengths = hubness(cohort.candidates, scores, len(dataset.database))
     normalized = by_hubness(candidates, query_scores, strengths)
 
-`mfvpr.evaluate(cohort=5)` does this for all scorers. The cohort of a database image are other places of the map. Only
-the last line needs queries; all others run when the map is made. Images far apart in the drive count as different
+`mfvpr.System(..., cohort=5)` does this for all scorers. The cohort of a database image are other places of the map.
+Only the last line needs queries; all others run when the map is made. Images far apart in the drive count as different
 places: if the drive passes a place twice, its images score high with each other and are treated as hubs.
 """
 

@@ -100,7 +100,7 @@ def rank_sequence(
     Args:
         matched: the sequence.
         scores: by name of the scorer.
-        fused, correlated, ties: see `mfvpr.evaluate`.
+        fused, correlated, ties: see `mfvpr.System`.
         hubness: by name of the scorer; None = no score normalization with a cohort.
     """
     candidates, scores = matched.candidates, {**scores}

@@ -75,12 +75,12 @@ def _whitening(
     about, name = fingerprint(recipe), type(extractor).__name__
     path = cache.root / f"{name}-whitening-{about}.npz"
     cache.root.mkdir(parents=True, exist_ok=True)
-    with lock_store(cache.root, "whitening", cache.tell) if not path.exists() else nullcontext():
+    with lock_store(cache.root, "whitening", cache.log) if not path.exists() else nullcontext():
         if not path.exists():  # never replaced, because bits may differ between machines
             learned = _learn(extractor, fitting, database, cache)
             arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
             write_arrays(path, arrays, about)
-            cache.tell(
+            cache.log(
                 f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
             )
     arrays = read_arrays(path, about)
@@ -91,7 +91,7 @@ def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFo
     rows, bad = fitting.sample_rows(len(database)), {}
 
     def maps() -> Iterator[dict[int, np.ndarray]]:
-        track = cache.track(f"{type(extractor).__name__} whitening")
+        track = cache.runtime.progress(f"{type(extractor).__name__} whitening")
         for batch in describe_folder(database, extractor.maps, rows, bad, skip_bad=cache.skip_bad, track=track):
             yield {
                 row: description.vector.reshape(extractor.windows.shape)

@@ -30,7 +30,8 @@ from mfvpr.storage.rows import require_space
 from mfvpr.storage.shards import Shard
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.progress import Stopwatch, Track, no_progress
+from mfvpr.utils.progress import Stopwatch
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 from mfvpr.utils.versions import versions
 
 DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
@@ -63,20 +64,18 @@ class FeatureCache:
     Attributes:
         root: folder of all stores; None = in memory.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
-        track: label -> progress bar of the next loop.
-        tell: called with one line: the work to be done and the disk space it takes, or a warning about images.
         wait: wait for another process that writes the same store, instead of raising.
         shard: extracts its own images alone, and reads the rest from the stores of other shards; see
             `mfvpr.storage.shards`. It needs a root.
+        runtime: progress and messages; `mfvpr.evaluate` sets its own.
         watch: counts the extraction of local features as the stage `features`.
     """
 
     root: Path | None = None
     skip_bad: bool = False
-    track: Callable[[str], Track] = lambda label: no_progress
-    tell: Callable[[str], None] = lambda line: None
     wait: bool = False
     shard: Shard | None = None
+    runtime: Runtime = DEFAULT_RUNTIME
     watch: Stopwatch | None = None
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
@@ -109,11 +108,15 @@ class FeatureCache:
         """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
         return recipe_of(value, self._content_of)
 
+    def log(self, line: str) -> None:
+        """Log a line; see `Runtime`."""
+        self.runtime.log(line)
+
     def warn(self, line: str) -> None:
-        """Tell a warning, once: several sequences may share a database."""
+        """Log a warning, once: several sequences may share a database."""
         if line not in self._warned:
             self._warned.add(line)
-            self.tell(f"warning: {line}")
+            self.log(f"warning: {line}")
 
     def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
         """Everything that changes the features of a folder's images: extractor, images, versions of decoders."""
@@ -178,17 +181,17 @@ class FeatureCache:
             if missing := sum(not store.done[row] for row in rows):
                 needed = match_stores.forecast_bytes(missing, num_candidates, typical)
                 require_space(store.folder, needed)
-                self.tell(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
+                self.log(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
                           f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
             else:
                 amount = "all" if store.done.all() else "its part of"
-                self.tell(f"{label}: {amount} {len(names)} queries from {store.folder}")
+                self.log(f"{label}: {amount} {len(names)} queries from {store.folder}")
             yield store
 
     @property
     def store_options(self) -> dict[str, Any]:
         """The arguments `waiting` and `shard` of `storage.rows.RowStore`."""
-        return {"waiting": self.tell if self.wait else None, "shard": self.shard}
+        return {"waiting": self.log if self.wait else None, "shard": self.shard}
 
     def _content_of(self, path: PurePath) -> Any:
         path = Path(path)
@@ -201,7 +204,7 @@ class FeatureCache:
         opened = source.open(folder, partial=self.skip_bad)
         counts = np.asarray(opened.counts)
         number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
-        self.tell(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
+        self.log(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
         return opened
 
     def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> ExtractionState:
@@ -218,14 +221,14 @@ class FeatureCache:
                 state.read_bad()
             missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
             self._announce(extractor, state, missing, len(rows), len(folder), label)
-            options = {"skip_bad": self.skip_bad, "track": self.track(label)}
+            options = {"skip_bad": self.skip_bad, "track": self.runtime.progress(label)}
             for batch in describe_folder(folder, extractor, missing, state.bad, **options):
                 for sink in state.sinks:
                     sink.write(batch)
             if missing:
                 state.write_bad()
                 for line in size_lines(state.of_scales, extractor.scales):
-                    self.tell(f"{label}: {line}")
+                    self.log(f"{label}: {line}")
         if self.shard is not None:
             self.shard.require_rows(state.look(rows), folder.names, label)
         if len(state.bad) == len(folder):
@@ -248,14 +251,14 @@ class FeatureCache:
         where, state.is_announced = ", ".join(str(store.folder) for store in stores), True
         if not missing:
             number = f"all {total}" if count == total else f"the {count} of {total}"
-            self.tell(f"{label}: {number} images from {where}")
+            self.log(f"{label}: {number} images from {where}")
             return
         needed = sum(sink.forecast(len(missing)) for sink in state.sinks)
         require_space(stores[0].folder, needed)
         scales = [f"about {scale.typical_count} features of {scale.dimension} dimensions each"
                   for scale in extractor.scales]  # fmt: skip
         each = ", ".join(scales) or f"descriptors of {extractor.vector_size} numbers"
-        self.tell(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
+        self.log(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
 
     def _vectors(
         self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
@@ -277,7 +280,7 @@ class FeatureCache:
         aggregation = self.once("aggregation", fit, database, describer)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         starts = range(0, len(folder), AGGREGATED)
-        for start in self.track(f"{label} descriptors")(starts, len(starts)):
+        for start in self.runtime.progress(f"{label} descriptors")(starts, len(starts)):
             if images := dict(features.read(range(len(folder))[start : start + AGGREGATED])):
                 values[list(images)] = aggregation(list(images.values()))
         values[list(features.bad)] = np.nan

@@ -2,7 +2,7 @@
 
     try:
         cache = FeatureCache(root, shard=Shard(2, 8))
-        mfvpr.evaluate(dataset, extractor, retriever, scorers, cache=cache)
+        mfvpr.evaluate(dataset, system, cache=cache)
     except NotYet as progress:
         print(progress, progress.is_complete)
 

@@ -1,6 +1,7 @@
 __all__ = [
     "InputError",
     "NoGradientError",
+    "Runtime",
     "Stopwatch",
     "recipe_of",
 ]
@@ -8,3 +9,4 @@ __all__ = [
 from .errors import InputError, NoGradientError
 from .fingerprints import recipe_of
 from .progress import Stopwatch
+from .runtime import Runtime

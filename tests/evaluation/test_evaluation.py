@@ -28,6 +28,7 @@ from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache, feature_cache
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
+from tests.builders import evaluate_parts
 from tests.programs import typed
 from tests.storage.extractors import Mean
 
@@ -47,7 +48,7 @@ def several(split, small_street):
 
 @pytest.fixture(scope="module")
 def result(dataset):
-    return mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
+    return evaluate_parts(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
 
 
 def test_systems_and_their_recall(dataset, result):
@@ -86,7 +87,7 @@ def test_gains_say_where_on_the_path_each_query_is(result, tmp_path):
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):
-    parts = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=5)
+    parts = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=5)
     [joint] = result.systems["count"]
     rows = np.concatenate([ranked.rows for ranked in parts.systems["count"]])
     np.testing.assert_array_equal(rows, joint.rows)
@@ -118,7 +119,7 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
 
 def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
-    result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates=10)
+    result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
     calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
     predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
@@ -134,8 +135,8 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several)
 def test_only_candidates_are_extracted(dataset, tmp_path):
     few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
     lines = []
-    cache = FeatureCache(tmp_path, tell=lines.append)
-    matched = match_sequence(dataset, few, SIFT, Retrieval(Mean()), 3, cache=cache)
+    cache = FeatureCache(tmp_path, runtime=mfvpr.Runtime(log=lines.append))
+    matched = match_sequence(dataset, few, mfvpr.Pipeline(SIFT, Retrieval(Mean()), candidates=3), cache=cache)
     wanted = np.unique(matched.candidates.indices)
     assert len(wanted) < 7
     [features] = FeatureCache(tmp_path).local(dataset.database, SIFT, [])
@@ -144,15 +145,15 @@ def test_only_candidates_are_extracted(dataset, tmp_path):
 
 
 def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
-    first = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
+    first = evaluate_parts(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(tmp_path))
 
     def only_scores(label):
         assert label == "scores"
         return progress.no_progress
 
-    again = mfvpr.evaluate(
+    again = evaluate_parts(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
-        cache=FeatureCache(tmp_path, track=only_scores), memory=1e-5,
+        cache=FeatureCache(tmp_path), runtime=mfvpr.Runtime(memory=1e-5, progress=only_scores),
     )  # fmt: skip
     for name, system in itertools.product(again.systems, (first, again)):
         [ranked], [expected] = system.systems[name], result.systems[name]
@@ -203,7 +204,7 @@ def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result
         "pairs": ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")}),
     }
     for name, chosen in retrievers.items():
-        imported_result = mfvpr.evaluate(dataset, local, chosen, SCORERS, candidates=5)
+        imported_result = evaluate_parts(dataset, local, chosen, SCORERS, candidates=5)
         for system in ("retrieval", "histogram", "count"):
             [got], [expected] = imported_result.systems[system], result.systems[system]
             np.testing.assert_array_equal(got.rows, expected.rows, err_msg=name)
@@ -231,8 +232,9 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
     listed = ShortlistFiles({dataset.queries.root: File(pairs)})
     for _ in range(2):
         lines = []
-        mfvpr.evaluate(
-            dataset, SIFT, listed, SCORERS, candidates=2, cache=FeatureCache(tmp_path / "s", tell=lines.append)
+        runtime = mfvpr.Runtime(log=lines.append)
+        evaluate_parts(
+            dataset, SIFT, listed, SCORERS, candidates=2, cache=FeatureCache(tmp_path / "s"), runtime=runtime
         )
         [line] = [line for line in lines if "no candidates" in line]
         assert "0001.png: no candidates (8 such queries of 10)" in line
@@ -266,7 +268,8 @@ def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several,
         plain = kind.fit
         monkeypatch.setattr(kind, "fit", lambda self, sample, plain=plain: fitted.append(self) or plain(self, sample))
     whitened = replace(VLAD, search=WhitenedSearch(4))
-    mfvpr.evaluate(several, SIFT, whitened, SCORERS, candidates=5, cache=FeatureCache(tmp_path, tell=lines.append))
+    runtime = mfvpr.Runtime(log=lines.append)
+    evaluate_parts(several, SIFT, whitened, SCORERS, candidates=5, cache=FeatureCache(tmp_path), runtime=runtime)
     assert fitted == [VLAD.describer.fitting, whitened.search]
     assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[1:2]
     assert sum("images to do" in line for line in lines) == 3
@@ -279,8 +282,8 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
     several, lines = sequences_dataset(tmp_path / "database", split, ground_truth="none"), []
     for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
         lines.clear()
-        feature_cache = FeatureCache(root, skip_bad=True, tell=lines.append)
-        result = mfvpr.evaluate(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
+        feature_cache = FeatureCache(root, skip_bad=True, runtime=mfvpr.Runtime(log=lines.append))
+        result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
         assert all(list(matched.bad_database) == [4] for matched in result.matched)
         warned = [line for line in lines if line.startswith("warning: ")]
         assert len(warned) == 2
@@ -331,7 +334,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
         yield from describe_folder(*arguments, **options)
 
     monkeypatch.setattr(feature_cache, "describe_folder", slow)
-    seconds = mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
+    seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}
 
@@ -362,7 +365,7 @@ def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp
     folders = [*(tmp_path / name for name in names), tmp_path / "real" / "deeper" / "..", Path()]
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
-    result = mfvpr.evaluate(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
+    result = evaluate_parts(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
     write_rankings(tmp_path / "out", EvaluationReport(result, [], [1], "count"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
     for name in (*names, "real", "second"):

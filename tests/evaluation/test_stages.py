@@ -61,7 +61,8 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     with open_store(tmp_path) as store:
         first = stages.match(features[1], features[0], candidates, store=store)
     with open_store(tmp_path) as store:
-        again = stages.match(features[1], features[0], candidates, store=store, track=lambda *_: pytest.fail("again"))
+        runtime = mfvpr.Runtime(progress=lambda label: lambda *_: pytest.fail("again"))
+        again = stages.match(features[1], features[0], candidates, store=store, runtime=runtime)
         alone, stored = stages.stored_matches(store)
         read_again, _ = stages.stored_matches(store, memory=1e-5)
     assert isinstance(read_again.matches, StoredMatches)

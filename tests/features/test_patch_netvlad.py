@@ -16,7 +16,7 @@ from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache, features, vectors
 from mfvpr.utils import InputError
-from tests.builders import read_golden
+from tests.builders import evaluate_parts, read_golden
 from tests.features.conftest import read_rows
 from tests.golden import make_patch_scores as patch_scores
 from tests.golden.make_netvlad import POSITIONS, image, name
@@ -91,13 +91,13 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     lines = []
     cache = partial(FeatureCache, tmp_path, tell=lines.append)
     options = {"candidates": 6, "cache": cache()}
-    report = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, **options)
+    report = evaluate_parts(dataset, extractor, Retrieval(extractor), SCORERS, **options)
     assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches
     single = []
     for size in sizes:  # out of stores as well, which round descriptors
         alone = replace(extractor, patch_sizes=(size,), scale_weights=None)
         scale_cache = FeatureCache(tmp_path / str(size))
-        single.append(mfvpr.evaluate(dataset, alone, Retrieval(alone), SCORERS, candidates=6, cache=scale_cache))
+        single.append(evaluate_parts(dataset, alone, Retrieval(alone), SCORERS, candidates=6, cache=scale_cache))
     for scorer in SCORERS:
         expected = 0.0
         for weight, alone in zip(weights, single, strict=True):
@@ -107,9 +107,9 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
         [ranked] = report.systems[scorer]
         actual = np.take_along_axis(ranked.scores, np.argsort(ranked.rows, axis=1), axis=1)
         np.testing.assert_allclose(actual, expected, atol=1e-4)
-    again = mfvpr.evaluate(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, cache=cache())
+    again = evaluate_parts(dataset, extractor, Retrieval(extractor), SCORERS, candidates=6, cache=cache())
     other = replace(extractor, scale_weights=(1.0, 2.0, 3.0))
-    changed = mfvpr.evaluate(dataset, other, Retrieval(other), SCORERS, candidates=6, cache=cache())
+    changed = evaluate_parts(dataset, other, Retrieval(other), SCORERS, candidates=6, cache=cache())
     assert sum("images to do" in line for line in lines) == 2  # weights are no part of what is kept
     for scorer in SCORERS:
         np.testing.assert_array_equal(again.systems[scorer][0].scores, report.systems[scorer][0].scores)

@@ -22,10 +22,10 @@ from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.scoring import GridAnchors
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.features import forecast_bytes, pack_features
-from mfvpr.utils import InputError
+from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import difference, fingerprint
 from mfvpr.utils.whitening import Whitening, fit_whitening
-from tests.builders import local, make_shortlist
+from tests.builders import evaluate_parts, local, make_shortlist
 from tests.networks.test_ssm_maps import published
 
 pytestmark = pytest.mark.thorough
@@ -177,7 +177,9 @@ def kept(root):
 
 def labeled_cache(root, labels):
     """A cache that adds what it computes to the labels."""
-    return FeatureCache(root, track=lambda label: labels.append(label) or (lambda items, total=None: items))
+    return FeatureCache(
+        root, runtime=mfvpr.Runtime(progress=lambda label: labels.append(label) or progress.no_progress)
+    )
 
 
 def test_what_is_learned_is_kept_and_made_once(cells, learned, dataset, tmp_path):
@@ -275,14 +277,14 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     labels, database = [], small_street / "database"
     several = sequences_dataset(database, [small_street / "queries", database], ground_truth="none")
     options = {"candidates": 3, "matcher": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
-    report = mfvpr.evaluate(several, cells, RETRIEVAL, {"count": mfvpr.MatchCount()}, **options)
+    report = evaluate_parts(several, cells, RETRIEVAL, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1
     [first, second] = report.matched
     assert (first.matches[0].counts == 12).all()
     np.testing.assert_array_equal(report.systems["count"][1].scores, np.full((10, 3), 12))
     assert second.matches[0].counts.shape == (10, 3)
     with pytest.raises(InputError, match=r"^grid: .*NaN"):  # of 4 x 3 cells
-        mfvpr.evaluate(several, cells, RETRIEVAL, {"grid": GridAnchors(3)}, **options)
+        evaluate_parts(several, cells, RETRIEVAL, {"grid": GridAnchors(3)}, **options)
 
 
 @pytest.mark.slow
@@ -291,11 +293,12 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
     self_dataset = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
     options = {"matcher": CANDIDATE, "cache": FeatureCache(tmp_path)}
-    report = mfvpr.evaluate(self_dataset, square, RETRIEVAL, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
+    report = evaluate_parts(self_dataset, square, RETRIEVAL, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
     [ranked] = report.systems["grid"]
     np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
     np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
-    recipes = [matches_recipe(self_dataset, self_dataset.only, square, RETRIEVAL, 4, CANDIDATE, FeatureCache(tmp_path))]
+    pipeline = mfvpr.Pipeline(square, RETRIEVAL, CANDIDATE, 4)
+    recipes = [matches_recipe(self_dataset, self_dataset.only, pipeline, FeatureCache(tmp_path))]
     recipes.append(recipes[0] | {"database": FeatureCache().recipe(self_dataset.database, square)})
     assert "whitening" in difference(*recipes)
 
@@ -308,5 +311,6 @@ def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset,
     [candidates] = retriever.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
     assert len(kept(tmp_path)) == 1
-    matched = match_sequence(replace(dataset, database=few), sequence, RETRIEVAL.describer.extractor, retriever, 3)
+    pipeline = mfvpr.Pipeline(RETRIEVAL.describer.extractor, retriever, candidates=3)
+    matched = match_sequence(replace(dataset, database=few), sequence, pipeline)
     np.testing.assert_array_equal(matched.candidates.scores.sum(1), [36 * 3])

@@ -31,6 +31,7 @@ from mfvpr.storage.map_entries import DEEPEST, check_entry
 from mfvpr.types import Features
 from mfvpr.utils import InputError
 from tests import scorers
+from tests.builders import evaluate_parts
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.thorough
@@ -60,7 +61,7 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
     systems = {"histogram": mfvpr.HistogramOfShifts(), "plain": scorers.plain,
                "sampled": scorers.Sampled(jax.random.key(0)), "host": mfvpr.OpenCvHomography()}  # fmt: skip
     retriever = Retrieval(Aggregated(SIFT, VLAD))
-    result = mfvpr.evaluate(dataset, SIFT, retriever, systems, candidates=5, cache=FeatureCache(tmp_path))
+    result = evaluate_parts(dataset, SIFT, retriever, systems, candidates=5, cache=FeatureCache(tmp_path))
     for name, scorer in systems.items():
         [ranked], known = result.systems[name], opened(folder, scorer=scorer)
         for query, path in enumerate(dataset.queries.paths):

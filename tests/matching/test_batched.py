@@ -121,7 +121,8 @@ def assert_same(first, second):
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
     candidates = shortlist_of()
-    match_set = stages.match(queries, database, candidates, NearestNeighborMatcher(**options), memory=memory)
+    matcher, runtime = NearestNeighborMatcher(**options), mfvpr.Runtime(memory=memory)
+    match_set = stages.match(queries, database, candidates, matcher, runtime=runtime)
     options = {name: value for name, value in options.items() if name != "chunk_size"}
     expected = expected_of(queries, database, candidates, **options)
     assert match_set.counts.sum() > 300
@@ -133,7 +134,7 @@ def test_every_pair_is_matched_as_alone(options, memory):
 def test_descriptors_of_any_length_and_queries_of_several_capacities(longest):
     database, queries = sets(longest)
     candidates = shortlist_of(2, len(queries), len(database))
-    match_set = stages.match(queries, database, candidates, memory=SMALL)
+    match_set = stages.match(queries, database, candidates, runtime=mfvpr.Runtime(memory=SMALL))
     assert (max(matches.distance.max(initial=0) for matches in match_set.matches) > 2) == (longest > 1)
     assert_as_alone(match_set, queries, database, candidates, expected_of(queries, database, candidates))
 
@@ -148,7 +149,7 @@ def test_stored_features_are_matched_as_those_in_memory(tmp_path):
             store.write({row: image for row, image in images.items() if row % 10 != 4})
         stored.append(FeatureSet(Counting(store), {4: "bad"}))
         in_memory.append(FeatureSet(InMemory(dict(store.read()), len(side)), {4: "bad"}))
-    match_set = stages.match(*stored, candidates, memory=1)
+    match_set = stages.match(*stored, candidates, runtime=mfvpr.Runtime(memory=1))
     assert_same(match_set, stages.match(*in_memory, candidates))
     assert_as_alone(match_set, *in_memory, candidates, expected_of(*in_memory, candidates))
     # Each side looks at its first image once more, for the size of a keypoint.
@@ -161,7 +162,7 @@ def test_stored_features_are_matched_as_those_in_memory(tmp_path):
         assert sum(reads.values()) == len(requested) + 1
     for side in stored:
         side.source.reads.clear()
-    assert_same(stages.match(*stored, candidates, memory=SMALL), match_set)
+    assert_same(stages.match(*stored, candidates, runtime=mfvpr.Runtime(memory=SMALL)), match_set)
     assert max(stored[1].source.reads.values()) > 1
 
 
@@ -218,7 +219,7 @@ def on_devices(out):
     queries, database, candidates = for_devices()
     results = []
     for devices, memory in ((jax.devices(), SMALL), (jax.devices()[-1:], SMALL), (None, None)):
-        match_set = stages.match(queries, database, candidates, devices=devices, memory=memory)
+        match_set = stages.match(queries, database, candidates, runtime=mfvpr.Runtime(devices, memory))
         scores = stages.score({"histogram": mfvpr.HistogramOfShifts()}, match_set, candidates)["histogram"]
         results.append({"ranking": rank_shortlist(candidates, scores).tolist(), "matches": as_hex(match_set)})
     Path(out).write_text(json.dumps({"devices": jax.device_count(), "results": results}))

@@ -9,10 +9,10 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, LightGlueMatcher, NearestNeighborMatcher
-from mfvpr.evaluation import stages
-from mfvpr.evaluation.validation import check_matching
+from mfvpr.evaluation import Pipeline, stages
 from mfvpr.features import FeatureSet, Scale, Sift
 from mfvpr.networks.lightglue_assignment import assignment
+from mfvpr.retrieval import ShortlistFiles
 from mfvpr.storage.matches import open_match_store
 from mfvpr.types import per_keypoint, per_match
 from mfvpr.utils import ragged, recipe_of
@@ -154,18 +154,19 @@ def test_features_of_another_kind_are_one_line():
     expected = (
         "^LightGlue: expected ALIKED's features, of 16 dimensions, got {}; extract these, or match nearest neighbors$"
     )
+    retriever = ShortlistFiles({})
     for extractor, got in ((Sift(), "Sift of 128"), (Extractor(16, 64), "Extractor of 16, 64")):
         with pytest.raises(InputError, match=expected.format(got)):
-            check_matching(50, extractor, matcher())
-        check_matching(50, extractor, NearestNeighborMatcher())
-    check_matching(50, Extractor(16), matcher())
-    check_matching(50, Extractor(0), matcher())  # not known before they are read
+            Pipeline(extractor, retriever, matcher())
+        Pipeline(extractor, retriever, NearestNeighborMatcher())
+    Pipeline(Extractor(16), retriever, matcher())
+    Pipeline(Extractor(0), retriever, matcher())  # not known before they are read
     with pytest.raises(InputError, match=r"^LightGlue: .*16 dimensions, got 8\b"):
         match_one(matcher(), *pair(COUNTS, 8, 0))
     with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1$"):
-        check_matching(50, Extractor(16), matcher(depth_confidence=95))
+        Pipeline(Extractor(16), retriever, matcher(depth_confidence=95))
     with pytest.raises(InputError, match=r"^matcher: .*the class NearestNeighborMatcher; .*mfvpr.Matcher"):
-        check_matching(50, Extractor(16), NearestNeighborMatcher)
+        Pipeline(Extractor(16), retriever, NearestNeighborMatcher)
 
 
 # Matchers of one's own

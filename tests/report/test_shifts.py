@@ -38,7 +38,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
     tools, images = stages.prepare(settings, Stopwatch())
-    matches, candidates = stages.match_data_set(settings, tools, images, Stopwatch())
+    matches, candidates = stages.match_data_set(tools, images, Stopwatch())
     weight = evaluation.build.scorers(settings["scorer"])["histogram"].weight
     scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
     names = images.dataset.database.names

@@ -69,7 +69,8 @@ def devices_agree():
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
 
-    alone, shared = (stages.score({"a": plain}, match_set, candidates, devices=on)["a"] for on in (None, devices))
+    runtimes = mfvpr.Runtime(), mfvpr.Runtime(devices)
+    alone, shared = (stages.score({"a": plain}, match_set, candidates, runtime=runtime)["a"] for runtime in runtimes)
     np.testing.assert_array_equal(alone, shared, strict=True)
     assert len(np.unique(alone)) > CANDIDATES
     settings = [{"max_distance": limit, "c": 0.1} for limit in (0.8, 1.5)]
@@ -151,7 +152,8 @@ def test_scales_of_other_queries_or_weights_raise(data):
 def test_progress_is_of_the_batches_of_all_scales(two_scales):
     scales, candidates = two_scales
     seen = []
-    stages.score(SCORERS, scales, candidates, track=lambda items, total: seen.append(total) or items)
+    runtime = mfvpr.Runtime(progress=lambda label: lambda items, total: seen.append(total) or items)
+    stages.score(SCORERS, scales, candidates, runtime=runtime)
     assert seen == [2]
 
 

@@ -14,7 +14,7 @@ from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.reranking.cohort_normalization import PRIOR, by_hubness, cohort_sequence, hubness
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
-from tests.builders import make_shortlist
+from tests.builders import evaluate_parts, make_shortlist
 from tests.programs import QUERIES, composed, folder, shared, small, typed
 from tests.reranking.conftest import SCORERS, SIFT, VLAD
 
@@ -102,10 +102,10 @@ def evaluation(dataset, cache_folder):
         tracked.append(label)
         return lambda items, total: items
 
-    result = mfvpr.evaluate(
+    result = evaluate_parts(
         both, SIFT, VLAD, SCORERS, candidates=5, cohort=2, fused={"histogram + cohort": Fusion(10.0)},
         correlated={"count + cohort": FrameCorrelation(1)},
-        cache=FeatureCache(cache_folder, tell=lines.append, track=track),
+        cache=FeatureCache(cache_folder, runtime=mfvpr.Runtime(log=lines.append, progress=track)),
     )  # fmt: skip
     return result, lines, tracked
 
@@ -114,12 +114,13 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, cache_folder, e
     result, *_ = evaluation
     more = ["histogram + cohort", "count + cohort", "histogram + cohort + retrieval", "count + cohort + frames"]
     assert [*result.systems] == ["retrieval", "histogram", "count", *more]
-    without = mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(cache_folder))
+    without = evaluate_parts(dataset, SIFT, VLAD, SCORERS, candidates=5, cache=FeatureCache(cache_folder))
     for name, [ranked] in without.systems.items():
         np.testing.assert_array_equal(result.systems[name][0].rows, ranked.rows)
         np.testing.assert_array_equal(result.systems[name][0].scores, ranked.scores)
     cache = FeatureCache(cache_folder)
-    cohort = match_sequence(dataset, cohort_sequence(cache.contents(dataset.database), 2), SIFT, VLAD, 5, cache=cache)
+    sequence = cohort_sequence(cache.contents(dataset.database), 2)
+    cohort = match_sequence(dataset, sequence, mfvpr.Pipeline(SIFT, VLAD, candidates=5), cache=cache)
     candidates = cohort.candidates
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()
     for name, scores in stages.score(SCORERS, cohort.by_scale, candidates).items():
@@ -141,17 +142,25 @@ def test_sequences_share_a_cohort_that_is_cached(dataset, cache_folder, evaluati
     assert {"cohort matching", "cohort scores"} <= {*tracked}
     assert result.seconds["cohort"] > 0
     lines = []
-    mfvpr.evaluate(dataset, SIFT, VLAD, {}, candidates=5, cohort=2, cache=FeatureCache(cache_folder, tell=lines.append))
+    evaluate_parts(
+        dataset,
+        SIFT,
+        VLAD,
+        {},
+        candidates=5,
+        cohort=2,
+        cache=FeatureCache(cache_folder, runtime=mfvpr.Runtime(log=lines.append)),
+    )
     assert lines[0].startswith("cohort matches: all 10 queries from ")
 
 
 def test_names_of_systems_with_a_cohort_are_known_only_with_one(dataset):
     for options in ({"fused": {"count + cohort": Fusion()}}, {"correlated": {"count + cohort": FrameCorrelation()}}):
         with pytest.raises(InputError, match=r"\(histogram, count\)|got count \+ cohort"):
-            mfvpr.evaluate(dataset, SIFT, VLAD, SCORERS, **options)
+            evaluate_parts(dataset, SIFT, VLAD, SCORERS, **options)
     taken = {"count": mfvpr.MatchCount(), "count + cohort": mfvpr.MatchCount()}
     with pytest.raises(InputError, match=r"count \+ cohort .*system"):
-        mfvpr.evaluate(dataset, SIFT, VLAD, taken, cohort=2)
+        evaluate_parts(dataset, SIFT, VLAD, taken, cohort=2)
 
 
 @pytest.fixture(scope="session")

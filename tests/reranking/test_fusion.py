@@ -13,6 +13,7 @@ from mfvpr.reranking.fusion import rank_sequence
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.types import Shortlist
 from tests import oracles
+from tests.builders import evaluate_parts
 from tests.reranking.conftest import SCORERS, SIFT, VLAD
 
 pytestmark = pytest.mark.thorough
@@ -87,7 +88,7 @@ def test_a_system_is_called_by_what_takes_part():
 
 @pytest.fixture(scope="module")
 def sequence_matches(dataset):
-    return match_sequence(dataset, dataset.only, SIFT, VLAD, 5)
+    return match_sequence(dataset, dataset.only, mfvpr.Pipeline(SIFT, VLAD, candidates=5))
 
 
 def rank_by(matched, fused, correlated):
@@ -131,7 +132,7 @@ def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
         folder.symlink_to(small_street / "queries")
     several = sequences_dataset(small_street / "database", folders, ground_truth="none")
     options = {"candidates": 5, "fused": {"histogram": BOTH}}
-    results = [mfvpr.evaluate(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several)]
+    results = [evaluate_parts(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several)]
     [alone], rankings = (result.systems["histogram + count + retrieval"] for result in results)
     for ranking in rankings:
         np.testing.assert_array_equal(ranking.rows, alone.rows)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.images import resize
 from mfvpr.features import Aggregated, Description, VladFitting
@@ -209,7 +210,7 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
     shutil.copytree(small_street / "database", copy)
     lines, extractor = [], Counted()
     for images, label in ((folder, "summer"), (image_folder(copy), "winter")):
-        FeatureCache(tmp_path / "s", tell=lines.append).local(images, extractor, label=label)
+        FeatureCache(tmp_path / "s", runtime=Runtime(log=lines.append)).local(images, extractor, label=label)
     assert extractor.seen == len(folder)
     [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
     assert lines[0].startswith("summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: ")

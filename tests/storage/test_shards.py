@@ -23,6 +23,7 @@ from mfvpr.storage.vectors import open_vector_store
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from mfvpr.utils.arrays import read_arrays
+from tests.builders import evaluate_parts
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales
 
 pytestmark = pytest.mark.thorough
@@ -35,7 +36,7 @@ HOW = {"candidates": 4, "fused": {"histogram": Fusion("zscore")}, "cohort": 1,
 
 def run_of(dataset, extractor=SIFT, retriever=VLAD, *, skip_bad=False, **how):
     """A function of a cache: the evaluation."""
-    return lambda cache: mfvpr.evaluate(
+    return lambda cache: evaluate_parts(
         dataset, extractor, retriever, SCORERS, cache=replace(cache, skip_bad=skip_bad), **how
     )
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mfvpr import InputError, Shortlist
+from mfvpr import InputError, Runtime, Shortlist
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet
 from mfvpr.storage.matches import open_match_store
@@ -39,7 +39,7 @@ def opened(tmp_path):
 def test_another_shortlist_is_refused_before_anything_is_written(drawn, candidates, opened, monkeypatch):
     monkeypatch.setattr(stages, "STORE_BATCH", 2)
     with opened() as store, pytest.raises(KeyboardInterrupt):
-        stages.match(drawn, drawn, candidates, store=store, track=interrupt_after(5))
+        stages.match(drawn, drawn, candidates, store=store, runtime=Runtime(progress=lambda _: interrupt_after(5)))
     shortlists = [
         replace(candidates, indices=candidates.indices[:, ::-1]),
         replace(candidates, indices=np.where(np.arange(QUERIES)[:, None] == 3, 0, candidates.indices)),

@@ -1,0 +1,129 @@
+"""What is evaluated, as values: a pipeline finds and matches candidates, a system scores and ranks them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.sift import Sift
+from mfvpr.matching.lightglue import LightGlueMatcher
+from mfvpr.matching.matcher import NEIGHBORS, Matcher, NearestNeighborMatcher
+from mfvpr.matching.nearest_neighbors import CrossCheck
+from mfvpr.reranking.frame_correlation import FrameCorrelation
+from mfvpr.reranking.fusion import Fusion
+from mfvpr.reranking.ranking import Ties
+from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
+from mfvpr.retrieval.retriever import Retriever
+from mfvpr.scoring.fields import check_bounds
+from mfvpr.scoring.registry import SCORERS
+from mfvpr.scoring.scorer import Scorer
+from mfvpr.utils.errors import InputError, require_word
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Images -> features -> shortlist -> matches.
+
+        sift = Sift()
+        pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())), candidates=50)
+
+    Attributes:
+        extractor: extracts local features, or reads them, see `mfvpr.retrieval.precomputed`.
+        retriever: the retrieval, which finds candidates.
+        matcher: matches a pair, see `mfvpr.Matcher`.
+        candidates: number of candidates of each query.
+    """
+
+    extractor: Extractor | Source
+    retriever: Retriever
+    matcher: Matcher = NEIGHBORS
+    candidates: int | Literal["all"] = 50
+
+    def __post_init__(self) -> None:
+        """Check the parts.
+
+        Raises:
+            InputError: the extractor gives no local features, the matcher cannot be called or does not suit the
+                extractor, or a number is out of its range.
+        """
+        is_whole = isinstance(self.candidates, int | np.integer) and not isinstance(self.candidates, bool)
+        if self.candidates != "all" and not (is_whole and self.candidates >= 1):
+            raise InputError(f"candidates={self.candidates!r}: expected a whole number from 1, or 'all'")
+        if not self.extractor.scales:
+            name = type(self.extractor).__name__
+            raise InputError(f"{name}: gives no local features; expected an extractor that does")
+        if isinstance(self.matcher, type) or not callable(self.matcher):
+            got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
+            raise InputError(f"matcher: expected what maps the features of two images to Matches, got {got}; see "
+                             "mfvpr.Matcher")  # fmt: skip
+        if isinstance(self.matcher, NearestNeighborMatcher):
+            require_word("cross_check", self.matcher.cross_check, CrossCheck)
+        if isinstance(self.matcher, LightGlueMatcher):
+            _check_lightglue(self.matcher, self.extractor)
+
+
+@dataclass(frozen=True)
+class System:
+    """Matches -> scores -> rankings: by the retrieval, by each scorer, and by what combines scores.
+
+    Attributes:
+        pipeline: finds and matches candidates.
+        scorers: by name.
+        fused: by name of a scorer, how its score is combined with the retrieval's (ranking `name + retrieval`), or with
+            other scorers' and the retrieval's (`name + other + retrieval`).
+        correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
+            before (`name + frames`).
+        cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
+            sides of a database image that show its place, and are left out; None = no cohort.
+        ties: equal scores keep the order of the retrieval, or go by the row of the database.
+    """
+
+    pipeline: Pipeline
+    scorers: Mapping[str, Scorer]
+    fused: Mapping[str, Fusion] = field(default_factory=dict)
+    correlated: Mapping[str, FrameCorrelation] = field(default_factory=dict)
+    cohort: int | None = None
+    ties: Ties = "retrieval"
+
+    def __post_init__(self) -> None:
+        """Check the scorers and the names of their combinations.
+
+        Raises:
+            InputError: a scorer is not callable or out of its bounds, a name is taken, or a combination has no scorer.
+        """
+        require_word("ties", self.ties, Ties)
+        with_cohort = [] if self.cohort is None else [f"{name} + {COHORT}" for name in self.scorers]
+        alone = [*self.scorers, *with_cohort]
+        for name, fusion in self.fused.items():
+            fusion.check(name, alone)
+        combined = [fusion.system(name) for name, fusion in self.fused.items()]
+        several = {*alone, *combined}
+        if unknown := [name for name in self.correlated if name not in several]:
+            raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
+                             f"{unknown[0]}")  # fmt: skip
+        reserved = {RETRIEVAL, *with_cohort, *combined, *(f"{name} + {FRAMES}" for name in self.correlated)}
+        for name, scorer in self.scorers.items():
+            if name in reserved:
+                raise InputError(f"scorers: {name} is the name of another system; choose another one")
+            _check_scorer(name, scorer)
+
+
+def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:
+    for name in ("filter_threshold", "depth_confidence"):
+        if (share := getattr(matcher, name)) is not None and not 0 <= share <= 1:
+            raise InputError(f"{name}={share}: expected a number from 0 to 1")
+    dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
+    if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
+        got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
+        raise InputError(f"LightGlue: expected ALIKED's features, of {matcher.dimension} dimensions, got {got}; "
+                         "extract these, or match nearest neighbors")  # fmt: skip
+
+
+def _check_scorer(name: str, scorer: Scorer) -> None:
+    if isinstance(scorer, type) or not callable(scorer):
+        got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
+        raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
+    if type(scorer) in SCORERS.values():
+        check_bounds(scorer)

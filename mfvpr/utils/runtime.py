@@ -1,0 +1,40 @@
+"""How a call is carried out: devices, memory, progress and messages. They change no result."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import Device
+from mfvpr.utils.progress import Track, no_progress
+
+
+@dataclass(frozen=True)
+class Runtime:
+    """Devices, memory, progress and messages of a call.
+
+        mfvpr.evaluate(dataset, system, runtime=Runtime(memory=4.0, log=print))
+
+    Attributes:
+        devices: that share the work; None = the default device of JAX.
+        memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what
+            is free.
+        progress: label -> progress bar of the next loop.
+        log: called with one line: the work to be done and the disk space it takes, or a warning.
+    """
+
+    devices: Sequence[Device] | None = None
+    memory: float | None = None
+    progress: Callable[[str], Track] = lambda label: no_progress
+    log: Callable[[str], None] = lambda line: None
+
+    def __post_init__(self) -> None:
+        if self.memory is not None and not 0 < self.memory < math.inf:
+            raise InputError(f"memory={self.memory!r}: expected GB above 0, or None")
+
+    def with_prefix(self, prefix: str) -> "Runtime":
+        """The same with a prefix of all labels of progress."""
+        return replace(self, progress=lambda label: self.progress(f"{prefix} {label}"))
+
+
+DEFAULT_RUNTIME = Runtime()
