@@ -26,9 +26,9 @@ def test_missing_and_empty_folders(tmp_path, name, words):
 def test_numbers_of_any_length_in_names_of_any_kind_sort_by_value(tmp_path):
     names = [f"{number}.png" for number in ("2", "10", "0010", "9" * 200, "1" + "0" * 200, "0" * 150 + "3")]
     long = "/".join(["7" * 200] * 15)  # the digits of a path are read folder by folder
-    others = ["img2.png", "img10.png", "sub/img2.png", "a b/ü@1.png", "IMG3.JPG", "img02.png", f"{long}/1.png"]
-    folder = image_folder(fill(tmp_path, [*names, *others]))
-    assert set(folder.names) == {*names, *others}
+    other_names = ["img2.png", "img10.png", "sub/img2.png", "a b/ü@1.png", "IMG3.JPG", "img02.png", f"{long}/1.png"]
+    folder = image_folder(fill(tmp_path, [*names, *other_names]))
+    assert set(folder.names) == {*names, *other_names}
     assert folder.names.index("img2.png") < folder.names.index("img10.png")
     order = [folder.names.index(names[place]) for place in (0, 5, 1, 3, 4)]
     assert order == sorted(order)

@@ -174,7 +174,8 @@ def test_queries_without_an_answer_are_reranked_first():
     probabilities, correct = np.linspace(0.99, 0.01, 20), {"retrieval": np.zeros(20, bool), "it": np.zeros(20, bool)}
     probabilities[3] = np.nan
     correct["it"][3] = correct["retrieval"][19] = True
-    calibrated: Any = SimpleNamespace(probabilities={"retrieval": probabilities}, correct=correct.__getitem__)
+    evaluation = SimpleNamespace(hits=correct.__getitem__)
+    calibrated: Any = SimpleNamespace(probabilities={"retrieval": probabilities}, evaluation=evaluation)
     np.testing.assert_allclose(recall_by_share(calibrated, "it")[:4], [0.05, 0.1, 0.05, 0.05])
 
 

@@ -123,7 +123,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several)
     calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
     predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
-    correct, halved = calibrated.correct("count"), halves(dataset.truth.positives(1))
+    correct, halved = calibrated.evaluation.hits("count"), halves(dataset.truth.positives(1))
     for half in halved:
         fitted = fit_confidence(inputs[half.tune], correct[half.tune])
         expected = fitted.probability(inputs[half.report])

@@ -122,12 +122,12 @@ def test_conf_and_help_follow_from_the_class(near, succeed):
 
 
 @pytest.mark.parametrize(("program", "arguments", "words"), [
-    ("evaluate", ["scorer=all", "scorer.near.radius=0"], "near.radius=0: expected a number above 0 (1e-6 to 1e12)"),
+    ("evaluate", ["scorer=all", "scorer.near.radius=0"], "near.radius=0: expected a number from 1e-06"),
     ("evaluate", ["scorer=all", "scorer.near.most=501"], "near.most=501: expected a number from 1 to 500, or null"),
     ("evaluate", ["scorer=near", "scorer.rounds=10"], "scorer.rounds=10: expected a whole number from 1 to 9"),
     ("evaluate", ["scorer=near", "scorer.norm=both"], "scorer.norm=both: expected one of sum, largest"),
     ("evaluate", ["scorer=near", "scorer.weight=heavy"], " ends in .json"),
-    ("evaluate", ["scorer=near", "scorer.size=[1]"], "size=[1]: expected a list of 2, each a number above 0"),
+    ("evaluate", ["scorer=near", "scorer.size=[1]"], "size=[1]: expected a list of 2, each a number from 1e-06"),
     ("evaluate", ["scorer=near", "scorer.strict=1"], "scorer.strict=1: expected one of true, false"),
     ("evaluate", ["scorer=near", "scorer.method=[1]"], "scorer.method=[1]: expected one of count"),
     ("sweep", ["scorer=near", "grid.radius=[-1]"], "radius=[-1]: expected a list of one or more, each a number"),

@@ -77,7 +77,7 @@ def test_scorers_of_conf_are_as_their_fields_say():
 def test_values_without_meaning_are_refused(name, value):
     config = OmegaConf.create(composed())
     OmegaConf.update(config, name, value)
-    with pytest.raises(SettingsError, match=f"{name}=.*expected a number above 0"):
+    with pytest.raises(SettingsError, match=f"{name}=.*expected a number from 1e-06"):
         settings.check(OmegaConf.to_container(config))
 
 

@@ -114,7 +114,7 @@ def test_optuna_draws_within_the_axes():
 def test_optuna_proposes_after_the_scorers_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch):
     optuna = pytest.importorskip("optuna")
     values, tell = [], optuna.Study.tell
-    monkeypatch.setattr(optuna.Study, "tell", lambda *told: values.append(told[-1]) or tell(*told))
+    monkeypatch.setattr(optuna.Study, "tell", lambda *arguments: values.append(arguments[-1]) or tell(*arguments))
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
     protocol = evaluation_protocol(TRUTH, TOLERANCES, "both")
     outcome = sweeping.search_optuna(axes, protocol, *data, trials=3, seed=1, ks=[1])
