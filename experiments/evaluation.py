@@ -85,9 +85,9 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     fusions = {name: fusion.rename_main(main, name) for name in fused_systems}
     confidence = confidences.check_confidence(confidence, headline, settings, images)
     correlated = {headline: frames} if frames else {}
-    system = System(tools.pipeline, scorers, fusions, correlated, cohort, settings["ties"])
+    system = System(tools.pipeline, scorers, fusions, correlated, cohort, settings["ties"], headline)
     result = evaluation.evaluate(images.dataset, system, cache=tools.cache)
-    result = replace(result, seconds=watch.seconds | result.seconds)
+    result = replace(result, seconds={**watch.seconds, **result.seconds})
     parameters = _parameters(settings, main, fusions)
     if frames:
         parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)

@@ -19,7 +19,7 @@ from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.report.file_names import file_names
 from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
-from mfvpr.utils import InputError
+from mfvpr.utils import InputError, Runtime
 from mfvpr.utils.files import printable
 
 
@@ -27,7 +27,7 @@ def localize(settings: dict[str, Any]) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
     robot_map = maps.open_map(
         build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
-        memory=settings["memory"],
+        runtime=Runtime(memory=settings["memory"]),
     )  # fmt: skip
     drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):

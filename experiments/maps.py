@@ -9,7 +9,7 @@ from experiments import build
 from experiments.console import track
 from experiments.settings import SettingsError, check
 from experiments.stages import dataset_of
-from mfvpr.features import Aggregated
+from mfvpr.evaluation import Pipeline, System
 from mfvpr.localization import Map
 from mfvpr.storage.disk import used_bytes
 from mfvpr.utils.files import printable, write_text
@@ -97,10 +97,7 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     """The map in a folder, with these settings."""
-    extractor: Any = build.extractor(settings["features"], None)  # `_check` excludes feature files
-    retrieval: Any = build.retriever(settings["retrieval"], extractor, None)  # and retrieval without a describer
-    describer: Any = retrieval.describer
-    describer = describer.fitting if isinstance(describer, Aggregated) else describer
-    [scorer] = build.scorers(settings["scorer"]).values()
-    return Map(folder, extractor, describer, scorer=scorer, matcher=build.matcher(settings["matching"]),
-               candidates=settings["candidates"], **options)  # fmt: skip
+    extractor = build.extractor(settings["features"], None)
+    retriever, matcher = build.retriever(settings["retrieval"], extractor, None), build.matcher(settings["matching"])
+    pipeline = Pipeline(extractor, retriever, matcher, settings["candidates"])
+    return Map(folder, System(pipeline, build.scorers(settings["scorer"])), **options)

@@ -10,7 +10,9 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import Features, Matches, Pipeline, Shortlist, System, types
+from mfvpr.features import Aggregated, Extractor
 from mfvpr.matching import MatchSet
+from mfvpr.retrieval import Retrieval
 
 SIZE = 336
 
@@ -20,6 +22,13 @@ def evaluate_parts(dataset, extractor, retriever, scorers, *, cache=None, runtim
     of_pipeline = {name: options.pop(name) for name in ("matcher", "candidates") if name in options}
     system = System(Pipeline(extractor, retriever, **of_pipeline), scorers, **options)
     return mfvpr.evaluate(dataset, system, cache=cache, runtime=runtime)
+
+
+def map_system(extractor, describer, scorer=None, candidates=50):
+    """A system for a map; the describer is an extractor, or the fitting of a vocabulary."""
+    describer = describer if isinstance(describer, Extractor) else Aggregated(extractor, describer)
+    pipeline = Pipeline(extractor, Retrieval(describer), candidates=candidates)
+    return System(pipeline, {"histogram": mfvpr.HistogramOfShifts()} if scorer is None else {"it": scorer})
 
 
 def unit(array):

@@ -26,7 +26,8 @@ PERMISSIONS = {
     },
     "testing": {"reranking", "scoring", "types", "utils"},
     "localization": {
-        "datasets", "evaluation", "features", "matching", "reranking", "scoring", "storage", "types", "utils",
+        "datasets", "evaluation", "features", "matching", "reranking", "retrieval", "scoring", "storage", "types",
+        "utils",
     },
     "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {

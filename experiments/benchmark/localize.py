@@ -15,9 +15,12 @@ from experiments.console import bar
 from mfvpr.checkpoints import REGISTRY, is_installed, load_model
 from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.features import AlikedFeatures, Sift, VladFitting
+from mfvpr.evaluation import Pipeline, System
+from mfvpr.features import Aggregated, AlikedFeatures, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.report import Table
+from mfvpr.retrieval import Retrieval
+from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage.maps import Entry
 from mfvpr.types import Features
 
@@ -34,8 +37,10 @@ def run(rounds: int | None, out: Path) -> None:
         street = streets_folder(Path(root), num_frames=FRAMES)
         images, queries = image_folder(street / "database"), image_folder(street / "queries")
         for name, extractor in _extractors():
+            pipeline = Pipeline(extractor, Retrieval(Aggregated(extractor, VladFitting())), candidates=CANDIDATES)
+            system = System(pipeline, {"histogram": HistogramOfShifts()})
             for size in SIZES:
-                street_map = Map(Path(root) / f"{name}-{size}", extractor, VladFitting(), candidates=CANDIDATES)
+                street_map = Map(Path(root) / f"{name}-{size}", system)
                 _fill(street_map, images, size)
                 rows.append({"detector": name, "images": size} | _percentiles(street_map, queries, rounds or ROUNDS))
     header = ["features", "images", "p50, ms", "p95, ms", "p50, candidates read", "p95", "features alone"]

@@ -21,7 +21,7 @@ from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
 from mfvpr.evaluation.validation import score_warnings
 from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
-from mfvpr.reranking.fusion import rank_sequence
+from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.shards import together
@@ -57,8 +57,8 @@ def evaluate(
     of_cohort = [] if system.cohort is None else [partial(_score_cohort, dataset, system, system.cohort, cache, watch)]
     scored: list[Scored] = together(*of_cohort, *calls)
     strengths = _hubness(len(dataset.database), *scored.pop(0)) if of_cohort else {}
-    combinations = system.fused, system.correlated, system.ties
-    ranked = [rank_sequence(*result, *combinations, hubness=strengths) for result in scored]
+    ways = system.fused, system.correlated, system.ties
+    ranked = [rank_by_systems(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
     matched = [sequence for sequence, _ in scored]
     for line in score_warnings(matched, ranked, system.scorers):
         cache.warn(line)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from mfvpr.scoring.fields import check_bounds
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.files import clip_middle
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,11 @@ class Pipeline:
             InputError: the extractor gives no local features, the matcher cannot be called or does not suit the
                 extractor, or a number is out of its range.
         """
-        is_whole = isinstance(self.candidates, int | np.integer) and not isinstance(self.candidates, bool)
-        if self.candidates != "all" and not (is_whole and self.candidates >= 1):
-            raise InputError(f"candidates={self.candidates!r}: expected a whole number from 1, or 'all'")
+        number: Any = self.candidates
+        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+        if not (number >= 1 if is_whole else isinstance(number, str) and number == "all"):
+            got = clip_middle(" ".join(repr(number).split()), 80)
+            raise InputError(f"candidates={got}: expected a whole number from 1, or 'all'")
         if not self.extractor.scales:
             name = type(self.extractor).__name__
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
@@ -78,6 +81,7 @@ class System:
         cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
             sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
+        final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.
     """
 
     pipeline: Pipeline
@@ -86,6 +90,7 @@ class System:
     correlated: Mapping[str, FrameCorrelation] = field(default_factory=dict)
     cohort: int | None = None
     ties: Ties = "retrieval"
+    final: str | None = None
 
     def __post_init__(self) -> None:
         """Check the scorers and the names of their combinations.
@@ -108,6 +113,13 @@ class System:
             if name in reserved:
                 raise InputError(f"scorers: {name} is the name of another system; choose another one")
             _check_scorer(name, scorer)
+        if self.headline not in {*alone, *reserved}:
+            raise InputError(f"final={self.final!r}: expected one of {', '.join([*alone, *reserved])}")
+
+    @property
+    def headline(self) -> str:
+        """Name of the ranking that decides."""
+        return self.final or next(iter(self.scorers), RETRIEVAL)
 
 
 def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:

@@ -1,6 +1,6 @@
 """Localization: a map of images with known places, in which one image at a time is localized.
 
-    known = Map("map", Sift(), VladFitting())
+    known = Map("map", system)
     known.build(folder, places)            # or, image by image: known.add(image, place)
     prediction = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
     route = Route(Drive(advance=1))        # if the map and the queries are in the order of a drive:
@@ -12,7 +12,8 @@ Read first: map (localize one image), images (the images of a map, and how they 
 parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
 matches), route (a drive through a map).
 
-Imports datasets, evaluation, features, matching, reranking, scoring, storage, types, utils.
+Imports datasets, evaluation, features, matching, reranking, retrieval, scoring, storage,
+types, utils.
 """
 
 from mfvpr.localization.map import Map

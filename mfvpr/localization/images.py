@@ -57,7 +57,7 @@ class MapImages:
         self,
         folder: Path | str,
         extractor: Extractor,
-        describer: Extractor | Aggregation | VladFitting,
+        describer: Extractor | VladFitting,
         *,
         candidates: int,
         memory: float | None,

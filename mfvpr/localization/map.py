@@ -2,6 +2,7 @@
 
 import math
 import operator
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,25 +11,31 @@ import jax
 import numpy as np
 
 from mfvpr.evaluation.calibration import Confidence
-from mfvpr.features.extractor import Aggregation, Extractor
+from mfvpr.evaluation.system import System
+from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.describing import Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
-from mfvpr.matching.matcher import NEIGHBORS, Matcher
-from mfvpr.reranking.results import Ranked
-from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.scorer import Scorer
+from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking.results import RETRIEVAL, Ranked
+from mfvpr.retrieval.retriever import Retrieval
+from mfvpr.retrieval.search import ExactSearch
+from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
+from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 
 class Map(MapImages):
     """Images with their places in a folder, in which one image at a time is localized.
 
-        known = Map("map", Sift(), VladFitting())
+        sift = Sift()
+        pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+        known = Map("map", System(pipeline, {"histogram": HistogramOfShifts()}))
         known.build(images, places)
         known.localize("query.jpg").place
 
@@ -39,44 +46,33 @@ class Map(MapImages):
     def __init__(
         self,
         folder: Path | str,
-        extractor: Extractor,
-        describer: Extractor | Aggregation | VladFitting,
+        system: System,
         *,
-        scorer: Scorer | None = None,
-        matcher: Matcher = NEIGHBORS,
-        candidates: int = 50,
         confidence: Confidence | None = None,
         threshold: float | None = None,
-        memory: float | None = None,
+        runtime: Runtime = DEFAULT_RUNTIME,
     ) -> None:
         """Open the map in a folder, which is made when the first image is added.
 
         Args:
             folder: of the map.
-            extractor: takes local features, of one scale.
-            describer: gives global descriptors: the same extractor, another one, an aggregation of the local features,
-                or `VladFitting`, whose vocabulary is learned once (`learn`, or `build`) and stored in the folder.
-            scorer: None = the histogram of shifts.
-            matcher: of a pair.
-            candidates: number of images that are matched, those with the most similar descriptors.
-            confidence: gives the probability p that the top prediction is correct, as an evaluation with the same
-                settings wrote it; None = no p.
-            threshold: of p, below which there is no place.
-            memory: GB that features may take on the device; None = a third of what is free.
+            system: extracts local features of one scale, and retrieves candidates by global descriptors: of an
+                extractor, or aggregated from the local features by a vocabulary, which is learned once (`learn`, or
+                `build`) and stored in the folder. The ranking that decides may combine scores.
+            confidence: gives the probability that the top prediction is correct, as an evaluation with the same system
+                wrote it; None = no probability.
+            threshold: of the confidence, below which there is no place.
+            runtime: memory that features may take on the device.
 
         Raises:
-            InputError: features of several scales, a threshold without a confidence, or a folder with a map that was
-                made with other settings.
+            InputError: a system that a map cannot use, a threshold without a confidence, or a folder with a map that
+                was made with another system.
         """
-        if len(extractor.scales) != 1:
-            raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
-                             f"got {len(extractor.scales)}")  # fmt: skip
-        candidates = _whole_number("candidates", candidates, least=1)
         if threshold is not None and confidence is None:
-            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives p")
-        self.scorer: Scorer = HistogramOfShifts() if scorer is None else scorer
-        self.matcher, self.confidence, self.threshold = matcher, confidence, threshold
-        super().__init__(folder, extractor, describer, candidates=candidates, memory=memory)
+            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
+        extractor, describer, candidates = _extractor(system), _describer(system), system.pipeline.candidates
+        self.system, self.confidence, self.threshold = system, confidence, threshold
+        super().__init__(folder, extractor, describer, candidates=int(candidates), memory=runtime.memory)
 
     def localize(self, image: Image, *, recent: int = 0) -> Prediction:
         """Find where an image was taken; see `localize_with_evidence`."""
@@ -111,25 +107,40 @@ class Map(MapImages):
         if not len(rows):
             return refusal("no candidates", description)
         arrays, slots = self._described.resident.hold(rows.tolist(), features, total)
-        matches, scores = match_and_score(features, arrays, slots, self.candidates, self.matcher, self.scorer)
-        order = np.argsort(-np.where(np.isnan(scores), -np.inf, scores), kind="stable")
-        best = jax.tree.map(lambda leaf: leaf[order[0] : order[0] + 1], matches)
+        matcher, scorers = self.system.pipeline.matcher, self.system.scorers
+        matches, scores = match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
+        ranking, by_retrieval = self._rank(rows, similarities, scores)
+        [place] = np.flatnonzero(rows == ranking.rows[0, 0])
+        best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
         if best.mask.sum() < LEAST_MATCHES:
             return refusal("too few matches", description)
-        ranking = Ranked(rows[order][None], scores[order][None])
-        p = self._probability(ranking, Ranked(rows[None], similarities[None]))
+        p = self._probability(ranking, by_retrieval)
         alternatives = tuple(
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
-            for row, score in zip(rows[order].tolist(), scores[order].tolist(), strict=True)
+            for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
         prediction = Prediction(
-            alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(self.scorer, best)
+            alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(scorers.values(), best)
         )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
             prediction = replace(
                 prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
             )
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
+
+    def _rank(
+        self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]
+    ) -> tuple[Ranked, Ranked]:
+        """The ranking that decides, and that of the retrieval; both compile once, for `candidates` rows."""
+        pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
+        shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
+        padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
+        rankings = rank_by_systems(shortlist, padded_scores, self.system.fused, {}, self.system.ties)
+        decides, retrieval = (
+            Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
+            for ranking in (rankings[self.system.headline], rankings[RETRIEVAL])
+        )
+        return decides, retrieval
 
     def _probability(self, ranking: Ranked, retrieval: Ranked) -> float | None:
         """Probability that the top prediction is correct; None without a confidence or a finite score."""
@@ -146,3 +157,34 @@ def _whole_number(name: str, value: Any, least: int = 0) -> int:
         pass
     got = clip_middle(" ".join(repr(value).split()), 80)
     raise InputError(f"{name}: expected a whole number from {least}, got {got}. Use an `int`.")
+
+
+def _extractor(system: System) -> Extractor:
+    """The extractor of a system; an InputError if a map cannot use it."""
+    extractor, candidates = system.pipeline.extractor, system.pipeline.candidates
+    if isinstance(extractor, Source):
+        name = type(extractor).__name__
+        raise InputError(f"{name}: a map extracts features of images itself; expected an extractor")
+    if len(extractor.scales) != 1:
+        raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
+                         f"got {len(extractor.scales)}")  # fmt: skip
+    if candidates == "all":
+        raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
+    if system.cohort is not None or system.correlated:
+        raise InputError("a map ranks single images: expected a system without cohort and frame correlation")
+    return extractor
+
+
+def _describer(system: System) -> Extractor | VladFitting:
+    """The extractor of global descriptors, or the fitting of the vocabulary; an InputError if a map cannot use it."""
+    retriever = system.pipeline.retriever
+    if not isinstance(retriever, Retrieval) or not isinstance(retriever.search, ExactSearch):
+        name = type(retriever).__name__
+        raise InputError(f"{name}: a map retrieves by global descriptors without whitening; expected Retrieval(...)")
+    if isinstance(describer := retriever.describer, Extractor):
+        return describer
+    is_same = recipe_of(describer.extractor) == recipe_of(system.pipeline.extractor)
+    if not is_same or not isinstance(describer.fitting, VladFitting):
+        raise InputError("a map aggregates its local features: expected Aggregated(extractor, VladFitting(...)) of the "
+                         "same extractor")  # fmt: skip
+    return describer.fitting

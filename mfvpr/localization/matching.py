@@ -1,5 +1,6 @@
 """Match a query with its candidates on the device, score the matches on all cores, and measure the shift of a pair."""
 
+from collections.abc import Iterable, Mapping
 from functools import partial
 
 import jax
@@ -23,9 +24,10 @@ _AT_ONCE = 25  # pairs; with ten a prediction takes 8 ms longer
 
 
 def match_and_score(
-    query: Features, database: Features, slots: Int[np.ndarray, " n"], number: int, matcher: Matcher, scorer: Scorer
-) -> tuple[Matches, Float[np.ndarray, " n"]]:
-    """Matches `[C, K, ...]` of an unpadded query, and scores, NumPy; no pair's result depends on the other pairs.
+    query: Features, database: Features, slots: Int[np.ndarray, " n"], number: int, matcher: Matcher,
+    scorers: Mapping[str, Scorer],
+) -> tuple[Matches, dict[str, Float[np.ndarray, " n"]]]:  # fmt: skip
+    """Matches `[C, K, ...]` of an unpadded query, and scores by name; no pair's result depends on the other pairs.
 
     A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes a few pairs at a
     time. Their number is the same for any number of cores, since the last bits of scores depend on it. A device with
@@ -41,21 +43,25 @@ def match_and_score(
     pairs = np.zeros((round_up(number, size), 2), np.int32)
     pairs[: len(slots), 1] = slots
 
-    def match_part(start: int) -> tuple[Matches, np.ndarray]:
+    def match_part(start: int) -> tuple[Matches, dict[str, np.ndarray]]:
         real = np.int32(np.clip(len(slots) - start, 0, size))
         matches = match_pairs(padded_query, database, pairs[start : start + size], real, matcher)
-        return jax.device_get((matches, score_candidates(scorer, matches)))
+        return jax.device_get((matches, {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}))
 
     workers = min(available_cpus(), len(pairs) // size)
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
     parts = list(map_parts(match_part, range(0, len(pairs), size)))
     matches, scores = jax.tree.map(lambda *fields: np.concatenate(fields)[:number], *parts)
-    return matches, scores[: len(slots)]
+    return matches, {name: values[: len(slots)] for name, values in scores.items()}
 
 
-def shift_of(scorer: Scorer, pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
-    """`shift`, `shift_interval` and `scale` of a `Prediction`, from the matches `[1, K, ...]` of a pair."""
-    if not isinstance(scorer, HistogramOfShifts):
+def shift_of(scorers: Iterable[Scorer], pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
+    """`shift`, `shift_interval` and `scale` of a `Prediction`, from the matches `[1, K, ...]` of a pair.
+
+    They are those of the first histogram of shifts among the scorers.
+    """
+    scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
+    if scorer is None:
         return None, None, None
     histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
     shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))

@@ -46,7 +46,8 @@ def localization_figure(
             file = path_inside(root, best)
             with suppress(InputError):  # the map keeps features, not images
                 shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
-        histogram = known.scorer if isinstance(known.scorer, HistogramOfShifts) else HistogramOfShifts()
+        scorers = known.system.scorers.values()
+        histogram = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), HistogramOfShifts())
         p = "" if prediction.confidence is None else f", confidence {prediction.confidence:.2f}"
         caption = f"{clip_middle(best, _NAME_LENGTH)}{note}, score {prediction.score:.5g}{p}"
         candidate = Candidate(shown, caption, localization.matches, explain(histogram, localization.matches))

@@ -1,4 +1,4 @@
-"""Rankings of a sequence by every system: retrieval alone, each scorer, and fusions of several scores."""
+"""Rankings by every system: retrieval alone, each scorer, and fusions of several scores."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from mfvpr.reranking.ranking import (
     rank_shortlist,
     retrieval_scores,
 )  # fmt: skip
-from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Matched, Ranked
+from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Ranked
 from mfvpr.scoring.fields import POSITIVE
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError, require_word
@@ -90,20 +90,20 @@ class Fusion:
         return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
 
 
-def rank_sequence(
-    matched: Matched, scores: Mapping[str, Scores], fused: Mapping[str, Fusion],
+def rank_by_systems(
+    candidates: Shortlist, scores: Mapping[str, Scores], fused: Mapping[str, Fusion],
     correlated: Mapping[str, FrameCorrelation], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of a sequence by name of the system.
+    """Rankings of queries by name of the system.
 
     Args:
-        matched: the sequence.
+        candidates: of the queries, which are a sequence if scores are correlated.
         scores: by name of the scorer.
         fused, correlated, ties: see `mfvpr.System`.
         hubness: by name of the scorer; None = no score normalization with a cohort.
     """
-    candidates, scores = matched.candidates, {**scores}
+    scores = {**scores}
     for name, strengths in (hubness or {}).items():
         scores[f"{name} + {COHORT}"] = by_hubness(candidates, scores[name], strengths, name=name)
     scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}

@@ -22,7 +22,7 @@ from mfvpr.report.confidences import CalibratedPredictions
 from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.reranking.fusion import rank_sequence
+from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache, feature_cache
@@ -69,7 +69,7 @@ def test_frame_correlation_is_a_ranking_more(result):
     [matched] = result.matched
     correlated = {"histogram": FrameCorrelation(1), "histogram + retrieval": FrameCorrelation()}
     scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
-    systems = rank_sequence(matched, scores, {"histogram": Fusion(c=10.0)}, correlated, "retrieval")
+    systems = rank_by_systems(matched.candidates, scores, {"histogram": Fusion(c=10.0)}, correlated, "retrieval")
     assert [*systems] == [*result.systems, "histogram + frames", "histogram + retrieval + frames"]
     for name, how in correlated.items():
         alone, got = systems[name], systems[f"{name} + frames"]

@@ -13,6 +13,7 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.features import Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.utils import InputError
+from tests.builders import map_system
 from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
 
@@ -21,7 +22,9 @@ def fill(disk, street):
     """Add images until the disk is full, localize, and go on when it has grown. Prints JSON."""
     images, errors = image_folder(Path(street) / "database"), []
     mount(disk, "-o", "size=600k")
-    known = Map(Path(disk) / "map", Sift(max_keypoints=200, image_size=(160, 120)), VladFitting(num_words=8))
+    known = Map(
+        Path(disk) / "map", map_system(Sift(max_keypoints=200, image_size=(160, 120)), VladFitting(num_words=8))
+    )
     known.learn(replace(images, names=images.names[:4]))
 
     def add_missing():

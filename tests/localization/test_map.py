@@ -31,7 +31,7 @@ from mfvpr.storage.map_entries import DEEPEST, check_entry
 from mfvpr.types import Features
 from mfvpr.utils import InputError
 from tests import scorers
-from tests.builders import evaluate_parts
+from tests.builders import evaluate_parts, map_system
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.thorough
@@ -44,12 +44,12 @@ SURE = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0
 def folder(dataset, tmp_path_factory):
     """A map of the database, whose places are rows."""
     folder = tmp_path_factory.mktemp("maps") / "map"
-    Map(folder, SIFT, VLAD).build(dataset.database, list(range(len(dataset.database))))
+    Map(folder, map_system(SIFT, VLAD)).build(dataset.database, list(range(len(dataset.database))))
     return folder
 
 
-def opened(folder, **options):
-    return Map(folder, SIFT, VLAD, **{"candidates": 5} | options)
+def opened(folder, *, scorer=None, candidates=5, **options):
+    return Map(folder, map_system(SIFT, VLAD, scorer, candidates), **options)
 
 
 def rows_of(prediction):
@@ -98,13 +98,14 @@ def test_a_question_keeps_what_it_was_answered_with(dataset, folder):
     for path in dataset.queries.paths[:3]:
         prediction, (features, vector), matches = known.localize_with_evidence(path)
         assert prediction == known.localize(path)
-        assert known.scorer(matches) == pytest.approx(prediction.score, rel=1e-5)
+        [scorer] = known.system.scorers.values()
+        assert scorer(matches) == pytest.approx(prediction.score, rel=1e-5)
         best = prediction.alternatives[0]
         assert (known.row(best.name), known.place(best.row)) == (best.row, best.place)
         keypoints = {tuple(point) for point in features.keypoints.tolist()}
         assert {tuple(point) for point in matches.points0[matches.mask].tolist()} <= keypoints
         assert vector @ vector == pytest.approx(1, rel=1e-5)
-        np.testing.assert_allclose(explain(known.scorer, matches).peak, prediction.shift, atol=1e-4)
+        np.testing.assert_allclose(explain(scorer, matches).peak, prediction.shift, atol=1e-4)
     assert known.row("no such") is None
     assert known.there.tolist() == [True] * len(dataset.database)
 
@@ -210,7 +211,7 @@ def test_segments_follow_each_other(dataset, tmp_path, monkeypatch):
 ])  # fmt: skip
 def test_a_map_of_other_settings_is_refused(folder, extractor, describer, difference):
     with pytest.raises(InputError) as error:
-        Map(folder, extractor, Constant() if describer == "constant" else describer)
+        Map(folder, map_system(extractor, Constant() if describer == "constant" else describer))
     assert difference in str(error.value)
     assert "delete" not in str(error.value)
 
@@ -231,7 +232,7 @@ def test_a_vocabulary_that_is_damaged_or_gone_is_to_be_put_back(dataset, folder,
 def test_rows_of_another_vocabulary_are_refused(dataset, folder, tmp_path):
     """Both maps have the same settings, but vocabularies that were learned from other images."""
     shutil.copytree(folder, tmp_path / "map")
-    Map(tmp_path / "other", SIFT, VLAD).learn(dataset.sequences[0].images)
+    Map(tmp_path / "other", map_system(SIFT, VLAD)).learn(dataset.sequences[0].images)
     shutil.copy(tmp_path / "other/vocabulary.npz", tmp_path / "map")
     with pytest.raises(InputError, match=r"recipe\.describer\.centers"):
         opened(tmp_path / "map")
@@ -325,7 +326,7 @@ def test_other_places_and_names_are_refused(name, place, words):
 
 @pytest.mark.parametrize(("name", "place"), [(("drive1", 9), 0), ("a.jpg", None)])
 def test_nothing_is_written_of_an_entry_that_is_refused(dataset, tmp_path, name, place):
-    known, image = Map(tmp_path / "map", Constant(), Constant()), replace(dataset.database, names=(name,))
+    known, image = Map(tmp_path / "map", map_system(Constant(), Constant())), replace(dataset.database, names=(name,))
     for add in (lambda: known.add(dataset.database.paths[0], place, name=name), lambda: known.build(image, [place])):
         with pytest.raises(InputError, match=r"expected (text|a place)"):
             add()
@@ -355,7 +356,7 @@ def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
     for ask in (lambda: known.localize_with_evidence(image, recent=number),
                 lambda: known.localize_with_evidence(image, before=number),
                 lambda: known.localize(image, recent=number), lambda: opened(folder, candidates=number)):  # fmt: skip
-        with pytest.raises(InputError, match=r"^(recent|before|candidates): expected a whole number [^\n]+$"):
+        with pytest.raises(InputError, match=r"^(recent|before|candidates).*: expected a whole number [^\n]+$"):
             ask()
     with pytest.raises(InputError, match=r"^recent: .*got None"):
         known.localize(image, recent=None)
@@ -447,7 +448,7 @@ class Constant:
 def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
     same = Constant()
     for extractor, describer in ((same, same), (SIFT, same)):
-        known = Map(tmp_path / type(extractor).__name__, extractor, describer, candidates=3)
+        known = Map(tmp_path / type(extractor).__name__, map_system(extractor, describer, candidates=3))
         known.build(dataset.database)
         known.add(dataset.queries.paths[0], "a query", name="q")
         for image in (*dataset.database.paths, dataset.queries.paths[0]):
@@ -464,7 +465,7 @@ class Bright(Constant):
 
 
 def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
-    rng, known = np.random.default_rng(0), Map(tmp_path / "map", Bright(), Bright(), candidates=3)
+    rng, known = np.random.default_rng(0), Map(tmp_path / "map", map_system(Bright(), Bright(), candidates=3))
     images = [rng.integers(0, 2 if row < 3 else 256, (12, 16, 3), np.uint8) for row in range(8)]
     for row, image in enumerate(images):
         known.add(image, row, name=str(row))
@@ -476,9 +477,9 @@ def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
 def test_killed_while_adding_it_has_whole_rows(dataset, small_street, tmp_path):
     program = (
         "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
-        "from mfvpr.localization import Map; from tests.localization.test_map import SIFT, VLAD\n"
+        "from tests.localization.test_map import opened\n"
         "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
-        "known = Map(sys.argv[2], SIFT, VLAD); known.learn(data.database); print('ready', flush=True)\n"
+        "known = opened(sys.argv[2]); known.learn(data.database); print('ready', flush=True)\n"
         "for turn in range(int(sys.argv[3]), 10**6):\n"
         "    known.add(data.database.paths[turn % 10], turn, name=str(turn)); print('added', flush=True)\n"
     )

@@ -17,6 +17,7 @@ from mfvpr.storage.features import open_store
 from mfvpr.storage.map_entries import Entry, open_entry_store
 from mfvpr.storage.rows import RowStore
 from mfvpr.utils import InputError, recipe_of
+from tests.builders import map_system
 from tests.localization.test_map import Constant
 from tests.storage.synthetic_features import file_of
 
@@ -41,7 +42,7 @@ def first(images, number):
 
 def opened(folder, extractor=None, describer=None):
     extractor = extractor or Constant()
-    return Map(folder, extractor, describer or extractor, scorer=mfvpr.MatchCount(), candidates=3)
+    return Map(folder, map_system(extractor, describer or extractor, mfvpr.MatchCount(), candidates=3))
 
 
 def test_threads_get_the_answers_of_one_thread(images, tmp_path):

@@ -9,7 +9,7 @@ import mfvpr
 from mfvpr.datasets import sequences_dataset
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.reranking.fusion import rank_sequence
+from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.types import Shortlist
 from tests import oracles
@@ -92,9 +92,8 @@ def sequence_matches(dataset):
 
 
 def rank_by(matched, fused, correlated):
-    return rank_sequence(
-        matched, stages.score(SCORERS, matched.by_scale, matched.candidates), fused, correlated, "retrieval"
-    )
+    scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
+    return rank_by_systems(matched.candidates, scores, fused, correlated, "retrieval")
 
 
 def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches):
