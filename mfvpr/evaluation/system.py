@@ -1,4 +1,4 @@
-"""What is evaluated, as values: a pipeline finds and matches candidates, a system scores and ranks them."""
+"""Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

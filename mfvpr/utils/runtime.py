@@ -1,4 +1,4 @@
-"""How a call is carried out: devices, memory, progress and messages. They change no result."""
+"""Settings of a call that change no result: devices, memory, progress and messages."""
 
 import math
 from collections.abc import Callable, Sequence
