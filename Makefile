@@ -12,7 +12,7 @@ QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 \
 .PHONY: demo test test-fast test-all setup check conf benchmark clean
 
 demo: setup
-	$(BIN)/python -m experiments.evaluate scorer=demo
+	$(BIN)/mfvpr evaluate scorer=demo
 
 test-fast: .venv/.test
 	$(QUICK) $(PYTEST) -m 'not (slow or thorough or optimized)'
@@ -30,7 +30,7 @@ check: .venv/.check  ## style and types
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
 
 conf: setup  ## the files of conf/ that follow from the scores' classes
-	$(BIN)/python -m experiments.declare
+	$(BIN)/python -m mfvpr.cli.declare
 
 benchmark: .venv/.benchmark
 	$(BIN)/python -m experiments.benchmark

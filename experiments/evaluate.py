@@ -1,6 +1,6 @@
-"""Evaluate systems: two folders of images in, a table of recall, rankings and figures out."""
+"""Evaluate systems: two folders of images in, recall, rankings and figures out. The same as `mfvpr evaluate`."""
 
-from experiments.launch import launch
+from mfvpr.cli.programs import run
 
 if __name__ == "__main__":
-    launch("config")
+    run("evaluate")

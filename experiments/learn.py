@@ -1,6 +1,6 @@
-"""Learn scores, and compare them with hand-set and grid-searched ones on other queries."""
+"""Learn match weights and parameters, and compare them with searched ones. The same as `mfvpr learn`."""
 
-from experiments.launch import launch
+from mfvpr.cli.programs import run
 
 if __name__ == "__main__":
-    launch("learn")
+    run("learn")

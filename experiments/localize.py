@@ -1,6 +1,6 @@
-"""Localize images in a map: a line of JSON for each. `python -m experiments.localize --help`."""
+"""Localize images in a map. The same as `mfvpr localize`."""
 
-from experiments.launch import launch
+from mfvpr.cli.programs import run
 
 if __name__ == "__main__":
-    launch("localize")
+    run("localize")

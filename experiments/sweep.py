@@ -1,6 +1,6 @@
-"""Sweep parameters: the recall of every setting of a grid, the best setting, and its confidence interval."""
+"""Score a data set by a grid of parameters. The same as `mfvpr sweep`."""
 
-from experiments.launch import launch
+from mfvpr.cli.programs import run
 
 if __name__ == "__main__":
-    launch("sweep")
+    run("sweep")

@@ -15,9 +15,9 @@ from pathlib import Path
 import hydra
 from omegaconf import OmegaConf
 
-from experiments import stages
-from experiments.launch import launch
-from experiments.settings import CONF
+from mfvpr.cli import programs, stages
+from mfvpr.cli.launch import launch
+from mfvpr.cli.settings import CONF
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.manifest import MATCHES, store_path
 
@@ -83,11 +83,12 @@ def typed(monkeypatch, capsys, program, *arguments):
     handler, code = signal.getsignal(signal.SIGTERM), 0
     capsys.readouterr()
     try:
-        module, config = import_module(f"experiments.{program}"), "config" if program == "evaluate" else program
-        if hasattr(module, "main"):  # of commands
-            module.main()
+        if program in programs.PROGRAMS:
+            programs.run(program)
+        elif program == "paper":
+            launch("paper")
         else:
-            launch(config)
+            import_module(f"experiments.{program}").main()
     except SystemExit as left:
         code = left.code
     finally:

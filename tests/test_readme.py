@@ -8,8 +8,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from experiments import overrides
-from experiments.settings import CONF, RULES, check, scorer_rules
+from mfvpr.cli import overrides
+from mfvpr.cli.settings import CONF, RULES, check, scorer_rules
 from mfvpr.datasets import image_folder
 from mfvpr.features import Sift
 from mfvpr.io import write_features
@@ -27,7 +27,7 @@ COMMANDS = [line for language, block in BLOCKS if language == "sh" for line in b
 
 
 def test_commands_are_of_the_kinds_checked_here():
-    assert {line.split()[0] for line in COMMANDS} == {"make", "python", "."}
+    assert {line.split()[0] for line in COMMANDS} == {"make", "mfvpr", "python", "."}
 
 
 @pytest.mark.parametrize("target", [line.split()[1] for line in COMMANDS if line.startswith("make")])
@@ -37,7 +37,7 @@ def test_make_targets_exist(target):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [line for line in COMMANDS if "experiments.evaluate" in line])
+@pytest.mark.parametrize("command", [line for line in COMMANDS if line.startswith("mfvpr evaluate")])
 def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, capsys):
     if "aliked" in command and not random_checkpoints.ALIKED.is_dir():
         pytest.skip("no ../shared/weights: ALIKED's are not shipped")
@@ -45,7 +45,7 @@ def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, cap
     shutil.copytree(small_street, root)
     shutil.copytree(root / "database", root / "ref")  # corridor's names
     shutil.copytree(root / "queries", root / "query")
-    arguments = shlex.split(command.removeprefix("python -m experiments.evaluate"))
+    arguments = shlex.split(command.removeprefix("mfvpr evaluate"))
     places = {"database": root / "database", "queries": root / "queries", "root": root}
     folders = {f"dataset.{name}=DIR": f"dataset.{name}={path}" for name, path in places.items()}
     folders["dataset.queries=[DIR,DIR]"] = f"dataset.queries=[{root}/queries,{root}/query]"
@@ -72,9 +72,9 @@ def test_commands_run(command, small_street, weights, tmp_path, monkeypatch, cap
 @pytest.mark.parametrize("program", ["sweep", "learn"])
 def test_commands_of_sweeps_and_learning_are_settings(program):
     """They run in the tests of these programs, on less."""
-    commands = [shlex.split(line) for line in COMMANDS if f"experiments.{program}" in line]
+    commands = [shlex.split(line) for line in COMMANDS if line.startswith(f"mfvpr {program}")]
     assert len(commands) >= 2
-    for _, _, _, *arguments in commands:
+    for _, _, *arguments in commands:
         chosen = [
             argument.replace("=DIR", "=root")
             for argument in arguments

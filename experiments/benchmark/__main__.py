@@ -8,7 +8,7 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from experiments.launch import Parser, refuse, run_command
+from mfvpr.cli.launch import Parser, refuse, run_command
 
 PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out, **options)` prints tables and writes them as JSON to `out`.
@@ -39,7 +39,7 @@ def add_arguments(parser: Parser) -> None:
         "--stores", type=Path, help="for scale: folder that keeps its features (default: 6 GB, deleted)"
     )
     parser.add_argument("--data", type=Path, help="for real: folder with grief_season and corridor")
-    parser.set_defaults(run="benchmark.__main__:run")
+    parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
 def run(benchmark: str, rounds: int | None, out: Path | None, **options: Path | None) -> None:

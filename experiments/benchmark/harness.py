@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.console import bar
+from mfvpr.cli.console import bar
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
 from mfvpr.utils.numerics import available_cpus

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from experiments.benchmark.harness import duration, write_report
-from experiments.console import bar
 from mfvpr.checkpoints import REGISTRY, is_installed, load_model
+from mfvpr.cli.console import bar
 from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import Pipeline, System

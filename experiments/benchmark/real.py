@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from experiments import build
 from experiments.benchmark.harness import duration, write_report
-from experiments.console import tell, track
-from experiments.overrides import compose_program
 from mfvpr.checkpoints import load_model
+from mfvpr.cli import build
+from mfvpr.cli.console import tell, track
+from mfvpr.cli.overrides import compose_program
 from mfvpr.datasets import folder_dataset
 from mfvpr.evaluation import Pipeline, estimate, hits, match_sequence, stages
 from mfvpr.features import Aggregated, AlikedFeatures, Extractor, Sift, VladFitting

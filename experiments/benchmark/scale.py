@@ -16,8 +16,8 @@ import numpy as np
 
 from experiments.benchmark.harness import write_report
 from experiments.benchmark.synthetic_features import SyntheticSet
-from experiments.console import bar
 from mfvpr import HistogramOfShifts
+from mfvpr.cli.console import bar
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet, FeatureSource, InMemory
 from mfvpr.report import Table

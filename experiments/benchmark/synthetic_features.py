@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.console import bar
+from mfvpr.cli.console import bar
 from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store
 from mfvpr.storage.manifest import store_path
 from mfvpr.storage.rows import require_space

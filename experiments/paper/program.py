@@ -6,16 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments import build, run_folder, truth
-from experiments.console import tell
-from experiments.launch import how_to_install
 from experiments.paper import runs, systems, timing
 from experiments.paper.figures import paper_figures
 from experiments.paper.pages import write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
-from experiments.settings import SettingsError
-from experiments.stages import dataset_of
+from mfvpr.cli import build, run_folder, truth
+from mfvpr.cli.console import tell
+from mfvpr.cli.launch import how_to_install
+from mfvpr.cli.settings import SettingsError
+from mfvpr.cli.stages import dataset_of
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table

@@ -9,12 +9,12 @@ from typing import Any
 import jax
 from omegaconf import OmegaConf
 
-from experiments import evaluation, run_folder
-from experiments.overrides import compose_program
 from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
-from experiments.settings import SettingsError, check
 from mfvpr.checkpoints import REGISTRY, files
+from mfvpr.cli import evaluation, run_folder
+from mfvpr.cli.overrides import compose_program
+from mfvpr.cli.settings import SettingsError, check
 from mfvpr.report.runs import write_json
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
@@ -52,7 +52,7 @@ def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str
     composed |= {name: settings[name] for name in _SHARED}
     composed["out"] = str(folder_of(run, place, settings))
     check(composed)
-    return composed | {"command": f"python -m experiments.evaluate {' '.join(chosen)}"}
+    return composed | {"command": f"mfvpr evaluate {' '.join(chosen)}"}
 
 
 def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:

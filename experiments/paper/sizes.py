@@ -5,7 +5,7 @@ Detected keypoints count, those of a grid do not. (The paper's MixVPR is of floa
 
 from typing import Any
 
-from experiments.stages import Tools
+from mfvpr.cli.stages import Tools
 from mfvpr.datasets import ImageFolder
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.build import expand_user
-from experiments.overrides import quote
-from experiments.settings import RULES, SettingsError
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
+from mfvpr.cli.build import expand_user
+from mfvpr.cli.overrides import quote
+from mfvpr.cli.settings import RULES, SettingsError
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.reranking.results import RETRIEVAL
 

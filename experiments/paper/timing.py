@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments import build
+from mfvpr.cli import build
 from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.evaluation import Pipeline, System, evaluation
 from mfvpr.localization.vectors import Vectors

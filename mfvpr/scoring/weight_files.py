@@ -35,7 +35,7 @@ def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
         InputError: the file does not exist, or is not a file of `write_weight`.
     """
     path = Path(path)
-    require_file(path, "a match weight that experiments.learn wrote")
+    require_file(path, "a match weight that mfvpr learn wrote")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content.pop("format") != _FORMAT:
@@ -43,7 +43,7 @@ def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
         return _weight(content.pop("inputs"), content), dict(content["made"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{path}: expected a match weight that experiments.learn wrote ({reason})") from error
+        raise InputError(f"{path}: expected a match weight that mfvpr learn wrote ({reason})") from error
 
 
 def _weight(names: list[str], content: Mapping[str, Any]) -> LearnedWeight:

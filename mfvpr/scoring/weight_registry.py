@@ -51,4 +51,4 @@ def _read(path: Path, modified_ns: int) -> tuple[Weight, dict[str, Any]]:
 
 
 NAMED_WEIGHTS: Mapping[str, Weight] = _NamedWeights()
-"""Weights by word, or by the path `*.json` of a file that `experiments.learn` wrote (InputError for other files)."""
+"""Weights by word, or by the path `*.json` of a file that `mfvpr learn` wrote (InputError for other files)."""

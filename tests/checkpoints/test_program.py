@@ -1,4 +1,4 @@
-"""`python -m experiments.weights` as a user types it."""
+"""`mfvpr weights` as a user types it."""
 
 import hashlib
 import signal
@@ -10,9 +10,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from experiments.launch import one_line
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
+from mfvpr.cli.launch import one_line
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 from tests.programs import ROOT, typed
 from tests.random_checkpoints import random_checkpoint, write_zip
@@ -122,8 +122,8 @@ def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
         assert caught.value.code == 2
         stderr = capsys.readouterr().err
         assert stderr.startswith(f"error: {name}: not installed in {folder}; get ")
-        assert stderr.endswith(f" and install it: python -m experiments.weights {command}\n")
-        assert f" and install it: python -m experiments.weights {command}\n" in program("verify", name)[1]
+        assert stderr.endswith(f" and install it: mfvpr weights {command}\n")
+        assert f" and install it: mfvpr weights {command}\n" in program("verify", name)[1]
 
 
 def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
@@ -217,7 +217,7 @@ def test_download(program, folder, site):
     assert stdout.splitlines() == [
         f"tiny.pth: {source}, {len(CONTENT):,} bytes, code MIT, weights none stated",
         f"{target}: downloaded, with the published hash",
-        f"to install it: python -m experiments.weights convert {target}",
+        f"to install it: mfvpr weights convert {target}",
     ]
     assert "100%" in stderr
     assert target.read_bytes() == CONTENT

@@ -108,12 +108,12 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, tmp_pat
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["features=d2net"], "d2_tf: not installed in NOWHERE; "),
-    (["features=aliked"], "python -m experiments.weights download aliked-n16"),
+    (["features=aliked"], "mfvpr weights download aliked-n16"),
     (["retrieval=mixvpr"], "weights none stated"),
     (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
     (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "MixVPR takes [320, 320] only"),
     (["retrieval=ssm", "retrieval.image_size=[336,336]"], "SSM-VPR's retrieval takes [224, 224] only"),
-    (["matching=lightglue"], "python -m experiments.weights download aliked_lightglue"),
+    (["matching=lightglue"], "mfvpr weights download aliked_lightglue"),
     (["features=aliked", "features.clahe_clip=2"], "features.clahe_clip: unknown setting"),
     (["system=mix_hist_20"], "system=mix_hist_20: expected one of mfvpr"),
     (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),

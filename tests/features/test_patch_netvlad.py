@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from experiments import stages
 from mfvpr.checkpoints.networks import plan_network
+from mfvpr.cli import stages
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.reranking import fuse_scales

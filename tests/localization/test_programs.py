@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import build, maps, query_images
-from experiments.settings import SettingsError
+from mfvpr.cli import build, maps, query_images
+from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.datasets.videos import read_frames
 from mfvpr.evaluation import write_confidences

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import evaluation, stages
 from mfvpr import HistogramOfShifts
+from mfvpr.cli import evaluation, stages
 from mfvpr.evaluation.stages import dominant_shifts
 from mfvpr.matching import MatchSet
 from mfvpr.report.shifts import HEADER

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import build
-from experiments.settings import SettingsError
+from mfvpr.cli import build
+from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles

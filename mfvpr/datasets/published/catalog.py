@@ -108,7 +108,7 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
     try:
         return entry.read(root, name, **options)
     except InputError as error:
-        raise InputError(f"{error} (layout: python -m experiments.data list {name})") from error
+        raise InputError(f"{error} (layout: mfvpr data list {name})") from error
 
 
 def published_differences(dataset: Dataset) -> Iterator[str]:

@@ -1,0 +1,16 @@
+"""Programs: a command line becomes settings, settings become values of mfvpr, and a job does the work.
+
+| command | job |
+| :-- | :-- |
+| evaluate, sweep, learn, localize | evaluation, sweeping, learning, localization |
+| map, data, weights, report | maps, published_data, checkpoints, mfvpr.report.pages |
+
+Read first: launch (starts a program), command_line (Hydra), groups (programs, and groups of settings), settings and
+rules (checks of settings). Then overrides, help_text, wording (of errors), declare (files in conf/ that follow from
+scorers). Settings become values in build, truth and confidences. Jobs share stages, run_folder, axes, console.
+
+Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, retrieval, scoring,
+storage, tuning, types, utils.
+"""
+
+__all__ = []

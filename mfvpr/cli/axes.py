@@ -1,0 +1,129 @@
+"""The axes of a sweep from the settings `grid.`, and whether its results fit into memory."""
+
+from typing import Any
+
+from mfvpr.cli import build
+from mfvpr.cli.settings import SettingsError
+from mfvpr.matching import MatchSet, Scales
+from mfvpr.matching.match_set import block_bytes, scales
+from mfvpr.scoring import SCORERS
+from mfvpr.scoring.fields import parameters_of
+from mfvpr.tuning import sweeps
+from mfvpr.tuning.learning.parameters import can_learn
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.search import require_optuna
+from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
+from mfvpr.utils import InputError
+from mfvpr.utils.numerics import free_host_bytes
+
+_NOT_OF_SCORER = ("max_distance", "c")
+_BYTES_PER_SETTING = 2000  # Python objects, about
+
+
+def with_final_axis(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings with grid.c = [fusion.c] if the combined score decides and no c is varied."""
+    grid = settings["grid"]
+    if settings["final"] == "score" or grid["c"] is not None or not any(grid.values()):
+        return settings
+    return settings | {"grid": grid | {"c": [_plain_c(settings)]}}
+
+
+def axes(settings: dict[str, Any]) -> Axes:
+    """The axes of the chosen scorer, checked."""
+    if "method" not in settings["scorer"]:
+        raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
+                            "with -m scorer=sum,anchor,histogram")  # fmt: skip
+    [(method, scorer)] = build.scorers(settings["scorer"]).items()
+    known = {*parameters_of(scorer), *_NOT_OF_SCORER}
+    values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
+    for name, axis in values.items():
+        if name not in known:
+            raise SettingsError(f"grid.{name}: scorer={method} has no such parameter; it has "
+                                f"{', '.join(n for n in settings['grid'] if n in known)}")  # fmt: skip
+        if len(set(axis)) < len(axis):
+            raise SettingsError(f"grid.{name}={axis}: expected different values")
+    if not values:
+        raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
+                            "--help")  # fmt: skip
+    limit = settings["matching"].get("max_distance")
+    if limit is not None and any(value is None or value > limit for value in values.get("max_distance", [])):
+        raise SettingsError(
+            f"grid.max_distance={values['max_distance']}: expected values up to {limit}, as "
+            f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
+        )
+    defaults = settings["scorer"] | {"max_distance": limit}
+    if "c" in values:
+        defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0}
+    return Axes(scorer, values, {name: defaults.get(name) for name in values})
+
+
+def search_axes(settings: dict[str, Any]) -> Axes:
+    """The axes of a sweep, if they can be searched here."""
+    grid_axes = axes(settings)
+    if settings["search"] == "grid":
+        _require_bytes(f"grid: {grid_axes.size:,} settings", grid_axes.size * _BYTES_PER_SETTING,
+                       "use fewer values, or search=optuna")  # fmt: skip
+        return grid_axes
+    try:
+        require_optuna()
+    except InputError as error:
+        raise SettingsError(f"search=optuna: {error}, or search=grid") from error
+    return grid_axes
+
+
+def learning_axes(settings: dict[str, Any]) -> Axes:
+    """The axes that learning searches for comparison, if the scorer can be learned."""
+    method = settings["scorer"].get("method")
+    known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
+    if method not in known:
+        setting = f"scorer={method}" if method else "scorer"
+        raise SettingsError(f"{setting}: expected one to learn, of {', '.join(known)}")
+    grid_axes = axes(settings)
+    if settings["split"] is None:
+        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
+                            "second_half or both")  # fmt: skip
+    return grid_axes
+
+
+def retrieval_weight(settings: dict[str, Any]) -> float | None:
+    """The weight of the retrieval score, None = balanced."""
+    c = _plain_c(settings)
+    return None if c == "auto" else float(c)
+
+
+def _plain_c(settings: dict[str, Any]) -> Any:
+    """The setting fusion.c, which must not fuse several scores here."""
+    if (c := settings["fusion"]["c"]) == "zscore":
+        raise SettingsError(
+            "fusion.c=zscore: expected a number or auto, as sweeps and learning add retrieval to one score; set "
+            "fusion.c=auto fusion.weights=null, which ranks alike for weights of 1"
+        )
+    return c
+
+
+def require_memory(settings: dict[str, Any], grid_axes: Axes, views: int, matches: MatchSet | Scales) -> None:
+    """Raise a SettingsError before a sweep whose results, or one chunk, do not fit into memory."""
+    queries = len(scales(matches)[0])
+    num_settings = grid_axes.size + (dict(grid_axes.own) not in grid_axes.grid())
+    _require_bytes(
+        f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
+        sweeps.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
+        "use fewer values, smaller recall.ks, or search=optuna",
+    )
+    chunk = settings["chunk"]
+    if chunk["settings"] or chunk["queries"]:
+        lines = min(chunk["settings"] or SETTINGS_PER_BLOCK, num_settings)
+        columns = min(chunk["queries"] or 1, queries)
+        _require_bytes(
+            f"chunk: {lines:,} settings x {columns:,} queries",
+            block_bytes(matches, lines, columns),
+            "use a smaller chunk.settings or chunk.queries, or leave them null",
+        )
+
+
+def _require_bytes(purpose: str, needed: int, remedy: str) -> None:
+    free = free_host_bytes()
+    if needed > 0.8 * free:
+        raise SettingsError(
+            f"{purpose} would take about {needed / 1e6:,.0f} MB of memory, {free / 1e6:,.0f} MB are free; {remedy}"
+        )

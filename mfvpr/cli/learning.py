@@ -1,0 +1,169 @@
+"""Learn scores on one half of the path, or on some data sets, and compare them with hand-set and searched ones."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mfvpr.cli import build, console, run_folder, stages, truth
+from mfvpr.cli.axes import learning_axes, retrieval_weight
+from mfvpr.cli.overrides import compose_data_sets
+from mfvpr.cli.settings import SettingsError
+from mfvpr.cli.stages import Images
+from mfvpr.datasets.sequences import OwnRows, own_rows
+from mfvpr.matching import Scales
+from mfvpr.report import comparisons, runs
+from mfvpr.scoring import Scorer
+from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
+from mfvpr.tuning.learning.comparison import Checkpoints, compare
+from mfvpr.tuning.learning.data_sets import Part, join_data_sets
+from mfvpr.tuning.learning.losses import LOSSES
+from mfvpr.tuning.learning.teaching import Options
+from mfvpr.utils import Stopwatch, recipe_of
+from mfvpr.utils.files import write_text
+from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.versions import versions
+
+_INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
+
+
+class Prepared(NamedTuple):
+    """A data set with its matches, their recipe, and a description of the ground truth."""
+
+    part: Part
+    images: Images
+    recipe: dict[str, Any]
+    ground_truth: dict[str, Any]
+
+
+def learn(settings: dict[str, Any]) -> None:
+    """Learn, search, compare on queries that were not learned on, fill the run folder."""
+    with run_folder.claim(settings) as folder:
+        axes, options, watch = learning_axes(settings), _options(settings), Stopwatch()
+        teach = [_prepare(choice, watch) for choice in _settings_by_data_set(settings)]
+        report, data = [], teach[0].part
+        if settings["report"]:
+            number = len(compose_data_sets("report", settings["report"]))
+            teach, report = teach[:-number], teach[-number:]
+            require_disjoint(teach, report)
+            data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
+        with watch("learning"):
+            checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
+            comparison = compare(axes, data.protocol, data.match_set, data.candidates, options,
+                                 checkpoints=checkpoints, track=console.track)  # fmt: skip
+        heading = _heading(settings, data, teach, report)
+        text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
+        left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command")
+        about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
+        results = {
+            **(about if report else _about(teach[0])), **comparisons.comparison_json(comparison),
+            "settings": {name: value for name, value in settings.items() if name not in left_out},
+            "seconds": watch.seconds, "versions": versions(),
+        }  # fmt: skip
+
+        def write(new: Path) -> None:
+            runs.write_table(new, comparisons.comparison_table(comparison), heading)
+            runs.write_json(new / "results.json", results)
+            origin = {"command": settings.get("command"), "commit": runs.commit(Path()), **results}
+            del origin["rows"], origin["queries"], origin["seconds"]
+            comparisons.write_weights(new / "weights", comparison, origin)
+            write_text(new / "summary.txt", f"{text}\n")
+
+        figures = comparisons.comparison_figures(comparison)
+        by_name = {data_set.part.name: data_set.ground_truth for data_set in report}
+        ground_truth = by_name if report else teach[0].ground_truth
+        run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
+
+
+def _settings_by_data_set(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Settings of each data set: those to learn on, then those to report on."""
+    if not settings["report"]:
+        yield settings
+        return
+    more = [compose_data_sets(name, settings[name]) for name in ("also", "report") if settings[name]]
+    for dataset in (settings["dataset"], *itertools.chain(*more)):
+        yield settings | {"dataset": dataset, "split": None}
+
+
+def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
+    if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
+        raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
+    tools, images = stages.prepare(settings, watch)
+    protocol = truth.evaluation_protocol(settings, images.dataset)
+    matches, candidates = stages.match_data_set(tools, images, watch)
+    assert not isinstance(matches, Scales)
+    recipe = stages.recipe(tools, images)
+    part = Part(label(settings["dataset"]), protocol, matches, candidates)
+    return Prepared(part, images, recipe, truth.describe(settings, images.dataset))
+
+
+def label(settings: dict[str, Any]) -> str:
+    """Name of a data set; streets of different seeds get different names."""
+    return f"{settings['name']} {settings['seed']}" if "seed" in settings else settings["name"]
+
+
+def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
+    """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
+    for first, second in itertools.product(teach, report):
+        sides = itertools.product(second.images.contents.values(), first.images.contents.values())
+        if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
+            raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
+                                f"which is learned on; {same} are the same")  # fmt: skip
+    for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
+        if same := sum(map(bool, _same_images(second, first, "query"))):
+            raise SettingsError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
+                                "are the same, and would count twice")  # fmt: skip
+    for first, second in itertools.combinations(report, 2):
+        if any(_same_images(second, first, "database")):
+            console.tell(f"warning: {first.part.name} and {second.part.name} are of one map, but their queries are "
+                         "taken for independent, so that intervals are too narrow and p too low")  # fmt: skip
+
+
+def _same_images(first: Prepared, second: Prepared, side: str) -> OwnRows:
+    return own_rows(first.images.contents[side], second.images.contents[side])
+
+
+def _about(data_set: Prepared) -> dict[str, Any]:
+    images = data_set.images
+    return {
+        "dataset": images.dataset.name, "ground_truth": data_set.ground_truth,
+        "data_fingerprint": images.fingerprints, "reading": images.reading,
+    }  # fmt: skip
+
+
+def _options(settings: dict[str, Any]) -> Options:
+    names = ("ties", "steps", "every", "patience", "batch", "learning_rate", "hidden", "seed")
+    return Options(
+        c=retrieval_weight(settings), retrieval_score=settings["fusion"]["retrieval_score"],
+        loss=LOSSES[settings["loss"]], inputs=_INPUTS[settings["inputs"]], **{name: settings[name] for name in names},
+    )  # fmt: skip
+
+
+def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: list[Prepared]) -> Checkpoints | None:
+    """Folder and recipe of the checkpoints; None without a folder."""
+    root = settings["checkpoints"] or settings["cache"]
+    if root is None:
+        return None
+    names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
+    recipe = {
+        "matches": [data_set.recipe for data_set in sets], "scorer": recipe_of(scorer),
+        "tolerances": settings["recall"], **{name: settings[name] for name in names},
+        "retrieval_score": settings["fusion"]["retrieval_score"], "positives": data.protocol.fingerprint,
+        "reported": dict(data.protocol.reported_sets),
+        "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
+    }  # fmt: skip
+    name = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
+    return Checkpoints(build.expand_user(root) / name, recipe)
+
+
+def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
+    system = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
+    ground_truth = truth.in_words(*(data_set.ground_truth for data_set in report or teach))
+    if report:
+        teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))
+        return f"{teach_names}: {system}; what was learned here is reported on {report_names}; {ground_truth}"
+    queries = sum(len(half.report) for half in data.protocol.halves)
+    return (
+        f"{data.name}: {system}; each of {queries} queries is reported on by what was learned on the other half of the "
+        f"path; {ground_truth}"
+    )

@@ -1,0 +1,144 @@
+"""Localize images in a map: a line of JSON for each, and figures of some."""
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from mfvpr.cli import build, confidences, maps
+from mfvpr.cli.console import tell
+from mfvpr.cli.query_images import images
+from mfvpr.cli.settings import SettingsError
+from mfvpr.datasets import read_image
+from mfvpr.evaluation import Confidence
+from mfvpr.localization import Drive, Localization, Map, Prediction, Route
+from mfvpr.report.file_names import file_names
+from mfvpr.report.localizations import localization_figure
+from mfvpr.storage.maps import Entry
+from mfvpr.utils import InputError, Runtime
+from mfvpr.utils.files import printable
+
+
+def localize(settings: dict[str, Any]) -> None:
+    """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
+    robot_map = maps.open_map(
+        build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
+        runtime=Runtime(memory=settings["memory"]),
+    )  # fmt: skip
+    drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
+    for number, (name, image) in enumerate(images(settings)):
+        if number == 0 and len(robot_map):
+            tell(f"{len(robot_map):,} images in the map; the first image takes seconds more: programs compile")
+        try:
+            pixels = image if isinstance(image, np.ndarray) else read_image(image)
+            localized, line = drive.localize(name, pixels)
+        except InputError as error:
+            if not len(robot_map):
+                raise
+            failed += 1
+            line = {"error": str(error)} | drive.route_entry(None, None)
+        else:
+            line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
+        print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
+    if failed:
+        raise SettingsError(f"{failed} of the images could not be localized; their lines say why")
+    figures.finish()
+
+
+class _Drive:
+    """One drive through a map: images are localized and added one by one."""
+
+    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+        self._map, self._settings = robot_map, settings
+        self._route = None if settings["route"] is None else Route(Drive(advance=settings["route"]))
+
+    def localize(
+        self, name: str, pixels: UInt8[np.ndarray, "height width channels"]
+    ) -> tuple[Localization, dict[str, Any]]:
+        """Localize an image and return its line; an image that is in the map sees only the images before it."""
+        start = time.perf_counter()
+        row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
+        localized = self._map.localize_with_evidence(pixels, recent=recent, before=row)
+        line = localized.prediction.as_json(self._settings["alternatives"]) | self.route_entry(
+            localized.prediction, row
+        )
+        return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
+
+    def add(self, name: str, localized: Localization) -> dict[str, Any]:
+        """Add an image to the end of the map, unless it has one of this name, and return the entry in its line."""
+        if not self._settings["add"]:
+            return {}
+        features, vector = localized.described
+        is_new = self._map.row(name) is None
+        if is_new:
+            self._map.add_described([Entry(name, name, vector)], [features])
+        return {"added": is_new}
+
+    def route_entry(self, prediction: Prediction | None, row: int | None) -> dict[str, Any]:
+        """The route's entry in the line of an image, which may have no prediction."""
+        if self._route is None:
+            return {}
+        rows = self._map.there[:row]
+        rows = rows[: max(0, len(rows) - self._settings["recent"])]
+        position = self._route(prediction, rows)
+        return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4)}}
+
+
+class _LocalizationFigures:
+    """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
+
+    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+        """Read the settings `figures`, `out` and `root`."""
+        figures, self._map, self._failed = settings["figures"], robot_map, 0
+        self._wanted = set(range(figures) if isinstance(figures, int) else figures)
+        self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
+        self._out, self._root = (settings[name] and build.expand_user(settings[name]) for name in ("out", "root"))
+        if self._root and not self._root.is_dir():
+            raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
+
+    def draw(
+        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Localization
+    ) -> dict[str, Any]:
+        """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
+        names = {number, name, PurePath(name).name}
+        if not self._wanted & names:
+            return {}
+        self._missing -= names
+        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+        path = self._out / f"{file}.png"
+        try:
+            localization_figure(path, self._map, name, pixels, localized, root=self._root)
+        except Exception as error:
+            self._failed += 1
+            tell(f"warning: {path}: not drawn ({error})")
+            return {"figure": None}
+        return {"figure": str(path)}
+
+    def finish(self) -> None:
+        """Raise a SettingsError if a figure could not be drawn, or if an image did not come."""
+        if self._failed:
+            raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
+        if self._missing:
+            names = ",".join(sorted(map(str, self._missing)))
+            raise SettingsError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
+                                "the lines have them, or the last parts of these")  # fmt: skip
+
+
+def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
+    """The confidence of the score that the map was made with."""
+    file = confidences.read_file(settings)
+    if file is None:
+        return None
+    map_settings = maps.read_settings(build.expand_user(settings["map"]))
+    name = map_settings["scorer"]["method"]
+    if name not in file.systems:
+        raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
+                            f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
+    if other := confidences.other_settings(file.origin, name, map_settings, map_settings["candidates"]):
+        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "
+             "it may mean nothing here")  # fmt: skip
+    return file.systems[name]

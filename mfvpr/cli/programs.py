@@ -1,0 +1,123 @@
+"""The command `mfvpr` and its programs; nothing slow is imported before a program knows what to do."""
+
+import sys
+from pathlib import Path
+
+from mfvpr.cli.launch import Parser, launch, refuse, run_command, version
+
+# Command -> what it does.
+PROGRAMS = {
+    "demo": "evaluate the paper's scores on a drawn street",
+    "evaluate": "two folders of images in, recall, rankings and figures out",
+    "sweep": "score a data set by a grid of parameters",
+    "learn": "learn match weights and parameters, and compare them with searched ones",
+    "map": "build a map for localization, add images to it",
+    "localize": "localize images in a map",
+    "weights": "list, download, convert and verify published weights",
+    "data": "list data sets, and check what a folder holds",
+    "report": "write the page of a run folder, or of several compared",
+}
+_COMPARISON = "comparison.html"
+
+
+def main() -> None:
+    """Run the command `mfvpr PROGRAM ...`."""
+    program = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if program in ("-h", "--help"):
+        width = max(map(len, PROGRAMS))
+        lines = [f"  {name:<{width}}  {about}" for name, about in PROGRAMS.items()]
+        print("usage: mfvpr PROGRAM [setting=value ...]", "", *lines, "", "mfvpr PROGRAM --help says more.", sep="\n")
+    elif program == "--version":
+        print(version())
+    elif program not in PROGRAMS:
+        refuse(f"{program}: expected one of {', '.join(PROGRAMS)}; see mfvpr --help")
+    else:
+        del sys.argv[1]
+        run(program)
+
+
+def run(program: str) -> None:
+    """Run a program with the arguments of the command line."""
+    if program == "demo":
+        sys.argv[1:1] = ["scorer=demo"]
+    if program == "map" and sys.argv[1:2] == ["build"]:
+        del sys.argv[1]
+        launch("map")
+    elif program in _ARGUMENTS:
+        description, add_arguments = _ARGUMENTS[program]
+        run_command(f"mfvpr {program}", description, add_arguments)
+    else:
+        launch({"demo": "config", "evaluate": "config"}.get(program, program))
+
+
+def _add_map_commands(parser: Parser) -> None:
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    commands.add_parser("build", help="build map=DIR dataset=...: of the database of a data set")
+    command = commands.add_parser("info", help="what a map holds, and what it was made with")
+    command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
+    command.set_defaults(run="mfvpr.cli.maps:print_map")
+    command = commands.add_parser("add", help="add images, one by one; other processes may localize meanwhile")
+    command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
+    command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")
+    command.add_argument("--place", help="where they were taken; by default their names")
+    command.set_defaults(run="mfvpr.cli.maps:add_images")
+
+
+def _add_weights_commands(parser: Parser) -> None:
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
+    command.set_defaults(run="mfvpr.cli.checkpoints:list_weights")
+    command = commands.add_parser("convert", help="install an official checkpoint")
+    command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
+    command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
+    command.set_defaults(run="mfvpr.cli.checkpoints:convert")
+    command = commands.add_parser("verify", help="check what is installed, byte by byte")
+    command.add_argument("names", metavar="NAME", nargs="*", help="by default all that are there")
+    command.set_defaults(run="mfvpr.cli.checkpoints:verify")
+    command = commands.add_parser("download", help="fetch an official checkpoint whose hash is published")
+    command.add_argument("name", metavar="NAME")
+    command.set_defaults(run="mfvpr.cli.checkpoints:download")
+
+
+def _add_data_commands(parser: Parser) -> None:
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    command = commands.add_parser("list", help="the published data sets, their sizes, and what their folders hold")
+    command.add_argument("names", metavar="NAME", nargs="*", help="by default a table of all")
+    command.set_defaults(run="mfvpr.cli.published_data:list_data")
+    command = commands.add_parser("check", help="what a folder holds beside what is published; draws pairs of images")
+    command.add_argument("name", metavar="NAME", help="as in dataset=NAME")
+    command.add_argument("settings", metavar="root=DIR", nargs="*", help="settings of the data set, without `dataset.`")
+    command.add_argument("--sheet", metavar="FILE", type=Path, help="where to draw them, by default NAME.png")
+    command.set_defaults(run="mfvpr.cli.published_data:check_data_set")
+
+
+def _add_report_arguments(parser: Parser) -> None:
+    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
+    parser.add_argument("--out", metavar="FILE", type=Path,
+                        help=f"by default RUN/report.html of one run, {_COMPARISON} here of several")  # fmt: skip
+    parser.set_defaults(run="mfvpr.cli.programs:write_page")
+
+
+_ARGUMENTS = {  # of programs that have commands or arguments instead of settings
+    "map": ("Localize images in a map with mfvpr localize. Settings of the first command: mfvpr map build --help.",
+            _add_map_commands),
+    "weights": ("Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the package; each "
+                "has its own license.", _add_weights_commands),
+    "data": ("Nothing is downloaded: each data set has its place and its license.", _add_data_commands),
+    "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, or of several "
+               "beside each other.", _add_report_arguments),
+}  # fmt: skip
+
+
+def write_page(runs: list[Path], out: Path | None) -> None:
+    """Write the page of one run, or of several compared, and print its path."""
+    from mfvpr.report.pages.one_run import write_report
+    from mfvpr.report.pages.several_runs import write_comparison
+    from mfvpr.utils.files import printable
+
+    if len(runs) == 1:
+        path = write_report(runs[0], out)
+    else:
+        path = out or Path(_COMPARISON)
+        write_comparison(runs, path)
+    print(printable(f"report: {path}"))

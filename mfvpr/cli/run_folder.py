@@ -1,0 +1,84 @@
+"""The folder of a run: claim it before the work, and fill it after, tables before figures."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from mfvpr.cli import build, console
+from mfvpr.cli.settings import SettingsError
+from mfvpr.report import runs
+from mfvpr.report.pages import one_run
+from mfvpr.report.runs import Figure
+from mfvpr.utils import InputError
+from mfvpr.utils.versions import versions
+
+_NO_SETTINGS = ("multirun", "command")  # added by `command_line`
+
+
+@contextmanager
+def claim(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
+    """The run folder that the settings name, for this run alone; with options of `runs.claim_run_folder`."""
+    out, name = settings["out"], settings["dataset"]["name"]
+    folder = build.expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
+        except InputError as error:
+            raise SettingsError(f"{error} with out=DIR") from error
+        yield folder
+
+
+def write_results(
+    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], *,
+    text: str, write: Callable[[Path], None], figures: Sequence[Figure],
+) -> None:  # fmt: skip
+    """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
+
+    The text is printed even if the files cannot be written; `write` gets the folder for them.
+    """
+    try:
+        write_files(folder, settings, ground_truth, write)
+    finally:
+        print(f"\n{text}", flush=True)
+    draw_figures(folder, figures)
+    print(f"results: {folder}")
+
+
+def write_files(
+    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], write: Callable[[Path], None]
+) -> None:
+    """Write the files of a run and run.json; arguments as of `write_results`."""
+    try:
+        with runs.writing(folder) as new:
+            write(new)
+            runs.write_json(new / "run.json", {
+                "command": settings.get("command"),
+                "settings": {name: value for name, value in settings.items() if name not in _NO_SETTINGS},
+                "ground_truth": ground_truth,
+                "commit": runs.commit(Path()),
+                "versions": versions(),
+            })  # fmt: skip
+    except OSError as error:
+        raise SettingsError(
+            f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "
+            "matches are kept where there is a store: make room, or name another folder with out=DIR"
+        ) from error
+
+
+def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
+    """Draw the figures of a run; warn if one cannot be drawn."""
+    for name, draw_figure in console.track("figures")(figures, len(figures)):
+        try:
+            draw_figure(folder / "figures" / name)
+        except Exception as error:
+            console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
+
+
+def report_page(folder: Path) -> Path | None:
+    """Write the page of an evaluation and return its path; warn and return None if that fails."""
+    try:
+        return one_run.write_report(folder)
+    except Exception as error:
+        console.tell(f"warning: {folder}: no page was made of it ({error})")
+        return None

@@ -1,0 +1,67 @@
+"""Ground truth of a recall: its source, its thresholds, and their words in results."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mfvpr import evaluation
+from mfvpr.cli.settings import SettingsError
+from mfvpr.datasets import Dataset, Truth
+from mfvpr.evaluation import EvaluationProtocol
+from mfvpr.utils import fingerprints
+
+_FILES = ("index_file", "query_labels", "database_labels")
+_WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images",
+          "published": "as published"}  # fmt: skip
+
+
+def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
+    """Thresholds of a correct prediction, ascending, in the ground truth's unit; empty without ground truth."""
+    recall = settings["recall"]
+    return [] if truth is None else truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
+
+
+def evaluation_protocol(settings: Mapping[str, Any], dataset: Dataset) -> EvaluationProtocol:
+    """The protocol of rankings for sweeps and learning."""
+    if dataset.truth is None:
+        raise SettingsError(
+            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
+        )
+    return evaluation.evaluation_protocol(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
+
+
+def describe(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """Kind, files, unit and thresholds of the ground truth, as results store them."""
+    choice, truth = settings["dataset"], dataset.sequences[0].truth
+    entries = {
+        "kind": choice.get("ground_truth", "drawn" if "cache" in choice else "published"),
+        "files": [choice[name] for name in _FILES if choice.get(name)],
+        "exclude_neighbors": choice.get("exclude_neighbors"),
+    }
+    return entries if truth is None else entries | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
+
+
+def positives_fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
+    """Fingerprint of the positives of all sequences, independent of their file; None without ground truth."""
+    content = []
+    for sequence in dataset.sequences:
+        if sequence.truth is not None:
+            positives = [sequence.truth.positives(threshold) for threshold in thresholds]
+            content.append([sequence.name, *({"rows": each.rows, "offsets": each.offsets} for each in positives)])
+    return fingerprints.fingerprint(fingerprints.recipe_of(content)) if content else None
+
+
+def in_words(*descriptions: Mapping[str, Any]) -> str:
+    """The ground truth in a heading, from descriptions of data sets with the same thresholds."""
+    first = descriptions[0]
+    if "unit" not in first:
+        return "no ground truth: rankings only"
+    source = ", ".join(dict.fromkeys(map(_source, descriptions)))
+    if first["unit"] == "exact":
+        return f"recall in %, ground truth: {source}"
+    within = ", ".join(f"{threshold:g}" for threshold in first["thresholds"])
+    return f"recall in %, within {within} {first['unit']} of the ground truth: {source}"
+
+
+def _source(description: Mapping[str, Any]) -> str:
+    kind, files = description["kind"], ", ".join(dict.fromkeys(description["files"]))
+    return ("labels in " if kind == "label" else "") + (files or _WORDS.get(kind, kind))

@@ -1,0 +1,150 @@
+"""Data settings in the programs: ground truth, excluded images, image reading."""
+
+import json
+import os
+import shutil
+from unittest.mock import ANY
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.cli.evaluation import evaluate
+from mfvpr.datasets import read_image
+from tests.programs import composed, csv_rows, folder
+
+pytestmark = pytest.mark.thorough
+
+QUICK = ("figures=0", "features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8",
+         "scorer=sum", "candidates=4", "cache=null")  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """An evaluation in this process: its rows, what it printed, and its folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*settings, name="out"):
+        place = tmp_path / name
+        evaluate(composed(*QUICK, f"out={place}", *settings) | {"multirun": False})
+        return json.loads((place / "results.json").read_text()), capsys.readouterr(), place
+
+    return run
+
+
+def recall(rows, **threshold):
+    return {row["system"]: row["recall_at"]["1"] for row in rows if threshold.items() <= row.items()}
+
+
+def ranked(place):
+    ranking = {}
+    for line in csv_rows(place / "predictions.csv"):
+        ranking.setdefault(line["query"], []).append(line["database"])
+    return ranking
+
+
+def same(street, *more):
+    """The database against itself."""
+    place = f"{street}/database"
+    return ("dataset=folder", f"dataset.database={place}", f"dataset.queries={place}", *more)
+
+
+def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path, run):
+    order = "dataset.ground_truth=order"
+    rows, printed, _ = run(*same(small_street, order), name="told")
+    assert "warning: 10 of 10 queries are database images themselves" in printed.err
+    assert set(recall(rows, tolerance=1).values()) == {1.0}
+
+    shutil.copytree(small_street / "database", tmp_path / "copy")  # by content
+    copied = (*same(small_street, order)[:2], f"dataset.queries={tmp_path}/copy", order)
+    assert "10 of 10 queries are database images" in run(*copied, name="copied")[1].err
+
+    rows, printed, place = run(*same(small_street, order, "dataset.exclude_neighbors=1"), name="left_out")
+    assert "database images themselves" not in printed.err
+    assert set(recall(rows, tolerance=1).values()) == {0.0}  # all that is within a frame is left out
+    assert 0 < recall(rows, tolerance=5)["sum"] <= 1
+    rankings = ranked(place)
+    assert len(rankings) == 10
+    for query, names in rankings.items():
+        assert len(names) == 4
+        assert all(abs(int(name[:4]) - int(query[:4])) > 1 for name in names)
+
+
+def test_nothing_right_is_told_beforehand(small_street, run):
+    settings = ("dataset.ground_truth=order", "dataset.exclude_neighbors=5", "recall.tolerances=[0,5]")
+    rows, printed, _ = run(*same(small_street, *settings))
+    assert "warning: the ground truth has no correct image for any query" in printed.err
+    assert set(recall(rows).values()) == {0.0}
+
+
+def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
+    for side in ("database", "query"):
+        lines = [f"{row:04d}.png,floor {row // 5}\n" for row in range(10)]
+        (tmp_path / f"{side}.csv").write_text("name,label\n" + "".join(lines))
+    files = [f"dataset.{side}_labels={tmp_path}/{side}.csv" for side in ("database", "query")]
+    rows, printed, place = run(*folder(small_street)[:3], "dataset.ground_truth=label", *files)
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1,R@5,R@10"
+    assert all("tolerance" not in row and "radius" not in row for row in rows)
+    correct = [int(query[:4]) // 5 == int(names[0][:4]) // 5 for query, names in ranked(place).items()]
+    assert recall(rows)["sum"] == np.mean(correct)
+    assert "recall in %" in printed.out
+    assert "±" not in printed.out
+
+
+def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street, run):
+    exact, printed, place = run(*folder(small_street, "dataset.widen_index=false"), name="exact")
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1,R@5,R@10"
+    assert len(exact) == 3
+    assert "±" not in printed.out
+    widened, _, place = run(*folder(small_street, "recall.tolerances=[0,1]"), name="widened")
+    assert (place / "table.csv").read_text().splitlines()[0] == "system,R@1 ±0,R@1 ±1,R@5 ±1,R@10 ±1"
+    assert recall(exact) == recall(widened, tolerance=0)
+
+
+@pytest.mark.slow
+def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp_path, run):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned, plain, deep = folders = [tmp_path / name for name in ("turned", "plain", "deep")]
+    for place in folders:
+        place.mkdir()
+    for path in sorted((small_street / "database").iterdir()):
+        Image.fromarray(np.rot90(read_image(path))).save(turned / path.name, exif=exif)
+    for path in sorted((small_street / "queries").iterdir()):
+        gray = np.asarray(Image.open(path).convert("L"))
+        Image.fromarray(gray).save(plain / path.name)
+        Image.fromarray(gray.astype(np.uint16) * 257).save(deep / path.name)
+
+    store = f"cache={tmp_path}/store"
+    common = ("dataset=folder", "dataset.ground_truth=order", store)
+    usual = run(*common, f"dataset.database={small_street}/database", f"dataset.queries={plain}", name="usual")
+    other = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", name="other")
+    assert [row["recall_at"] for row in usual[0]] == [row["recall_at"] for row in other[0]]
+    assert (usual[2] / "predictions.csv").read_text() == (other[2] / "predictions.csv").read_text()
+    assert usual[0][0]["reading"]["query"]["scaled_16bit"] == usual[0][0]["reading"]["database"]["turned"] == 0
+    assert other[0][0]["reading"] == {
+        "database": {"orient": True, "turned": 10, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
+        "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 10, "largest_16bit": ANY},
+    }  # fmt: skip
+    assert "note: 10 database images are turned" in other[1].err
+    assert "note: 10 16-bit query images are scaled to 8 bits" in other[1].err
+    assert "warning: the largest value" not in other[1].err
+
+    # The same store: what was read otherwise is not taken for it.
+    off = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", "dataset.orient=false",
+              "dataset.bits=12", name="off")  # fmt: skip
+    assert "so that they come out cut off; dataset.bits=16 would use their range" in off[1].err
+    assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
+
+
+@pytest.mark.parametrize("value", ["", None, "elsewhere"])
+def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
+    """Or features would be kept in the root of the file system."""
+    monkeypatch.setenv("MFVPR_CACHE", value or "")
+    if value is None:
+        monkeypatch.delenv("MFVPR_CACHE")
+    calls, root = [], value or "~/.cache/mfvpr"
+    monkeypatch.setattr("mfvpr.cli.evaluation.evaluate", calls.append)
+    succeed("evaluate")
+    assert (calls[0]["cache"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
+    assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")

@@ -1,0 +1,202 @@
+"""The programs as a user meets them: settings, mistakes, the demo's table, a run folder."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
+from mfvpr.cli import build, evaluation, settings
+from mfvpr.cli.settings import CONF, SettingsError
+from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
+from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run
+
+pytestmark = pytest.mark.thorough
+
+CHOICES = [
+    (group.name, choice.stem)
+    for group in sorted(CONF.iterdir())
+    if group.is_dir()
+    for choice in sorted(group.glob("*"))
+]
+
+
+@pytest.mark.parametrize(("group", "choice"), CHOICES)
+def test_every_conf_composes_and_passes_its_own_checks(group, choice):
+    paths = {
+        "folder": ["dataset.database=a", "dataset.queries=b"],
+        "grid": ["features=ssm", "matching.cross_check=candidate"],
+    }
+    needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
+    programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}
+    for config in programs.get(group, ["config"]):
+        settings.check(composed(f"{group}={choice}", *needs, config=config))
+
+
+@pytest.mark.parametrize("features", ["sift", "aliked"])
+def test_features_of_a_named_system_may_be_replaced(features):
+    config = composed("system=ssm_hist", f"features={features}")
+    settings.check(config)
+    assert (config["features"]["name"], config["retrieval"]["name"]) == (features, "ssm")
+    assert config["features"]["image_size"] == [336, 336]
+    assert (config["candidates"], config["scorer"]["method"]) == (50, "histogram")
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
+    (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),
+    (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
+    (["features=aliked", "features.image_size=null"], "features.image_size=null: expected width and height"),
+    (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate, since"),
+    (["scorer=grid", "features=ssm", "matching=lightglue"], "cross_check=lightglue: expected candidate, since"),
+    (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
+])  # fmt: skip
+def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
+    with pytest.raises(SettingsError, match=words):
+        settings.check(composed(*arguments))
+    settings.check(composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
+
+
+def test_scorers_of_conf_are_as_their_fields_say():
+    assert build.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
+    every = build.scorers(composed("scorer=all")["scorer"])
+    assert every == {name: scorer() for name, scorer in SCORERS.items() if name not in ALONE}
+    ratio = {"anchor": AnchorPoints(weight=RatioWeight()), "histogram": HistogramOfShifts(weight=RatioWeight())}
+    assert build.scorers(composed("scorer=ratio")["scorer"]) == ratio
+    compared = build.scorers(composed("scorer=compared")["scorer"])
+    assert compared["homography_8"] == Homography(8.0)
+    assert compared["magsac_8"] == OpenCvHomography(8.0, estimator="magsac")
+
+
+@pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf"), "abc", None, True, [1]])
+@pytest.mark.parametrize("name", ["scorer.histogram.sigma", "scorer.histogram.bin_size", "scorer.anchor.tolerance"])
+def test_values_without_meaning_are_refused(name, value):
+    config = OmegaConf.create(composed())
+    OmegaConf.update(config, name, value)
+    with pytest.raises(SettingsError, match=f"{name}=.*expected a number from 1e-06"):
+        settings.check(OmegaConf.to_container(config))
+
+
+@pytest.mark.slow
+def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
+    """Names with spaces, unicode and '@' in a parent folder; one image broken, one without keypoints."""
+    root = tmp_path / "a@b, c's" / "ü"
+    for name in ("database", "queries"):
+        (root / name).mkdir(parents=True)
+        for path in sorted((small_street / name).iterdir()):
+            (root / name / f"é {path.name}").write_bytes(path.read_bytes())
+    (root / "database" / "é 0003.png").write_bytes(b"")
+    Image.new("RGB", (30, 30)).save(root / "queries" / "é 0005.png")
+    arguments = ["dataset=folder", f"dataset.database={root}/database", f"dataset.queries={root}/queries",
+                 "dataset.ground_truth=order", *QUICK, "candidates=99", f"out={tmp_path}/out"]  # fmt: skip
+
+    assert "é 0003.png: expected an image file" in refuse("evaluate", *arguments)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
+
+    _, stderr = succeed("evaluate", *arguments, "on_bad_image=skip")
+    assert "candidates=99, but the database has 10 images" in stderr
+    heading = (tmp_path / "out" / "table.md").read_text().splitlines()[0]
+    assert ": 10 queries, 10 database images (1 skipped), 10 candidates (" in heading
+    skipped = csv_rows(tmp_path / "out" / "skipped.csv")
+    assert [(row["folder"], row["image"]) for row in skipped] == [("database", "é 0003.png")]
+    rows = csv_rows(tmp_path / "out" / "predictions.csv")
+    assert {f"é {row:04d}.png" for row in range(10)} - {row["query"] for row in rows} == {"é 0005.png"}
+    assert "é 0003.png" not in {row["database"] for row in rows}
+    assert "é 0005.png: no candidates (1 such queries of 10)" in stderr
+
+    assert "expected a new or empty run folder" in refuse("evaluate", *arguments, "on_bad_image=skip")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["database features", "matching"])
+def test_ctrl_c_leaves_nothing(small_street, tmp_path, interrupt, stage):
+    command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    seen = ""
+    while stage not in seen:
+        character = process.stderr.read(1)
+        assert character, f"ended before {stage}: {seen}"
+        seen += character
+    interrupt(process)
+
+
+@pytest.mark.slow
+def test_one_evaluation_compiles_few_programs_and_the_next_none(
+    small_street, tmp_path, monkeypatch, compilations, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    common = folder(small_street, "figures=2", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
+    evaluation.evaluate(composed(*common))
+    assert 1 <= compilations.count <= 20
+    compilations.reset()
+    unused = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
+              "scorer.anchor.window=6", "fusion.c=auto"]  # fmt: skip
+    evaluation.evaluate(composed(*common, *unused))
+    assert compilations.count == 0
+    assert len(list((tmp_path / "runs" / "folder").iterdir())) == 2
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory):
+    """`make demo` after its installation, with an empty cache."""
+    root = tmp_path_factory.mktemp("demo")
+    done = run("scorer=demo", cwd=root, MFVPR_CACHE=str(root / "cache"))
+    assert done.returncode == 0, done.stderr
+    (folder,) = (root / "runs" / "streets").iterdir()
+    return done, folder
+
+
+@pytest.mark.slow
+def test_demo_ranks_histogram_above_count_above_retrieval(demo):
+    _, folder = demo
+    rows = json.loads((folder / "results.json").read_text())
+    recall = {(row["system"], row["tolerance"]): row["recall_at"]["1"] for row in rows}
+    for tolerance in (1, 2, 5):
+        assert recall["histogram", tolerance] > recall["count", tolerance]
+    for tolerance in (1, 2):  # within 5 frames retrieval alone finds as many
+        assert recall["count", tolerance] > recall["retrieval", tolerance]
+
+
+@pytest.mark.slow
+def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
+    done, folder = demo
+    systems = ["retrieval", *PAPER, "histogram_ratio", "histogram + retrieval"]
+    header, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
+    assert [line.split("  ")[0] for line in lines] == systems
+    assert header.split("  ")[0] == "system"
+    assert done.stdout.endswith(f"report: runs/streets/{folder.name}/report.html\n")
+    assert (folder / "report.html").read_text("utf-8").count('src="data:image/jpeg;base64,') == 6
+    for bar in ("drawing streets", "database features", "matching", "scores", "figures"):
+        assert bar in done.stderr
+
+    files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
+    assert files <= {path.name for path in folder.iterdir()}
+    figures = [*(folder / "figures").iterdir()]
+    kinds = {"correct", "incorrect", "precision", "reliability", "rerank"}
+    assert {path.stem.split("_")[0] for path in figures} == kinds
+    for path in figures:
+        image = np.asarray(Image.open(path).convert("L"))
+        assert image.shape[0] > 300
+        assert image.std() > 20
+    assert [row["system"] for row in csv_rows(folder / "table.csv")] == systems
+    assert {row["query"] for row in csv_rows(folder / "predictions.csv")[:50]} == {"0000.png"}
+
+
+@pytest.mark.slow
+def test_results_say_what_made_them(demo):
+    _, folder = demo
+    text = (folder / "results.json").read_text()
+    rows = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert len(rows) == 21
+    for row in rows:
+        assert set(row["recall_at"]) == {"1", "5", "10"}
+        assert (row["queries"], row["database"], row["candidates"]) == (100, 100, 50)
+        assert {"data", "features", "retrieval", "matching", "scores"} <= set(row["seconds"])
+        assert {"mfvpr", "jax", "numpy"} <= set(row["versions"])
+        assert set(map(len, row["data_fingerprint"].values())) == {16}
+    histogram = next(row for row in rows if row["system"] == "histogram")
+    assert histogram["parameters"]["sigma"] == 22.5

@@ -1,0 +1,81 @@
+"""Fusions as a user of the programs meets them: the systems of a run folder, and what can be swept of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mfvpr.cli import axes, build, evaluation, settings
+from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, small
+
+FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
+SYSTEM = "histogram + anchor + retrieval"
+
+
+def ranked(out, name):
+    """Database images of every query and the scores, best first."""
+    lines = csv_rows(out / "predictions" / f"{name}.csv")
+    return [(line["query"], line["database"], float(line["score"])) for line in lines]
+
+
+@pytest.mark.slow
+def test_a_run_ranks_by_what_is_fused(root, tmp_path):
+    out = tmp_path / "out"
+    more = ("final=combined", "previous_queries=1", "figures=1", f"out={out}")
+    evaluation.evaluate(composed(*small(root), *FUSED, *more))
+    rows = json.loads((out / "results.json").read_text())
+    rows_by_system = {row["system"]: row for row in rows if row["tolerance"] == 1}
+    assert [*rows_by_system] == ["retrieval", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
+    assert [row["scorer"] for row in rows_by_system.values()] == [
+        "none", "anchor", "histogram", "histogram + anchor", "histogram + anchor",
+    ]  # fmt: skip
+    parameters = {name: row["parameters"] for name, row in rows_by_system.items()}
+    assert parameters["anchor"]["weight"] == parameters["histogram"]["weight"] == "ratio"
+    assert parameters[SYSTEM] == {
+        "histogram": parameters["histogram"], "anchor": parameters["anchor"],
+        "c": "zscore", "retrieval_score": "cosine", "weights": {"retrieval": 0.5, "anchor": 1},
+    }  # fmt: skip
+    assert parameters[f"{SYSTEM} + frames"] == parameters[SYSTEM] | {"previous": 1, "reach": 15.0, "gain": 0.4}
+    decided = out / "predictions" / "histogram_anchor_retrieval.csv"
+    assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
+    scores = [score for _, _, score in ranked(out, "histogram_anchor_retrieval")]
+    for query in range(QUERIES):  # standardized: their mean is 0
+        of_query = scores[query * CANDIDATES : (query + 1) * CANDIDATES]
+        assert sum(of_query) == pytest.approx(0, abs=1e-3)
+        assert max(of_query) > 0.5
+    assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
+
+
+def test_our_system_fuses_two_scores_and_retrieval():
+    for arguments, features, side, weight in (
+        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.retrieval=1"], "sift", 336, 1),
+    ):  # fmt: skip
+        config = composed("system=mfvpr", *arguments)
+        settings.check(config)
+        assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
+        fusion = build.fusion(config)
+        assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": weight, "anchor": 1})
+        assert fusion.system("histogram") == SYSTEM
+        assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + retrieval"
+    alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
+    config = composed("system=mfvpr", *alone, config="sweep")
+    settings.check(config)
+    assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]
+
+
+def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):
+    more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, histogram: 2}", "cohort=1", "figures=0")
+    evaluation.evaluate(composed(*small(root), *more, f"out={tmp_path}/out"))
+    rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
+    name = "histogram + cohort + retrieval"
+    assert [*rows][-2:] == ["histogram + retrieval", name]
+    assert rows[name]["parameters"]["cohort"] == 1
+    retrieval_scores, cohort_scores, fused = (
+        {line[:2]: line[2] for line in ranked(tmp_path / "out", system)}
+        for system in ("retrieval", "histogram_cohort", "histogram_cohort_retrieval")
+    )
+    for query in {query for query, _ in fused}:
+        pairs = [pair for pair in fused if pair[0] == query]
+        scores = [np.array([part[pair] for pair in pairs]) for part in (retrieval_scores, cohort_scores)]
+        by_retrieval, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
+        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * by_retrieval + 2 * normalized, atol=1e-2)

@@ -1,0 +1,49 @@
+"""Launchers of jobs: they compose, what is not installed is told, and shards go through one."""
+
+import hydra
+import pytest
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+
+from mfvpr.cli.groups import choices
+from mfvpr.cli.settings import CONF
+from tests.programs import composed
+
+PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers
+EXTRAS = {"joblib": "sweep", "submitit_local": "slurm", "slurm": "slurm"}
+
+
+def installed():
+    """The launchers that Hydra finds; it looks for them once."""
+    Plugins.instance()
+    return ConfigStore.instance().repo["hydra"]["launcher"]
+
+
+@pytest.mark.parametrize("launcher", choices("launcher"))
+def test_a_launcher_composes_and_adds_no_setting(launcher):
+    """Check a structured configuration, which refuses what the plugin does not know."""
+    if f"{PLUGINS[launcher]}.yaml" not in installed():
+        pytest.skip(f"pip install 'mfvpr[{EXTRAS[launcher]}]'")
+    for config in ("config", "sweep", "learn"):
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            hydra_settings = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
+        assert hydra_settings.job.env_set == {"PJRT_NPROC": str(hydra_settings.launcher.get("cpus_per_task") or 1)}
+        assert PLUGINS[launcher].rpartition("_")[2] in hydra_settings.launcher._target_.lower()
+        assert composed(f"launcher={launcher}", config=config) == composed(config=config)
+
+
+@pytest.mark.parametrize("launcher", PLUGINS)
+def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, refuse_at_once):
+    monkeypatch.delitem(installed(), f"{PLUGINS[launcher]}.yaml", raising=False)
+    message = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
+    for setting in (f"launcher={launcher}", f"hydra/launcher={PLUGINS[launcher]}"):
+        assert refuse_at_once("evaluate", "-m", setting, "candidates=4,8") == message
+
+
+def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
+    without, _ = succeed("evaluate", "--help")
+    assert "  launcher=null           joblib, slurm, submitit_local\n" in without
+    stdout, _ = succeed("sweep", "--help", "launcher=slurm")
+    assert "\nhydra:\n  # An array of Slurm" in stdout
+    assert "\n  launcher:\n    name: mfvpr\n    array_parallelism: 64  # tasks" in stdout
+    assert "@" not in stdout[stdout.index("hydra:") : stdout.index("scorer:")]

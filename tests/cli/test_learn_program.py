@@ -1,0 +1,265 @@
+"""experiments.learn as its users meet it: what it learns from, what it reports, its checkpoints, and mistakes."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.cli import evaluation, learning, sweeping
+from mfvpr.scoring.weight_files import read_weight
+from mfvpr.tuning.learning import checkpoints, teaching
+from mfvpr.tuning.learning.splits import TrainingSplit
+from mfvpr.tuning.learning.training import Fit, Record
+from tests.programs import QUERIES, composed, results, small, snapshot
+
+pytestmark = pytest.mark.slow
+
+SUM = ("scorer=sum",)
+SHORT = (*SUM, "split=first_half", "steps=4", "every=2", "batch=4", "learning_rate=0.05")
+ROWS = [name + fused for name in ("paper", "1 - ratio", "grid search", "gradient", "match weights", "match labels")
+        for fused in ("", " + retrieval")]  # fmt: skip
+WIDEST = 1  # frames
+
+
+@pytest.fixture(scope="session")
+def learn(root):
+    """Learns into a folder, in this process; what results.json holds comes back."""
+
+    def call(out, *overrides, pictures=False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not pictures:
+                patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
+            learning.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
+        return results(out)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def learned(learn, tmp_path_factory):
+    out = tmp_path_factory.mktemp("learned") / "out"
+    return out, learn(out, *SHORT, pictures=True)
+
+
+@pytest.fixture
+def untrained(monkeypatch):
+    """Replace the training by its start values, and record its options."""
+    calls = []
+
+    def start(parameters, objective, batches, **options):
+        calls.append(options)
+        for step in range(options["steps"]):
+            batches(step)
+        return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
+
+    monkeypatch.setattr(teaching, "fit", start)
+    return calls
+
+
+def rows_of(results):
+    return {row["score"]: row for row in results["rows"]}
+
+
+def test_all_rows_in_every_file(learned):
+    out, content = learned
+    assert [row["score"] for row in content["rows"]] == ROWS
+    with (out / "table.csv").open() as file:
+        header, *lines = csv.reader(file)
+    assert header == ["score", "R@1 ±0", "R@1 ±1", "95 % at ±1", "against paper", "p", "p by blocks"]
+    assert [line[0] for line in lines] == ROWS
+    for line, row in zip(lines, content["rows"], strict=True):
+        assert [float(cell) for cell in line[1:3]] == [round(100 * value, 1) for value in row["recall_at_1"].values()]
+        for tolerance, (low, high) in row["interval"].items():
+            assert 0 <= low <= row["recall_at_1"][tolerance] <= high <= 1
+    assert all(name in (out / "summary.txt").read_text() for name in ROWS)
+    trained = [row["halves"]["first_half"] for row in content["rows"][6:10]]
+    for fit in trained:
+        assert [record[0] for record in fit["history"]] == [0, 2, 4]
+        assert fit["steps"] in (0, 2, 4)
+        assert fit["values"]["temperature"] > 0
+    assert [sorted(fit["values"]) for fit in trained] == 2 * [["temperature"], ["c", "temperature"]]
+    assert any(fit["steps"] > 0 for fit in trained)
+
+
+def test_pictures_and_weights(learned):
+    out, _ = learned
+    for name in ("curves", "weights"):
+        picture = np.asarray(Image.open(out / "figures" / f"{name}.png").convert("L"))
+        assert min(picture.shape) > 200
+        assert picture.std() > 10
+    for name in ("match_weights", "match_weights_retrieval", "match_labels"):
+        weight, origin = read_weight(out / "weights" / f"first_half_{name}.json")
+        assert weight.hidden.shape == (5, 16)
+        assert origin["settings"]["seed"] == 0
+        assert origin["training"].startswith("first_half: match ")
+
+
+def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
+    grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
+    sweeping.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
+    swept = results(tmp_path / "out")
+    rows = rows_of(learned[1])
+    assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]
+    for line in swept["report"]:
+        for row, name in (("paper", "own"), ("grid search", "chosen")):
+            assert rows[row]["recall_at_1"][f"{line['threshold']}"] == pytest.approx(line[name]["recall"])
+
+
+def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkeypatch):
+    """Check both halves: neither the reported queries and places nor their neighbors, while learning or validating."""
+    seen, batch = [], TrainingSplit.batch
+
+    def watched(split, queries, size):
+        seen.append((split, queries))
+        return batch(split, queries, size)
+
+    monkeypatch.setattr(TrainingSplit, "batch", watched)
+    content = learn(
+        tmp_path / "out", *SUM, "split=both", "steps=6", "batch=2", "fusion.retrieval_score=negative_euclidean"
+    )
+    reported = dict(zip(("first_half", "second_half"), content["queries"]["reported"], strict=True))
+    assert sorted(query for half in reported.values() for query in half) == list(range(QUERIES))
+    for chosen_on, (half, reported_rows) in zip(content["queries"]["chosen_on"], reported.items(), strict=True):
+        assert len(chosen_on) >= 8
+        assert min(abs(row - other) for row in chosen_on for other in reported_rows) > 2 * WIDEST
+        taught = {int(query) for split, queries in seen if split.name == half for query in queries}
+        assert len(taught) >= 5
+        assert taught <= set(chosen_on)
+    for split, queries in seen:
+        assert np.all(split.candidates.scores < 0)  # as it was asked
+        places = {int(place) for query in queries for place in split.candidates.indices[query][split.usable[query]]}
+        assert min(abs(place - other) for place in places for other in reported[split.name]) > WIDEST
+        assert min(abs(row - other) for row in split.train for other in split.validation) > 2 * WIDEST
+        assert {*queries} <= {*split.train} or {*queries} <= {*split.validation}
+
+
+@pytest.mark.parametrize("changes", [(), ("matching.max_distance=0.3", "ties=index")])
+def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, changes):
+    changes = ("scorer=sum", "fusion.c=1e6", *changes)
+    rows = rows_of(learn(tmp_path / "out", *SUM, *changes, "steps=1"))
+    evaluation.evaluate(composed(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
+    expected = json.loads((tmp_path / "evaluated" / "results.json").read_text())
+    names = {"sum": "paper", "sum + retrieval": "paper + retrieval"}
+    for row in expected:
+        if row["system"] in names:
+            recall = rows[names[row["system"]]]["recall_at_1"][f"{row['tolerance']}"]
+            assert recall == pytest.approx(row["recall_at"]["1"], abs=1e-6)
+
+
+def test_without_a_store_the_recalls_are_the_same(learn, learned, untrained, tmp_path):
+    """Match weights, which look at the ratio, are begun as well. A store rounds its matches: settings may tie."""
+    rows = rows_of(learn(tmp_path / "out", *SHORT, "cache=null"))
+    assert list(rows) == ROWS
+    for name in ROWS[:2]:
+        assert rows[name]["recall_at_1"] == rows_of(learned[1])[name]["recall_at_1"], name
+
+
+@pytest.mark.parametrize(
+    ("axes", "names"), [(("grid.weight=[dmf]",), {"weight"}), (("grid.weight=null", "grid.c=[auto]"), {"c"})]
+)
+def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained, tmp_path, axes, names):
+    extra = ("grid.c=null", "fusion.c=0.7") if names == {"weight"} else ()
+    rows = rows_of(learn(tmp_path / "out", *SUM, *extra, *axes, "split=first_half", "steps=1"))
+    for fused in ("", " + retrieval"):
+        searched, expected = rows[f"grid search{fused}"], rows[f"paper{fused}"]
+        assert searched["recall_at_1"] == expected["recall_at_1"]
+        assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not fused else set())
+
+
+def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
+    rows = rows_of(learn(tmp_path / "out", "scorer=anchor", "scorer.num_bins=5", "split=first_half", "steps=1"))
+    assert {*rows["grid search"]["halves"]["first_half"]["values"]} == {"window", "tolerance", "weight"}
+    assert {*rows["gradient"]["halves"]["first_half"]["values"]} == {"tolerance", "temperature"}
+
+
+def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
+    saved, save = [], checkpoints.save
+
+    def interrupted(folder, step, *rest):
+        saved.append((folder.name, step))
+        if len(saved) == 4:
+            raise KeyboardInterrupt
+        save(folder, step, *rest)
+
+    monkeypatch.setattr(checkpoints, "save", interrupted)
+    again = (*SHORT, f"checkpoints={tmp_path}/kept")
+    with pytest.raises(KeyboardInterrupt):
+        learn(tmp_path / "out", *again)
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+    assert learn(tmp_path / "out", *again) == learned[1]
+    assert saved[:4] == [(f"first_half-gradient{more}", step) for more in ("", "_retrieval") for step in (2, 4)]
+    assert saved[4:6] == [("first_half-gradient_retrieval", 4), ("first_half-match_weights", 2)]
+
+
+def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, refuse):
+    [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
+    before = snapshot(root)
+    for change, words in (
+        ("learning_rate=0.5", "learning_rate=0.05, expected 0.5"),
+        ("recall.tolerances=[1]", "tolerances.tolerances[0]=0, expected 1"),
+        ("loss=recall", 'loss="cross_entropy", expected "recall"'),
+    ):
+        arguments = (*small(root), *SHORT, change, f"checkpoints={folder.parent}", f"out={tmp_path}/out")
+        error = refuse("learn", *arguments)
+        assert error.startswith(f"error: {folder}: ")
+        assert words in error
+        assert "delete" in error
+        assert list(tmp_path.iterdir()) == []
+    assert snapshot(root) == before
+
+
+def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp_path, monkeypatch):
+    """Else one training would go on with what another one left."""
+    monkeypatch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
+    shifted = tmp_path / "shifted.csv"
+    shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
+    changes = [
+        "seed=0", "seed=1", "hidden=4", "inputs=absolute", "batch=3", "learning_rate=0.5", "loss=recall",
+        "candidates=7", "every=1", "fusion.retrieval_score=negative_euclidean", f"dataset.index_file={shifted}",
+    ]  # fmt: skip
+    for change in changes:
+        fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
+        learning.learn(composed(*small(root), *fixed, change, config="learn"))
+        shutil.rmtree(tmp_path / "out")
+    assert len({call["folder"] for call in untrained}) == 5 * len(changes)
+    assert len({json.dumps(call["recipe"]) for call in untrained}) == 5 * len(changes)
+
+
+@pytest.mark.parametrize(("rate", "step", "step_kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
+def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step, step_kept):
+    place = tmp_path / "kept"
+    few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
+    absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
+    error = refuse("learn", *small(root), *few, *absurd)
+    assert error.startswith(f"error: step {step}: ")
+    assert " is not finite at numbers.sigma=" in error
+    assert step_kept.format(place / "first_half-gradient") in error
+    assert "learning rate" in error
+    assert not (tmp_path / "out").exists()
+    assert sorted(path.name for path in place.glob("*/*")) == (["3", "4"] if step == 4 else [])
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["split=null"], "split=null: "),
+    (["scorer=count"], "scorer=count: expected one to learn"),
+    (["scorer=all"], "scorer: expected one to learn"),
+    (["recall.tolerances=[30]"], "smaller tolerances or radius"),
+    (["also=streets"], "also=streets: expected report="),
+    (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
+    (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
+    (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
+    (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number from 0"),
+])  # fmt: skip
+def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
+    assert words in refuse_at_once("learn", *small(root), *arguments)
+
+
+def test_what_is_not_the_papers_is_not_called_so(learn, untrained, tmp_path):
+    content = learn(tmp_path / "out", *SUM, "scorer.weight=ratio", "split=first_half", "steps=1")
+    names = ["as set", "as set + retrieval", "1 - ratio", "1 - ratio + retrieval"]
+    assert [row["score"] for row in content["rows"]][:4] == names
+    assert content["rows"][0]["recall_at_1"] == content["rows"][2]["recall_at_1"]
+    assert "against as set" in (tmp_path / "out" / "table.md").read_text()

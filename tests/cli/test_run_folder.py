@@ -1,0 +1,390 @@
+"""Run folders: their files, also after errors, on full disks, and with names that are not UTF-8."""
+
+import itertools
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mfvpr.cli import console, evaluation, run_folder
+from mfvpr.cli.settings import SettingsError
+from mfvpr.datasets import AllowedTruth, Positives, read_image
+from mfvpr.datasets.streets import streets_folder
+from mfvpr.evaluation import mcnemar
+from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.report import runs
+from mfvpr.report.evaluations import SequenceFigures
+from mfvpr.scoring import HistogramOfShifts
+from mfvpr.utils import InputError
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
+
+pytestmark = pytest.mark.thorough
+
+LINES = ("scorer=histogram", "figures=4")
+SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
+
+
+@pytest.fixture(scope="session")
+def evaluated(root, tmp_path_factory):
+    out = tmp_path_factory.mktemp("evaluated") / "out"
+    evaluation.evaluate(composed(*small(root), *LINES, f"out={out}"))
+    return out
+
+
+@pytest.fixture(scope="session")
+def outcome(root):
+    return evaluation.evaluation_of(composed(*small(root), *LINES, "candidates=3"))
+
+
+# --- contents ----------------------------------------------------------------------------------------------------
+
+
+def test_predictions_are_long_and_agree_with_the_recall(evaluated):
+    entries = json.loads((evaluated / "results.json").read_text())
+    for system in SYSTEMS:
+        lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        assert list(lines[0]) == ["query", "rank", "database", "score", "correct"]
+        assert [int(line["rank"]) for line in lines] == QUERIES * [*range(1, CANDIDATES + 1)]
+        scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
+        assert np.all(np.diff(scores) <= 0)
+        correct = np.array([int(line["correct"]) for line in lines]).reshape(QUERIES, -1)
+        recall = next(row["recall_at"] for row in entries if row["system"] == system and row["tolerance"] == 1)
+        assert correct[:, 0].mean() == pytest.approx(recall["1"], abs=1e-6)
+        assert correct[:, :5].any(axis=1).mean() == pytest.approx(recall["5"], abs=1e-6)
+    assert (evaluated / "predictions.csv").read_bytes() == (evaluated / "predictions" / "histogram.csv").read_bytes()
+
+
+@pytest.mark.parametrize("system", ["retrieval", "histogram", "histogram_retrieval"])
+def test_failures_are_the_wrong_first_answers(evaluated, system):
+    ranked = {}
+    for line in csv_rows(evaluated / "predictions" / f"{system}.csv"):
+        ranked.setdefault(line["query"], []).append(line)
+    incorrect = {query: lines for query, lines in ranked.items() if lines[0]["correct"] == "0"}
+    failures = csv_rows(evaluated / "failures" / f"{system}.csv")
+    assert [line["query"] for line in failures] == list(incorrect)
+    assert 0 < len(failures) < QUERIES
+    assert {bool(line["rank"]) for line in failures} == {True, False} or system != "retrieval"
+    for line in failures:
+        lines = incorrect[line["query"]]
+        assert line["prediction"] == lines[0]["database"]
+        first = next((line for line in lines if line["correct"] == "1"), None)
+        if first is None:
+            assert [line[name] for name in ("rank", "correct_image", "score", "margin")] == [""] * 4
+        else:
+            assert (line["rank"], line["correct_image"], line["score"]) == (
+                first["rank"], first["database"], first["score"])  # fmt: skip
+            margin = float(lines[0]["score"]) - float(first["score"])
+            assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
+
+
+def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
+    gains, hits = csv_rows(evaluated / "gains.csv"), {}
+    assert len(gains) == QUERIES
+    for system in SYSTEMS:
+        lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
+        for line in gains:
+            correct = [entry["rank"] for entry in lines if entry["query"] == line["query"] and entry["correct"] == "1"]
+            assert line[f"{system} rank"] == (correct[0] if correct else "")
+            assert line[system] == str(int(correct[:1] == ["1"]))
+        hits[system] = np.array([line[system] == "1" for line in gains])
+    assert {line["histogram rank"] for line in gains} > {"", "1"}
+    for line, pair in zip(csv_rows(evaluated / "differences.csv"), itertools.combinations(SYSTEMS, 2), strict=True):
+        assert (line["system"], line["other"]) == pair
+        first, second = (hits[name] for name in pair)
+        assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
+        assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
+        assert float(line["blocks_p"]) == pytest.approx(block_sign_flips(first, second).p_value, rel=1e-6)
+    header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
+    assert header == "| only this is correct, not | retrieval | histogram | histogram + retrieval |"
+    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['retrieval']).sum()} (p ")
+
+
+def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys):
+    none = ("dataset.ground_truth=none", "dataset.index_file=null", "figures=2", f"out={tmp_path}/out")
+    evaluation.evaluate(composed(*small(root), *LINES, *none))
+    assert "no ground truth: rankings only" in capsys.readouterr().out
+    entries = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [(row["system"], row["recall_at"]) for row in entries] == [(system, {}) for system in SYSTEMS]
+    assert {line["correct"] for line in csv_rows(tmp_path / "out" / "predictions.csv")} == {""}
+    files = {"results.json", "run.json", "predictions.csv", "predictions", "shifts.csv", "figures", "report.html"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == files
+    assert {path.name.split("_")[0] for path in (tmp_path / "out" / "figures").iterdir()} == {"best"}
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
+
+
+def test_heading_and_tables_say_the_same(evaluated, capsys):
+    entries = json.loads((evaluated / "results.json").read_text())
+    truth = entries[0]["ground_truth"]
+    assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
+    heading, _, *table = (evaluated / "table.md").read_text().splitlines()
+    assert heading.endswith(f"recall in %, within 0, 1 frames of the ground truth: {truth['files'][0]}")
+    latex = (evaluated / "table.tex").read_text()
+    assert latex.startswith(f"% {heading}\n")
+    for line in csv_rows(evaluated / "table.csv"):
+        assert f"| {' | '.join(line.values())} |" in table
+        assert f"{' & '.join(line.values())} \\\\\n" in latex
+
+
+def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
+    subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    subprocess.run(["git", *identity, "commit", "--quiet", "--allow-empty", "-m", "x"], cwd=tmp_path, check=True)
+    monkeypatch.chdir(tmp_path)
+    stdout, _ = succeed("evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
+    assert stdout.endswith("results: a b\nreport: a b/report.html\n")
+    content = json.loads((tmp_path / "a b" / "run.json").read_text())
+    assert content["command"].startswith("mfvpr evaluate dataset=folder dataset.database=")
+    assert content["command"].endswith(" scorer=count figures=0 'out=a b'")
+    expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
+    assert content["settings"] == expected
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert content["commit"] == head.stdout.strip()
+    assert {"mfvpr", "jax", "python"} <= content["versions"].keys()
+    (tmp_path / "file").write_text("x")
+    subprocess.run(["git", "add", "file"], cwd=tmp_path, check=True)
+    assert runs.commit(tmp_path) == content["commit"] + "-dirty"
+    assert runs.commit(Path("/")) is None
+
+
+def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
+    heights = {path.name: len(read_image(path)) for path in (evaluated / "figures").glob("*_0*.png")}
+    assert len(heights) == 4
+    assert min(height for name, height in heights.items() if name.startswith("incorrect")) > 700
+    assert max(height for name, height in heights.items() if name.startswith("correct")) < 600
+
+    page = page_of(outcome)
+    [ranked], correct = outcome.report.result.systems["histogram"], outcome.report.is_correct("histogram", 0)
+    query_by_case = {bool(correct[query].any()): query for query in np.flatnonzero(~correct[:, 0])}
+    names = outcome.images.dataset.database.names
+    query = query_by_case[True]
+    rank = int(np.argmax(correct[query]))
+    [prediction] = page.correct_candidates(query)
+    score = f"{ranked.scores[query, rank]:.5g}"
+    assert prediction.caption == f"correct: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
+    assert float(prediction.explanation.score) == pytest.approx(float(score), rel=1e-3)
+    [prediction] = page.correct_candidates(query_by_case[False])
+    place = outcome.images.dataset.truth.place(query_by_case[False])
+    assert prediction.caption == f"correct: {names[place]}, not among the 3 candidates"
+    assert prediction.matches is None
+
+
+def page_of(outcome, **changes):
+    result = outcome.report.result
+    dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
+    evaluation = replace(outcome.report, result=replace(result, dataset=dataset))
+    return SequenceFigures(evaluation, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
+
+
+def test_what_does_not_count_is_never_shown_as_right(outcome):
+    """If the nearest image is excluded, the page shows another correct image, or none."""
+    correct = outcome.report.is_correct("histogram", 0)
+    query = int(np.flatnonzero(~correct.any(axis=1))[0])
+    names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
+    excluded = np.zeros((len(outcome.images.dataset.queries), len(names)), bool)
+    excluded[query, truth.place(query)] = True
+
+    def predictions(excluded):
+        page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
+        return [prediction.caption for prediction in page.correct_candidates(query)]
+
+    other = int(np.argmax(outcome.report.positives[0].dense()[query] & ~excluded[query]))
+    assert predictions(excluded) == [f"correct: {names[other]}, not among the 3 candidates"]
+    assert predictions(np.ones_like(excluded)) == []
+
+
+def test_figures_of_chosen_queries(outcome):
+    query_rows, dataset = evaluation.query_rows, outcome.images.dataset
+    assert query_rows([5, "0002.png", 5], dataset) == [5, 2]
+    assert query_rows(7, dataset) == 7
+    for incorrect in (24, -1, "nope.png"):
+        with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
+            query_rows([0, incorrect], dataset)
+    assert list(page_of(outcome).verdicts([5, 2])) == [5, 2]
+
+
+def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
+    page = replace(page_of(outcome), refused=np.arange(24) == 5)
+    assert "no place" in page.title(5, "correct")
+    assert "no place" not in page.title(2, "correct")
+
+
+# --- the claim ---------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_in_use_is_refused_at_the_start(root, tmp_path, monkeypatch, call):
+    monkeypatch.setattr(evaluation, "evaluation_of", lambda *_: pytest.fail("it was begun"))
+    with runs.claim_run_folder(tmp_path / "out"):
+        code, stdout, stderr = call("evaluate", *small(root), f"out={tmp_path}/out")
+    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+    assert stderr.startswith(f"error: {tmp_path}/out: another run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_claim_of_a_killed_run_is_free(tmp_path):
+    code = ("import sys; from pathlib import Path; from mfvpr.report import runs\n"
+            "with runs.claim_run_folder(Path(sys.argv[1])) as folder, runs.writing(folder) as new:\n"
+            "    (new / 'half').write_text('written'); print('held', flush=True); sys.stdin.read()")  # fmt: skip
+    process = subprocess.Popen([sys.executable, "-c", code, tmp_path / "out"], cwd=ROOT, stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, text=True)  # fmt: skip
+    with process:
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(InputError, match="another run is using"), runs.claim_run_folder(tmp_path / "out"):
+            pass
+        process.send_signal(signal.SIGKILL)
+    assert list((tmp_path / "out").iterdir()) != []
+    with runs.claim_run_folder(tmp_path / "out") as folder:
+        assert list(folder.iterdir()) == []
+        with runs.writing(folder) as new:
+            (new / "results.json").write_text("all")
+    assert [path.name for path in folder.iterdir()] == ["results.json"]
+
+
+def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
+    def interrupted():
+        with runs.claim_run_folder(tmp_path / "a" / "b" / "out") as folder, runs.writing(folder) as new:
+            (new / "half").write_text("written")
+            raise KeyboardInterrupt
+
+    (tmp_path / "a").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "a"]
+
+
+def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
+    together = threading.Barrier(8, timeout=30)
+
+    def claim(_):
+        together.wait()
+        with runs.claim_run_folder(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
+            together.wait()
+            return folder.name
+
+    with ThreadPoolExecutor(8) as threads:
+        names = sorted(threads.map(claim, range(8)))
+    assert names == ["2030-01-02_03-04-05", *(f"2030-01-02_03-04-05-{number}" for number in range(2, 9))]
+    assert list(tmp_path.rglob("*-*")) == []
+
+
+# --- what goes wrong at the end ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def limited(monkeypatch):
+    """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
+    before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), run_folder.write_results
+
+    def limit(size):
+        def limited(*arguments, **named):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+            try:
+                write_results(*arguments, **named)
+            finally:  # at once: the log of the tests is a file, too
+                resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+        monkeypatch.setattr(run_folder, "write_results", limited)
+
+    return limit
+
+
+def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, limited):
+    limited(2000)
+    code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert code == 2
+    assert "\nhistogram + retrieval " in stdout
+    last = stderr.splitlines()[-1]
+    assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large); they are printed")
+    assert "with out=DIR" in last
+    assert "Traceback" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, succeed, limited):
+    limited(30_000)
+    stdout, stderr = succeed("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
+    warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/incorrect_")]
+    assert len(warnings) == 2
+    assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
+    assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
+    assert not [path for path in (tmp_path / "out").rglob(".*")]
+
+
+def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
+    run_folder.report_page(tmp_path)
+    stdout, stderr = capsys.readouterr()
+    assert stdout == ""
+    assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
+
+
+def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
+    monkeypatch.setattr(
+        "mfvpr.report.evaluations.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+    )
+    code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
+    assert code == 130
+    assert "\nhistogram + retrieval " in stdout
+    assert stderr.splitlines()[-1].startswith("interrupted")
+    names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+
+
+def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
+    """Names of images, of their folder, and of the run folder."""
+    street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
+    place = tmp_path / os.fsdecode(b"data\xff")
+    for side in ("database", "queries"):
+        (place / side).mkdir(parents=True)
+        for path in sorted((street / side).iterdir())[:6]:
+            shutil.copy(path, place / side / os.fsdecode(b"\xfe" + path.name.encode()))
+    out = tmp_path / os.fsdecode(b"out\xff")
+    arguments = [f"dataset.database={place}/database", f"dataset.queries={place}/queries", f"out={out}", "figures=2",
+                 "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
+    stdout, stderr = succeed("evaluate", *small(root), *arguments)
+    assert stdout.endswith("out\\udcff/report.html\n")
+    assert "warning" not in stderr
+    assert len(list((out / "figures").glob("*_0*.png"))) == 2
+    assert b"\xfe0000.png,1,\xfe000" in (out / "predictions.csv").read_bytes()
+    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    assert run["settings"]["out"] == str(out)
+    json.loads((out / "results.json").read_text(encoding="utf-8"))
+
+
+# --- progress ----------------------------------------------------------------------------------------------------
+
+
+def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
+    assert list(console.track("matching")(range(234), 234)) == list(range(234))
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["0", *(f"{percent}" for percent in range(0, 101, 10))]
+    assert lines[1].startswith("matching               0 %  1 of 234  ")  # says soon how long the rest takes
+    assert lines[6].startswith("matching              50 %  117 of 234  ")
+    assert all(line.endswith(" s left") for line in lines[1:-1])
+    bar = console.bar("drawing", 3)
+    bar.update(3)
+    bar.close()
+    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["0", "100"]
+
+
+def test_no_progress_is_shown_of_nothing(capsys):
+    assert list(console.track("features")([], 0)) == []
+    assert capsys.readouterr().err == ""
+
+
+def test_progress_in_a_terminal_is_a_bar(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert list(console.track("matching")(range(9), 9)) == list(range(9))
+    assert "\rmatching            : 100%|" in capsys.readouterr().err

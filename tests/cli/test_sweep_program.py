@@ -1,0 +1,269 @@
+"""experiments.sweep as its users meet it: its numbers, its files, mistakes, and interruptions."""
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mfvpr.cli import axes, evaluation, launch, sweeping
+from mfvpr.storage import matches as match_store
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small, snapshot
+
+pytestmark = pytest.mark.thorough
+
+SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
+
+
+@pytest.fixture(scope="session")
+def sweep(root):
+    """Sweeps into a folder, in this process; what results.json holds comes back."""
+
+    def call(out, *overrides, pictures=False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not pictures:
+                patch.setattr(sweeping.sweeps, "heat_maps", lambda *_: [])
+            sweeping.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
+        return results(out)
+
+    return call
+
+
+GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")
+
+
+@pytest.fixture(scope="session")
+def swept(sweep, tmp_path_factory):
+    """The sweep that fills the store."""
+    out = tmp_path_factory.mktemp("swept") / "out"
+    return out, sweep(out, *GRID, pictures=True)
+
+
+def recall_of(content, **parameters):
+    [entry] = [entry for entry in content["settings"] if entry["parameters"] == parameters]
+    return entry["recall_at"]
+
+
+# --- one sweep ---------------------------------------------------------------------------------------------------
+
+
+def evaluated(root, out, *overrides):
+    """The rows of an evaluation, and their recall at ks by system and tolerance."""
+    evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *overrides))
+    rows = json.loads((out / "results.json").read_text())
+    return rows, {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
+
+
+@pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
+def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
+    content = sweep(tmp_path / "swept", *GRID, f"final={final}")
+    rows, _ = evaluated(root, tmp_path / "evaluated", "scorer=histogram", GRID[-1], f"final={final}")
+    assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
+    deciding = {f"{row['tolerance']}": row["recall_at"] for row in rows if row["decides"]}
+    assert recall_of(content, **content["own"]) == deciding
+
+
+def test_every_file_tells_the_same(swept):
+    out, content = swept
+    with (out / "table.csv").open() as file:
+        header, *lines = csv.reader(file)
+    assert header == ["sigma", "weight", "c", "R@1 ±0", "R@1 ±1", "R@5 ±1"]
+    assert len(lines) == len(content["settings"]) == 8
+    for line, entry in zip(lines, content["settings"], strict=True):
+        assert line[:3] == [f"{value}" for value in entry["parameters"].values()]
+        recall = entry["recall_at"]
+        expected = [recall["0"]["1"], recall["1"]["1"], recall["1"]["5"]]
+        np.testing.assert_allclose([float(cell) / 100 for cell in line[3:]], expected, atol=6e-4)
+    assert {"mfvpr", "jax", "numpy"} <= set(content["versions"])
+    assert set(map(len, content["data_fingerprint"].values())) == {16}
+    assert content["ground_truth"]["kind"] == "index"
+    assert content["ground_truth"]["thresholds"] == [0, 1]
+    heading = (out / "summary.txt").read_text().splitlines()[0]
+    assert f"within 0, 1 frames of the ground truth: {content['ground_truth']['files'][0]}" in heading
+    assert (out / "table.md").read_text().startswith(f"{heading}\n\n|")
+    assert (out / "table.tex").read_text().startswith(f"% {heading}\n\\begin")
+    assert (content["unit"], content["thresholds"], content["ks"]) == ("frames", [0, 1], [1, 5])
+
+
+def test_the_best_setting_is_chosen_and_told(swept):
+    out, content = swept
+    main = {tuple(entry["parameters"].values()): entry["recall_at"]["1"]["1"] for entry in content["settings"]}
+    [chosen] = content["chosen"]
+    assert main[tuple(chosen.values())] == max(main.values()) > min(main.values())
+    assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": 0}
+    for line in content["report"]:
+        tolerance = f"{line['threshold']}"
+        for name, setting in (("chosen", chosen), ("own", content["own"])):
+            assert line[name]["recall"] == pytest.approx(recall_of(content, **setting)[tolerance]["1"], abs=1e-6)
+        test = line["mcnemar"]
+        gain = QUERIES * (line["chosen"]["recall"] - line["own"]["recall"])
+        assert test["only_first"] - test["only_second"] == pytest.approx(gain)
+    text = (out / "summary.txt").read_text()
+    assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
+    assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
+    assert "this flatters" in text
+    flips = content["report"][1]["sign_flips"]
+    assert f"by {flips['blocks']} blocks of {flips['block']} queries p = {flips['p_value']:.2g}" in text
+
+
+def test_heat_maps_are_pictures(swept):
+    figures = swept[0] / "figures"
+    assert {path.name for path in figures.iterdir()} == {"sigma_weight.png", "sigma_c.png", "weight_c.png"}
+    for path in figures.iterdir():
+        picture = np.asarray(Image.open(path).convert("RGB"))
+        assert min(picture.shape[:2]) > 200
+        assert picture.std() > 30
+        assert np.any(np.all(np.abs(picture.astype(int) - (232, 72, 44)) < 8, axis=-1))  # the best is framed
+
+
+def test_without_a_store(root, sweep, tmp_path):
+    """Nor with many ties, by another rule: most pairs have no matches."""
+    common = ("cache=null", "matching.max_distance=0.3", "ties=index")
+    _, expected = evaluated(root, tmp_path / "evaluated", "scorer=histogram", "scorer.sigma=10", *common)
+    content = sweep(tmp_path / "swept", "grid.sigma=[10]", *common)
+    for tolerance, recall in recall_of(content, sigma=10).items():
+        assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
+
+
+def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
+    content = sweep(tmp_path / "final", "grid.sigma=[10]", "final=combined", "fusion.c=100")
+    explicit = sweep(tmp_path / "given", "grid.sigma=[10]", "grid.c=[0,100]", "fusion.c=100")
+    assert content["own"] == {"sigma": 22.5, "c": 100}
+    combined, alone = (recall_of(explicit, sigma=10, c=c) for c in (100, 0))
+    assert recall_of(content, sigma=10, c=100) == combined != alone
+
+
+def test_other_scores_and_their_axes(sweep, swept, tmp_path):
+    sizes = sweep(tmp_path / "anchor", "scorer=anchor", "scorer.num_bins=8", "grid.num_bins=[5,8]")
+    assert len({json.dumps(entry["recall_at"]) for entry in sizes["settings"]}) == 2
+    soft = sweep(tmp_path / "soft", "grid.temperature=[null,1e-6,100]")["settings"]
+    hard, nearly, washed_out = (entry["recall_at"] for entry in soft)
+    assert hard == nearly != washed_out
+    assert "none" in (tmp_path / "soft" / "table.csv").read_text()
+
+
+@pytest.mark.parametrize(("experiment", "changes", "count"), [
+    ("histogram", ("grid.sigma=[10,15]", "grid.bin_size=[15]"), 3),
+    ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
+    ("combined", ("grid.c=[0,1,auto]",), 3),
+])  # fmt: skip
+def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
+    content = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
+    assert len(content["settings"]) == count
+    assert (tmp_path / "out" / "figures").is_dir()
+
+
+@pytest.mark.slow
+def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
+    def find(name, seed):
+        space = ("search=optuna", "trials=5", "grid.sigma=[5,30]", "grid.weight=[fs,unit]")
+        return sweep(tmp_path / name, *space, f"seed={seed}")
+
+    first, again, other = find("first", 1), find("again", 1), find("other", 2)
+    assert first == again
+    tried = [entry["parameters"] for entry in first["settings"]]
+    assert tried[0] == first["own"] == {"sigma": 22.5, "weight": "fs"}
+    assert len(tried) == 6
+    assert tried != [entry["parameters"] for entry in other["settings"]]
+
+
+# --- mistakes and interruptions ----------------------------------------------------------------------------------
+
+SIGMA = "grid.sigma=[10]"
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
+    (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
+    (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
+    (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
+    ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
+    ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
+    ([SIGMA, "features=sift,aliked"], "add --multirun"),
+])  # fmt: skip
+def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
+    assert words in refuse_at_once("sweep", *small(root), *arguments)
+
+
+@pytest.mark.parametrize(("program", "arguments", "words"), [
+    ("sweep", [SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
+    ("sweep", ["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
+    ("evaluate", ["scorer=histogram", "scorer.bin_size=0.01"], "bin_size=0.01: expected at most 1024 bins"),
+])  # fmt: skip
+def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, program, arguments, words):
+    assert refuse(program, *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, refuse):
+    def refused(free, *arguments):
+        monkeypatch.setattr(axes, "free_host_bytes", lambda: free)
+        error = refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out")
+        assert list(tmp_path.iterdir()) == []
+        return error
+
+    many = f"grid.sigma={list(range(1, 101))}", f"grid.bin_size={list(range(5, 105))}"
+    assert "10,000 settings would take about 20 MB of memory, 10 MB are free" in refused(10**7, *many)
+    few = f"grid.sigma={list(range(1, 101))}", "recall.ks=[1000]"
+    line = refused(10**6, *few)
+    assert "rankings of 24 queries by 101 settings would take about 10 MB of memory, 1 MB are free" in line
+    line = refused(2 * 10**5, SIGMA, "chunk.queries=24")
+    assert "chunk: 2 settings x 24 queries " in line
+    assert "chunk.settings or chunk.queries" in line
+
+
+@pytest.mark.parametrize("change", ["candidates=7", "retrieval.num_words=9", "features.max_keypoints=61"])
+def test_matches_of_something_else_are_refused(root, swept, tmp_path, call, change):
+    """A store that was moved to where another one belongs."""
+
+    def place(*changes):
+        return matches_path(composed(*small(root), *changes, config="sweep"))[0]
+
+    matching_place, foreign = place(f"cache={tmp_path}/store"), place(change)
+    with match_store.open_match_store(matching_place, {"other": 1}, num_queries=24, num_candidates=8):
+        pass
+    matching_place.parent.joinpath(foreign.name).symlink_to(matching_place)
+    before = snapshot(tmp_path)
+    folders = (f"cache={tmp_path}/store", f"out={tmp_path}/out")
+    code, stdout, stderr = call("sweep", *small(root), change, SIGMA, *folders)
+    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+    assert "these matches were made with" in stderr
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
+    root, sweep, swept, tmp_path, monkeypatch, interrupt
+):
+    """Finished blocks are store, and go when the whole sweep is done."""
+    grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
+    arguments = [*small(root), *grid, f"out={tmp_path}/out"]
+    command = [sys.executable, "-m", "experiments.sweep", *arguments]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    store = root / "store"
+    while len(done := list(store.glob("folder_sweep-*/[!.]*.npz"))) < 5:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.01)
+    interrupt(process)
+    done, computed = list(store.glob("folder_sweep-*/[!.]*.npz")), []
+    assert 5 <= len(done) < 6 * QUERIES
+    sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
+    scores = SWEEP.block_scores
+    monkeypatch.setattr(SWEEP, "block_scores", lambda *block: computed.append(1) or scores(*block))
+    resumed = sweep(tmp_path / "out", *grid)
+    assert len(computed) == 6 * QUERIES - len(done)
+    assert not list(store.glob("folder_sweep-*"))
+    assert resumed == sweep(tmp_path / "again", *grid[:1])
+
+
+def test_a_lost_ctrl_c_comes_again():
+    """An exception in a garbage collection callback cannot be caught; it must come again at once, even in a sleep."""
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        launch.resend_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
+    assert time.monotonic() - start < 10
