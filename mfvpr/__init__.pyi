@@ -2,9 +2,9 @@
 
 # values that pass from stage to stage
 # what is correct, and recall
+# systems by name; a whole data set, and one image at a time
+from .cli.systems import load_system
 from .datasets.positives import frame_positives, radius_positives
-
-# a whole data set, and one image at a time
 from .evaluation.evaluation import evaluate
 from .evaluation.recall import recall_at_k
 from .evaluation.system import Pipeline, System
@@ -93,6 +93,7 @@ __all__ = [
     "filter_matches",
     "frame_positives",
     "image_sizes",
+    "load_system",
     "masked",
     "masked_mean",
     "masked_median",

@@ -34,8 +34,8 @@ PERMISSIONS = {
         "datasets", "evaluation", "features", "localization", "reranking", "scoring", "tuning", "types", "utils",
     },
     "cli": {
-        "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "report", "reranking",
-        "retrieval", "scoring", "storage", "tuning", "types", "utils",
+        "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "networks", "report",
+        "reranking", "retrieval", "scoring", "storage", "tuning", "types", "utils",
     },
 }  # fmt: skip
 LIBRARIES = {

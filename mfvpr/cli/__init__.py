@@ -5,12 +5,15 @@
 | evaluate, sweep, learn, localize | evaluation, sweeping, learning, localization |
 | map, data, weights, report | maps, published_data, checkpoints, mfvpr.report.pages |
 
-Read first: launch (starts a program), command_line (Hydra), groups (programs, and groups of settings), settings and
-rules (checks of settings). Then overrides, help_text, wording (of errors), declare (files in conf/ that follow from
-scorers). Settings become values in build, truth and confidences. Jobs share stages, run_folder, axes, console.
+Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
+settings and rules (checks of settings), systems (`load_system`). Then overrides, help_text, wording (of errors),
+declare (files in conf/ that follow from scorers). Settings become values in build, truth and confidences. Jobs share
+stages, run_folder, axes, console.
 
-Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, retrieval, scoring,
-storage, tuning, types, utils.
+Imports checkpoints, datasets, evaluation, features, localization, matching, networks, report, reranking, retrieval,
+scoring, storage, tuning, types, utils.
 """
 
-__all__ = []
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,9 +15,11 @@ from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
+from mfvpr.evaluation import Pipeline, System
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import Fusion
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking.results import COHORT
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
@@ -155,7 +157,7 @@ def matcher(settings: dict[str, Any]) -> Matcher:
 def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
     """Files of another program, by folder of the images."""
     if data is None:
-        raise ValueError(f"{group}: files of another program belong to a data set")
+        raise SettingsError(f"{group}: files of other programs belong to a data set; choose others")
     queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
     if len(queries) not in (1, len(data.sequences)):
         raise SettingsError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
@@ -190,6 +192,30 @@ def runtime(settings: dict[str, Any]) -> Runtime:
     if number != "all" and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
     return Runtime(devices if number == "all" else devices[:number], settings["memory"], console.track, console.tell)
+
+
+def pipeline(settings: dict[str, Any], data: Dataset | None) -> Pipeline:
+    """The pipeline that the settings name; files of other programs need their data set."""
+    local = extractor(settings["features"], data)
+    retrieval = retriever(settings["retrieval"], local, data)
+    return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"])
+
+
+def system(settings: dict[str, Any], pipeline: Pipeline) -> System:
+    """The system that the settings name: the main scorer is fused with the retrieval, also its scores with a cohort."""
+    chosen, fusing, cohort = scorers(settings["scorer"]), fusion(settings), settings["cohort"]
+    main = main_scorer(chosen)
+    fused = {main: fusing}
+    if cohort is not None and fusing.members(main) == [main]:
+        fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
+    headline = fusing.system(main) if settings["final"] == "combined" else main
+    correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
+    return System(pipeline, chosen, fused, correlated, cohort, settings["ties"], headline)
+
+
+def main_scorer(scorers: Mapping[str, Any]) -> str:
+    """Name of the scorer that decides: the histogram of shifts, or the first."""
+    return "histogram" if "histogram" in scorers else next(iter(scorers))
 
 
 def fusion(settings: dict[str, Any]) -> Fusion:

@@ -6,7 +6,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,7 +44,7 @@ def run(config: str) -> None:
     def task(composed: DictConfig) -> None:
         hydra_settings = HydraConfig.get()
         is_multirun = hydra_settings.mode == RunMode.MULTIRUN
-        with _multirun_job() if is_multirun else one_line(), _hydra_errors(config):  # in here, or Hydra adds lines
+        with _multirun_job() if is_multirun else one_line(), hydra_errors(config, typed):  # in here, or Hydra adds lines
             for setting in sorted(OmegaConf.missing_keys(composed)):
                 raise SettingsError(f"{setting}: this setting has no default; give {setting}=VALUE")
             settings: Any = OmegaConf.to_container(composed, resolve=True)
@@ -59,8 +59,8 @@ def run(config: str) -> None:
 
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
-    with _hydra_errors(config):
-        typed = sys.argv[1:]
+    typed = sys.argv[1:]
+    with hydra_errors(config, typed):
         multirun = sorted({*_MULTIRUN} & {*typed})
         arguments = split_first(typed) if config == "learn" and not multirun else typed
         for argument in arguments:
@@ -119,15 +119,15 @@ def _check_form(argument: str, config: str) -> None:
 
 
 @contextmanager
-def _hydra_errors(config: str) -> Iterator[None]:
-    """Raise Hydra's errors as SettingsErrors."""
+def hydra_errors(config: str, arguments: Sequence[str]) -> Iterator[None]:
+    """Raise Hydra's errors about the arguments of a program as SettingsErrors."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        raise SettingsError(_explain(error, config)) from error
+        raise SettingsError(_explain(error, config, arguments)) from error
 
 
-def _explain(error: Exception, config: str) -> str:
+def _explain(error: Exception, config: str, arguments: Sequence[str]) -> str:
     """Explain a Hydra error in one line; for an unknown setting, name the nearest one."""
     text = " ".join((str(error) or str(error.__cause__)).split())
     text = text.partition(" Config search path")[0].partition(" See https")[0]
@@ -136,18 +136,18 @@ def _explain(error: Exception, config: str) -> str:
         return f"{launcher[1]}: this launcher is not installed; {mend}"
     if unknown := re.search(r"Could not override '([^']*)'|Key '([^']*)' is not in struct", text):
         name = unknown[1] or unknown[2]
-        return f"{name}: unknown setting; {_suggestion(name, config)}"
+        return f"{name}: unknown setting; {_suggestion(name, config, arguments)}"
     for pattern, words in _EXPLANATIONS.items():
         if known := re.search(pattern, text):
             return known.expand(words)
     return text
 
 
-def _suggestion(wrong: str, config: str) -> str:
+def _suggestion(wrong: str, config: str, arguments: Sequence[str]) -> str:
     """Suggest a setting for an unknown one: in its group, in another choice of its group, or a similar name."""
     if wrong in _RENAMED:
         return f"its name is {_RENAMED[wrong]} now"
-    chosen = [argument for argument in sys.argv[1:] if argument.partition("=")[0] in groups(config)]
+    chosen = [argument for argument in arguments if argument.partition("=")[0] in groups(config)]
     settings: Any = OmegaConf.to_container(compose_program(config, chosen))
     values = dict(nodes(settings))
     group, (outer, _, name) = wrong.partition(".")[0], wrong.rpartition(".")

@@ -11,7 +11,7 @@ from mfvpr.cli.stages import Images, Tools
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
-from mfvpr.evaluation import System, evaluation
+from mfvpr.evaluation import evaluation
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.features import Source
 from mfvpr.report import runs
@@ -19,7 +19,7 @@ from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, 
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import EvaluationReport, query_figures, recall_table, write_rankings, write_skipped
 from mfvpr.report.shifts import write_shifts
-from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage import NotYet
@@ -73,24 +73,17 @@ def _fill_store(settings: dict[str, Any]) -> None:
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
     scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
-    fusion, main = build.fusion(settings), "histogram" if "histogram" in scorers else next(iter(scorers))
-    fusion.check(main, scorers)
+    main = build.main_scorer(scorers)
+    build.fusion(settings).check(main, scorers)  # before anything slow
     tools, images = stages.prepare(settings, watch)
-    figure_queries = query_rows(settings["figures"], images.dataset)
-    headline = fusion.system(main) if settings["final"] == "combined" else main
-    frames = FrameCorrelation(previous) if (previous := settings["previous_queries"]) else None
-    cohort, fused_systems = settings["cohort"], [main]
-    if cohort is not None and fusion.members(main) == [main]:
-        fused_systems.append(f"{main} + {COHORT}")
-    fusions = {name: fusion.rename_main(main, name) for name in fused_systems}
+    system, figure_queries = build.system(settings, tools.pipeline), query_rows(settings["figures"], images.dataset)
+    headline = system.headline
     confidence = confidences.check_confidence(confidence, headline, settings, images)
-    correlated = {headline: frames} if frames else {}
-    system = System(tools.pipeline, scorers, fusions, correlated, cohort, settings["ties"], headline)
     result = evaluation.evaluate(images.dataset, system, cache=tools.cache)
     result = replace(result, seconds={**watch.seconds, **result.seconds})
-    parameters = _parameters(settings, main, fusions)
-    if frames:
-        parameters[f"{headline} + {FRAMES}"] = parameters[headline] | asdict(frames)
+    parameters = _parameters(settings, main, system.fused)
+    for name, correlation in system.correlated.items():
+        parameters[f"{name} + {FRAMES}"] = parameters[name] | asdict(correlation)
     thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
     report = EvaluationReport(result, thresholds, sorted(set(settings["recall"]["ks"])), headline)
     histogram = scorers.get("histogram")

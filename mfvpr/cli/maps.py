@@ -9,7 +9,7 @@ from mfvpr.cli import build
 from mfvpr.cli.console import track
 from mfvpr.cli.settings import SettingsError, check
 from mfvpr.cli.stages import dataset_of
-from mfvpr.evaluation import Pipeline, System
+from mfvpr.evaluation import System
 from mfvpr.localization import Map
 from mfvpr.storage.disk import used_bytes
 from mfvpr.utils.files import printable, write_text
@@ -97,7 +97,4 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     """The map in a folder, with these settings."""
-    extractor = build.extractor(settings["features"], None)
-    retriever, matcher = build.retriever(settings["retrieval"], extractor, None), build.matcher(settings["matching"])
-    pipeline = Pipeline(extractor, retriever, matcher, settings["candidates"])
-    return Map(folder, System(pipeline, build.scorers(settings["scorer"])), **options)
+    return Map(folder, System(build.pipeline(settings, None), build.scorers(settings["scorer"])), **options)

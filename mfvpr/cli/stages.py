@@ -66,10 +66,7 @@ def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 
 
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
-    extractor = build.extractor(settings["features"], dataset)
-    retriever = build.retriever(settings["retrieval"], extractor, dataset)
-    matcher = build.matcher(settings["matching"])
-    return Tools(Pipeline(extractor, retriever, matcher, settings["candidates"]), cache)
+    return Tools(build.pipeline(settings, dataset), cache)
 
 
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:

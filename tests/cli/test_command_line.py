@@ -64,7 +64,7 @@ def test_help_is_of_the_groups_that_were_chosen(succeed):
 @pytest.mark.parametrize(("argument", "code", "error", "modules"), [
     ("--help", None, "", ["hydra", "omegaconf", "numpy", "jax"]),
     ("scorer.histogram.sigma=0", 2, "error: scorer.histogram.sigma=0: expected a number from 1e-06 to 1e+12",
-     ["numpy", "jax", "mfvpr"]),
+     ["numpy", "jax"]),
 ])  # fmt: skip
 def test_help_and_wrong_settings_do_not_wait_for_slow_imports(argument, code, error, modules):
     script = ("import sys; from mfvpr.cli.launch import launch\n"

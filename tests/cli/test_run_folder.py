@@ -184,7 +184,7 @@ def page_of(outcome, **changes):
     result = outcome.report.result
     dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
     evaluation = replace(outcome.report, result=replace(result, dataset=dataset))
-    return SequenceFigures(evaluation, 0, outcome.tools.extractor, HistogramOfShifts(), np.zeros(24, bool))
+    return SequenceFigures(evaluation, 0, outcome.tools.pipeline.extractor, HistogramOfShifts(), np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):

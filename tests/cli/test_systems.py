@@ -1,0 +1,73 @@
+"""Systems by name in the library are those of the programs."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import InputError, load_system
+from mfvpr.cli import build, evaluation, programs
+from mfvpr.cli.groups import choices
+from mfvpr.features import Sift
+from mfvpr.storage import FeatureCache
+from mfvpr.utils.fingerprints import recipe_of
+from tests.programs import CANDIDATES, composed, csv_rows, small
+
+SMALL = {
+    "features": {"max_keypoints": 60, "image_size": [160, 120]},
+    "retrieval": {"num_words": 8},
+    "candidates": CANDIDATES,
+}
+
+
+@pytest.mark.parametrize("name", choices("system"))
+def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
+    if name == "steering":
+        assert isinstance(load_system(name).pipeline.extractor, Sift)
+    else:
+        with pytest.raises(InputError, match=r"^[\w-]+: not installed in "):
+            load_system(name)
+
+
+@pytest.mark.parametrize(("name", "settings", "words"), [
+    ("mix", {}, "^system=mix: expected one of mfvpr, mix_hist_10"),
+    ("steering", {"sigma": 3}, "^sigma: unknown setting; the nearest is scorer[.]sigma"),
+    ("steering", {"scorer": {"sgma": 3}}, "^scorer.sgma: unknown setting; the nearest is scorer[.]sigma"),
+    ("steering", {"candidates": -1}, "^candidates=-1: expected a whole number from 1"),
+    ("steering", {"features": "xfeat"}, "^features=xfeat: expected one of aliked"),
+    ("steering", {"features": "import"}, "^features: files of other programs belong to a data set"),
+    ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),
+])  # fmt: skip
+def test_what_cannot_be_loaded_is_one_line(name, settings, words):
+    with pytest.raises(InputError, match=words) as error:
+        load_system(name, **settings)
+    assert "\n" not in str(error.value)
+
+
+def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path):
+    arguments = ("system=steering", f"out={tmp_path}/run", "figures=0")
+    evaluation.evaluate(composed(*small(tmp_path), *arguments) | {"multirun": False})
+    system = load_system("steering", **SMALL)
+    again = load_system(tmp_path / "run" / "run.json")
+    assert recipe_of(again.pipeline) == recipe_of(system.pipeline)
+    data = build.dataset(composed(*small(tmp_path))["dataset"], lambda done, total: None)
+    result = mfvpr.evaluate(data, system, cache=FeatureCache(tmp_path / "features"))
+    names = np.array(data.database.names)[result.systems["histogram"][0].rows[:, 0]]
+    rows = [row for row in csv_rows(tmp_path / "run" / "predictions.csv") if row["rank"] == "1"]
+    assert [row["database"] for row in rows] == names.tolist()
+    street = mfvpr.Map(tmp_path / "map", system)
+    street.build(data.database)
+    assert [street.localize(path).place for path in data.queries.paths] == names.tolist()
+
+
+def test_the_command_runs_programs_and_refuses_others(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mfvpr"])
+    programs.main()
+    assert {*programs.PROGRAMS} <= {*capsys.readouterr().out.split()}
+    monkeypatch.setattr(sys, "argv", ["mfvpr", "evaluat"])
+    with pytest.raises(SystemExit) as left:
+        programs.main()
+    assert left.value.code == 2
+    assert capsys.readouterr().err.startswith("error: evaluat: expected one of demo, evaluate")
