@@ -1,1 +1,1 @@
-"""What belongs to a clone: the programs of `mfvpr.cli` by name, the benchmark, the paper's evaluation, results."""
+"""Programs of a clone: those of `mfvpr.cli` by name, the benchmark, the paper's evaluation; and their results."""

@@ -44,7 +44,8 @@ def run(config: str) -> None:
     def task(composed: DictConfig) -> None:
         hydra_settings = HydraConfig.get()
         is_multirun = hydra_settings.mode == RunMode.MULTIRUN
-        with _multirun_job() if is_multirun else one_line(), hydra_errors(config, typed):  # in here, or Hydra adds lines
+        # In here, or Hydra adds lines to the errors.
+        with _multirun_job() if is_multirun else one_line(), hydra_errors(config, typed):
             for setting in sorted(OmegaConf.missing_keys(composed)):
                 raise SettingsError(f"{setting}: this setting has no default; give {setting}=VALUE")
             settings: Any = OmegaConf.to_container(composed, resolve=True)

@@ -97,4 +97,4 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     """The map in a folder, with these settings."""
-    return Map(folder, System(build.pipeline(settings, None), build.scorers(settings["scorer"])), **options)
+    return Map(folder, System(build.pipeline({**settings}, None), build.scorers(settings["scorer"])), **options)

@@ -76,7 +76,8 @@ def _score(dataset: Dataset, sequence: QuerySequence, system: System, cache: Fea
 def _score_cohort(dataset: Dataset, system: System, cohort: int, cache: FeatureCache, watch: Stopwatch) -> Scored:
     """Match and score the database with itself, as a stage of its own."""
     sequence = cohort_sequence(cache.contents(dataset.database), cohort)
-    cache = replace(cache, runtime=cache.runtime.with_prefix("cohort"))
+    progress = cache.runtime.progress
+    cache = replace(cache, runtime=replace(cache.runtime, progress=lambda label: progress(f"cohort {label}")))
     with watch(COHORT):
         return _score(dataset, sequence, system, cache, Stopwatch())
 

@@ -6,18 +6,6 @@ npz, h5, pairs, and formats/ (MATLAB files, pickles and NumPy objects, read as d
 Imports types, utils.
 """
 
-from mfvpr.io.descriptors import read_global_descriptors, write_global_descriptors
-from mfvpr.io.feature_files import write_features
-from mfvpr.io.features import ImportedFeatures, open_features
-from mfvpr.io.shortlists import read_shortlist, reranked_shortlist, write_shortlist
+import lazy_loader
 
-__all__ = [
-    "ImportedFeatures",
-    "open_features",
-    "read_global_descriptors",
-    "read_shortlist",
-    "reranked_shortlist",
-    "write_features",
-    "write_global_descriptors",
-    "write_shortlist",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,8 +16,6 @@ Imports datasets, evaluation, features, matching, reranking, retrieval, scoring,
 types, utils.
 """
 
-from mfvpr.localization.map import Map
-from mfvpr.localization.predictions import Alternative, Localization, Prediction
-from mfvpr.localization.route import Drive, Located, Route
+import lazy_loader
 
-__all__ = ["Alternative", "Drive", "Localization", "Located", "Map", "Prediction", "Route"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

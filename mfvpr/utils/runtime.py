@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device
@@ -31,10 +31,6 @@ class Runtime:
     def __post_init__(self) -> None:
         if self.memory is not None and not 0 < self.memory < math.inf:
             raise InputError(f"memory={self.memory!r}: expected GB above 0, or None")
-
-    def with_prefix(self, prefix: str) -> "Runtime":
-        """The same with a prefix of all labels of progress."""
-        return replace(self, progress=lambda label: self.progress(f"{prefix} {label}"))
 
 
 DEFAULT_RUNTIME = Runtime()
