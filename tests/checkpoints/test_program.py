@@ -154,6 +154,7 @@ def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypat
     assert original.startswith("patchnetvlad_pitts_128: BAD, not installed in")
     path.with_suffix(".json").unlink()
     assert "there is no manifest" in program("verify")[1]
+    assert program("list")[1].splitlines()[-1].split()[-2:] == ["no", "-"]
 
 
 def test_what_is_not_converted_is_verified_by_its_published_hash(program, folder, monkeypatch):

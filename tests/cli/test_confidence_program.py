@@ -197,8 +197,10 @@ def test_what_another_program_says_of_how_it_was_made_stops_nothing(evaluate, co
     assert "other settings of features" in stderr
 
 
-def test_a_confidence_that_is_the_same_for_all_is_told(evaluate, content, tmp_path):
-    content["systems"]["histogram"]["weights"] = [0.0, 0.0]
+def test_a_confidence_that_is_the_same_for_all_is_told_and_refuses_none_at_its_value(evaluate, content, tmp_path):
+    content["systems"]["histogram"] |= {"weights": [0.0, 0.0], "bias": 0.0}
     (tmp_path / "flat.json").write_text(json.dumps(content))
-    _, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json")
+    out, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json", "threshold=0.5")
     assert "flat.json has the same confidence for all predictions" in stderr
+    top = csv_rows(out / "top_predictions.csv")
+    assert {(line["confidence"], line["reason"]) for line in top} == {("0.5", "")}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mfvpr.cli import stages
 from mfvpr.cli.evaluation import evaluate
 from mfvpr.datasets import read_image
 from tests.programs import composed, csv_rows, folder
@@ -135,6 +136,19 @@ def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp
               "dataset.bits=12", name="off")  # fmt: skip
     assert "so that they come out cut off; dataset.bits=16 would use their range" in off[1].err
     assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
+
+
+@pytest.mark.parametrize(("largest", "words"), [
+    (1023, "dark; dataset.bits=10"), (1024, ""), (4095, ""), (4096, "cut off; dataset.bits=13"),
+])  # fmt: skip
+def test_a_range_of_16_bit_images_that_does_not_fit_is_told(tmp_path, capsys, largest, words):
+    (tmp_path / "database").mkdir()
+    Image.fromarray(np.full((120, 160), largest, np.uint16)).save(tmp_path / "database" / "0.png")
+    settings = composed(*QUICK, *same(tmp_path, "dataset.ground_truth=order", "dataset.bits=12"))
+    stages.prepare(settings, stages.Stopwatch())
+    stderr = capsys.readouterr().err
+    assert words in stderr
+    assert ("the largest value of all 16-bit images" in stderr) == bool(words)
 
 
 @pytest.mark.parametrize("value", ["", None, "elsewhere"])

@@ -178,10 +178,10 @@ def test_nordlands_test_part_is_two_sections(tmp_path):
 
 
 def test_vpr_bench_asks_every_tenth_frame(tmp_path):
-    put(tmp_path, *(f"ref/{i:07d}.jpg" for i in range(22)), *(f"query/{i:07d}.jpg" for i in range(3)))
+    put(tmp_path, *(f"ref/{i:07d}.jpg" for i in range(30)), *(f"query/{i:07d}.jpg" for i in range(3)))
     assert rows(published_dataset("nordland_vprbench", tmp_path), 1) == [[0, 1], [9, 10, 11], [19, 20, 21]]
     put(tmp_path, "query/0000003.jpg")
-    check_error("nordland_vprbench", tmp_path, "got 22 for 4")
+    check_error("nordland_vprbench", tmp_path, "got 30 for 4")
 
 
 # Pittsburgh

@@ -178,6 +178,11 @@ def test_visible_points_lie_on_the_nearest_facade_in_view():
     assert points[:, 1].max() <= 0.0
 
 
+def test_points_behind_the_camera_or_too_near_are_outside_the_image():
+    points = np.array([[0.0, -1.6, 0.6], [0.0, -1.6, 0.4], [7.5, 4.0, -10.0]])
+    assert CAMERA.project(points)[1].tolist() == [True, False, False]
+
+
 def test_drives_differ_in_lane_and_heading_only():
     database, queries = plan_drives(0, 100, CAMERA.image_size)
     lane = np.array([q.x - d.x for q, d in zip(queries, database, strict=True)])

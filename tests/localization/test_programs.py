@@ -295,6 +295,7 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, build_
     assert values_of("place", first)[8:] == [*names[:8], None]  # the second time, where it was the first
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
         assert all(alternative["row"] < 2 + number - 3 for alternative in line["alternatives"])
+    assert values_of("route", first[:2]) == [None, None]  # while the map has three images at most
     assert maps.open_map(tmp_path / "map").names[2:] == names
     again, _ = localize(twice, *settings)
     assert without_seconds(again) == without_seconds(first)
@@ -331,6 +332,14 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
     monkeypatch.setattr(query_images, "POLL", 0)
     name, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
     assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
+
+
+def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
+    image, writes = tmp_path / "a.png", [b"image", b"im"]
+    image.write_bytes(b"i")
+    monkeypatch.setattr(query_images.time, "sleep", lambda _: writes and image.write_bytes(writes.pop()))
+    _, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
+    assert path.read_bytes() == b"image"
 
 
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -110,6 +111,18 @@ def test_a_store_is_read_while_another_process_writes_it(tmp_path, request):
     holder.wait()
     with before:
         assert before.done.tolist() == [True, False, False]
+
+
+def test_rows_that_are_written_during_the_wait_for_the_lock_are_done(tmp_path):
+    with ExitStack() as stack:
+        holder = stack.enter_context(open_store(tmp_path / "s", RECIPE, num_images=3))
+
+        def finish(_):
+            holder.write({1: features_of(1)})
+            stack.close()
+
+        with open_store(tmp_path / "s", RECIPE, num_images=3, waiting=finish) as store:
+            assert store.done.tolist() == [False, True, False]
 
 
 def test_a_complete_store_is_not_written(tmp_path):

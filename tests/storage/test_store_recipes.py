@@ -6,11 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mfvpr import InputError, Runtime, Shortlist
+from mfvpr import InputError, Pipeline, Runtime, Shortlist
+from mfvpr.datasets import Positives
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import FeatureSet
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
 from mfvpr.storage.matches import open_match_store
 from tests.programs import composed, matches_path
+from tests.storage.extractors import SIFT, Mean
 from tests.storage.synthetic_features import assert_same_match_sets, digests, features_of, interrupt_after
 
 # Matches of another shortlist
@@ -89,3 +94,12 @@ def test_matches_of_other_settings_are_kept_apart(small_street, tmp_path):
         shutil.copytree(small_street / "database", street / side)
     paths = {matches_path(settings_of(street, f"cache={tmp_path}/s", change))[0] for change in changes}
     assert len(paths) == len(changes)
+
+
+def test_matches_without_an_image_for_another_query_are_kept_apart(dataset):
+    pipeline, recipes = Pipeline(SIFT, Retrieval(Mean()), candidates=3), []
+    for query in (0, 1):
+        excluded = Positives.from_rows([[3] if row == query else [] for row in range(10)], 10)
+        sequence = replace(dataset.sequences[0], excluded=excluded)
+        recipes.append(matches_recipe(dataset, sequence, pipeline, FeatureCache()))
+    assert recipes[0] != recipes[1]

@@ -37,7 +37,7 @@ class Weather:
     exposure: Exposure
 
 
-# New weathers go to the end: the position in the table seeds the clouds (see `sky.sky_texture`).
+# New weathers go to the end: the position in the table seeds the clouds (see `scene.sky_texture`).
 WEATHERS = {
     "day": Weather(
         ambient=(1.0, 1.0, 1.0), lamp=(0, 0, 0), sun=1.0, glow=0.0, snow=0.0,

@@ -18,7 +18,7 @@ from tests.tuning.learning.paths import QUERIES, TOLERANCES, path
 
 
 def part(name, seed, width=QUERIES):
-    """A data set of its own; the best so many candidates of every query."""
+    """A data set with the best `width` candidates of every query; the last query has one less."""
     protocol, matches, candidates = path(seed=seed)
     protocol = replace(protocol, halves=(), split=None)
     keep = [int(ends[width - 1]) for ends in np.cumsum(matches.counts, axis=1)]
@@ -29,7 +29,9 @@ def part(name, seed, width=QUERIES):
         for flat_matches, end in zip(matches.matches, keep, strict=True)
     ]  # fmt: skip
     matches = replace(matches, matches=flat, counts=matches.counts[:, :width])
-    return Part(name, protocol, matches, jax.tree.map(lambda values: values[:, :width], candidates))
+    candidates = jax.tree.map(lambda values: values[:, :width], candidates)
+    candidates.indices[-1, -1], candidates.mask[-1, -1] = -1, False
+    return Part(name, protocol, matches, candidates)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +51,9 @@ def test_every_query_keeps_its_own(parts, joined):
         width = data_set.candidates.indices.shape[1]
         for query in (0, 7, QUERIES - 1):
             row = number * QUERIES + query
-            np.testing.assert_array_equal(
-                joined.candidates.indices[row, :width], data_set.candidates.indices[query] + number * QUERIES
-            )
+            indices = data_set.candidates.indices[query]
+            expected = np.where(indices >= 0, indices + number * QUERIES, -1)
+            np.testing.assert_array_equal(joined.candidates.indices[row, :width], expected)
             assert np.all(joined.candidates.indices[row, width:] == -1)
             assert not joined.candidates.mask[row, width:].any()
             np.testing.assert_array_equal(joined.candidates.scores[row, :width], data_set.candidates.scores[query])

@@ -88,8 +88,13 @@ def test_it_finds_what_tells_right_matches_from_wrong_ones():
     assert teachable.values(result.parameters) == {}
 
 
-def test_the_teacher_goes_with_the_size_of_the_images():
-    taught_model = of_matches(split(), HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
+def test_the_teacher_goes_with_the_size_of_the_images_that_learning_sees():
+    taught_split = split()
+    matches = [*taught_split.match_set.matches]
+    for query in taught_split.half.report:
+        matches[query] = replace(matches[query], image_size0=np.float32([900, 900]))
+    taught_split = replace(taught_split, match_set=replace(taught_split.match_set, matches=matches))
+    taught_model = of_matches(taught_split, HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
     assert taught_model.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
     assert taught_model.teacher.bin_size == pytest.approx(taught_model.teacher.sigma / 2)
     assert taught_model.teacher.max_bins >= 2 * max(SIZES) / taught_model.teacher.bin_size

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.matching import MatchSet
+from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.reranking import ranking
 from mfvpr.scoring.parameters import with_parameters
@@ -221,6 +221,7 @@ OTHER_DATA = {
         matches, replace(listed, indices=np.where(listed.mask, listed.indices[:, ::-1], -1))
     ),
     "retrieval": lambda matches, listed: (matches, replace(listed, scores=listed.scores[:, ::-1])),
+    "fusion of scales": lambda matches, listed: (Scales([matches], weights=[0.01]), listed),
 }  # fmt: skip
 
 
