@@ -45,7 +45,6 @@ def test_a_layout_is_told(program):
     stdout, _ = program("list", "gardens_point", "msls_val")
     assert "GroundTruth.csv" in stdout
     assert "train_val/cph/database/images" in stdout
-    program("list", "x", code=2)
 
 
 def test_what_is_there_stands_beside_what_is_published(program, tmp_path):

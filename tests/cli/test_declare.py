@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
-from mfvpr.cli import build, command_line, declare, groups, help_text, overrides, settings
+from mfvpr.cli import axes, build, command_line, declare, groups, help_text, overrides, settings
 from mfvpr.cli.settings import CONF
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
 from mfvpr.scoring.fields import (
@@ -25,6 +25,7 @@ from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
 from mfvpr.tuning.learning.parameters import can_learn, starts
 from mfvpr.types import Array, Matches
+from tests.programs import composed
 
 pytestmark = pytest.mark.thorough
 
@@ -159,3 +160,5 @@ def test_where_learning_starts_follows_from_the_fields():
     assert starts(AnchorPoints(temperature=0.5), 2.0) == {"tolerance": 3.0, "temperature": 0.5}
     assert starts(AnchorPoints(), 2.0) == {"tolerance": 3.0, "temperature": 0.03}
     assert starts(AggregatedScore(), 2.0) == {"temperature": 1.0}
+    searched = axes.learning_axes(composed("scorer=anchor", config="learn"))
+    assert {*searched.without("c").values} == {"window", "tolerance", "weight"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import axes, build, evaluation, settings
-from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, small
+from tests.programs import composed, csv_rows, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
 SYSTEM = "histogram + anchor + retrieval"
@@ -38,11 +38,6 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert parameters[f"{SYSTEM} + frames"] == parameters[SYSTEM] | {"previous": 1, "reach": 15.0, "gain": 0.4}
     decided = out / "predictions" / "histogram_anchor_retrieval.csv"
     assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
-    scores = [score for _, _, score in ranked(out, "histogram_anchor_retrieval")]
-    for query in range(QUERIES):  # standardized: their mean is 0
-        of_query = scores[query * CANDIDATES : (query + 1) * CANDIDATES]
-        assert sum(of_query) == pytest.approx(0, abs=1e-3)
-        assert max(of_query) > 0.5
     assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
 
 

@@ -169,12 +169,6 @@ def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained
         assert {*searched["halves"]["first_half"]["values"]} == names - ({"c"} if not fused else set())
 
 
-def test_anchors_are_searched_over_what_they_have(learn, untrained, tmp_path):
-    rows = rows_of(learn(tmp_path / "out", "scorer=anchor", "scorer.num_bins=5", "split=first_half", "steps=1"))
-    assert {*rows["grid search"]["halves"]["first_half"]["values"]} == {"window", "tolerance", "weight"}
-    assert {*rows["gradient"]["halves"]["first_half"]["values"]} == {"tolerance", "temperature"}
-
-
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
     saved, save = [], checkpoints.save
 

@@ -91,7 +91,7 @@ def test_failures_are_the_wrong_first_answers(evaluated, system):
 
 def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
     gains, hits = csv_rows(evaluated / "gains.csv"), {}
-    assert len(gains) == QUERIES
+    assert [line["place"] for line in gains] == [*map(str, range(QUERIES))]
     for system in SYSTEMS:
         lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
         for line in gains:
@@ -124,8 +124,15 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
 
 
-def test_heading_and_tables_say_the_same(evaluated, capsys):
+def test_results_heading_and_tables_say_what_made_them(evaluated, capsys):
     entries = json.loads((evaluated / "results.json").read_text())
+    for row in entries:
+        assert {*row["recall_at"]} == {"1", "5"}
+        assert (row["queries"], row["database"], row["candidates"]) == (QUERIES, QUERIES, CANDIDATES)
+        assert {"data", "features", "retrieval", "matching", "scores"} <= {*row["seconds"]}
+        assert {"mfvpr", "jax", "numpy"} <= {*row["versions"]}
+        assert {*map(len, row["data_fingerprint"].values())} == {16}
+    assert next(row for row in entries if row["system"] == "histogram")["parameters"]["sigma"] == 22.5
     truth = entries[0]["ground_truth"]
     assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
     heading, _, *table = (evaluated / "table.md").read_text().splitlines()

@@ -148,7 +148,6 @@ def test_other_scores_and_their_axes(sweep, swept, tmp_path):
 
 
 @pytest.mark.parametrize(("experiment", "changes", "count"), [
-    ("histogram", ("grid.sigma=[10,15]", "grid.bin_size=[15]"), 3),
     ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
     ("combined", ("grid.c=[0,1,auto]",), 3),
 ])  # fmt: skip

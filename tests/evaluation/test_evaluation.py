@@ -1,6 +1,5 @@
 """A whole evaluation in one call: sequences, what is kept, and files of other programs in place of our own stages."""
 
-import csv
 import itertools
 import shutil
 from dataclasses import replace
@@ -13,7 +12,7 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.datasets import Positives, sequences_dataset
-from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence, stages
+from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
@@ -21,8 +20,7 @@ from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.confidences import CalibratedPredictions
 from mfvpr.report.differences import differences, write_gains
 from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings
-from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking import Fusion
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache, feature_cache
@@ -63,27 +61,6 @@ def test_systems_and_their_recall(dataset, result):
     expected = [[mfvpr.recall_at_k(ranked.rows, dataset.truth.positives(t), [k])[0] for k in (1, 5)] for t in (0, 1)]
     np.testing.assert_allclose(recall.by_sequence, [expected])
     np.testing.assert_array_equal(recall.mean, recall.pooled)
-
-
-def test_frame_correlation_is_a_ranking_more(result):
-    [matched] = result.matched
-    correlated = {"histogram": FrameCorrelation(1), "histogram + retrieval": FrameCorrelation()}
-    scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
-    systems = rank_by_systems(matched.candidates, scores, {"histogram": Fusion(c=10.0)}, correlated, "retrieval")
-    assert [*systems] == [*result.systems, "histogram + frames", "histogram + retrieval + frames"]
-    for name, how in correlated.items():
-        alone, got = systems[name], systems[f"{name} + frames"]
-        expected = how(alone.shortlist, alone.scores)
-        order = np.argsort(-expected, axis=1, kind="stable")
-        np.testing.assert_array_equal(got.scores, np.take_along_axis(expected, order, axis=1))
-        np.testing.assert_array_equal(got.rows, np.take_along_axis(alone.rows, order, axis=1))
-        assert (got.scores != alone.scores).any()
-
-
-def test_gains_say_where_on_the_path_each_query_is(result, tmp_path):
-    write_gains(tmp_path, EvaluationReport(result, [0, 1], [1], "count"))
-    with (tmp_path / "gains.csv").open() as file:
-        assert [line["place"] for line in csv.DictReader(file)] == [*map(str, range(10))]
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):

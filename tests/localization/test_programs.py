@@ -244,25 +244,20 @@ def test_figures_of_images_that_were_not_localized(folder, small_street, tmp_pat
     assert len([*(tmp_path / "out").iterdir()]) == 1
 
 
-def test_one_wrong_image_does_not_lead_off_the_route(folder, small_street, tmp_path, localize):
-    drive = shutil.copytree(small_street / "database", tmp_path / "drive")
-    shutil.copy(drive / "0000.png", drive / "0006.png")
-    lines, _ = localize(drive, "route=1")
-    assert values_of("place", lines) == [*NAMES[:6], NAMES[0], *NAMES[7:]]
-    assert [line["route"]["place"] for line in lines] == NAMES
-    assert all(0 < line["route"]["p"] <= 1 for line in lines)
-    plain, _ = localize(drive)
-    assert values_of("place", plain) == values_of("place", lines)
-    assert all("route" not in line and "added" not in line for line in plain)
-
-
-def test_a_route_goes_on_where_an_image_says_nothing(folder, small_street, tmp_path, localize):
+def test_a_route_goes_on_where_an_image_is_wrong_or_says_nothing(folder, small_street, tmp_path, localize):
     drive = shutil.copytree(small_street / "database", tmp_path / "drive")
     (drive / "0004.png").write_text("no image")
-    write_gray(drive / "0006.png")
+    shutil.copy(drive / "0000.png", drive / "0006.png")
+    write_gray(drive / "0008.png")
     lines, _ = localize(drive, "route=1", code=2)
+    places = [line.get("place") for line in lines]
+    assert places == [*NAMES[:4], None, NAMES[5], NAMES[0], NAMES[7], None, NAMES[9]]
     assert "error" in lines[4]
     assert [line["route"]["place"] for line in lines] == NAMES
+    assert all(0 < line["route"]["p"] <= 1 for line in lines)
+    plain, _ = localize(drive, code=2)
+    assert [line.get("place") for line in plain] == places
+    assert all("route" not in line and "added" not in line for line in plain)
 
 
 @pytest.fixture

@@ -102,6 +102,12 @@ def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches
     systems = rank_by(sequence_matches, fused, correlated)
     assert [*systems] == ["retrieval", *SCORERS, "histogram + count + retrieval", "count + retrieval",
                           "histogram + count + retrieval + frames"]  # fmt: skip
+    before, after = systems["histogram + count + retrieval"], systems["histogram + count + retrieval + frames"]
+    expected = FrameCorrelation(1)(before.shortlist, before.scores)
+    order = np.argsort(-expected, axis=1, kind="stable")
+    np.testing.assert_array_equal(after.scores, np.take_along_axis(expected, order, axis=1))
+    np.testing.assert_array_equal(after.rows, np.take_along_axis(before.rows, order, axis=1))
+    assert (after.scores != before.scores).any()
     alone = rank_by(sequence_matches, {"count": Fusion()}, {})
     for name in ("retrieval", *SCORERS):
         np.testing.assert_array_equal(systems[name].scores, alone[name].scores)
