@@ -13,8 +13,9 @@ from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import BIN_STEP, score_candidates
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer
+from mfvpr.scoring.scorer import Scorer, require_real
 from mfvpr.types import Features, Matches
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, device_bytes, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
 
@@ -46,7 +47,7 @@ def match_and_score(
     def match_part(start: int) -> tuple[Matches, dict[str, np.ndarray]]:
         real = np.int32(np.clip(len(slots) - start, 0, size))
         matches = match_pairs(padded_query, database, pairs[start : start + size], real, matcher)
-        return jax.device_get((matches, {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}))
+        return jax.device_get((matches, {name: _scores(scorer, matches) for name, scorer in scorers.items()}))
 
     workers = min(available_cpus(), len(pairs) // size)
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
