@@ -56,6 +56,15 @@ def match_and_score(
     return matches, {name: values[: len(slots)] for name, values in scores.items()}
 
 
+def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
+    """Scores of pairs, float32; an InputError if the scorer does not return a real number for each."""
+    scores, name = score_candidates(scorer, matches), type(scorer).__name__
+    if scores.shape != matches.mask.shape[:1]:
+        raise InputError(f"{name}: expected a number for each pair, got an array {list(scores.shape[1:])}")
+    require_real(name, scores)
+    return scores.astype(np.float32)
+
+
 def shift_of(scorers: Iterable[Scorer], pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
     """`shift`, `shift_interval` and `scale` of a `Prediction`, from the matches `[1, K, ...]` of a pair.
 
