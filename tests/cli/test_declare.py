@@ -1,6 +1,5 @@
 """A scorer is declared once: settings, rules, help and axes follow from its class."""
 
-import json
 import shutil
 
 import hydra
@@ -26,7 +25,6 @@ from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
 from mfvpr.tuning.learning.parameters import can_learn, starts
 from mfvpr.types import Array, Matches
-from tests.programs import results, small
 
 pytestmark = pytest.mark.thorough
 
@@ -146,19 +144,6 @@ def test_all_scores_contain_it(near):
     assert [*scorers] == [name for name in SCORERS if name not in ALONE]
     assert scorers["near"] == Nearness(size=(1.0, 2.0), norm="largest")
     assert scorers["near"].weight is NAMED_WEIGHTS["unit"]
-
-
-@pytest.mark.slow
-def test_its_parameters_are_swept(near, root, tmp_path, succeed):
-    axes = ("scorer=near", "grid.radius=[0.001,20]", "grid.weight=[unit,dmf]", "grid.norm=[sum,largest]")
-    succeed("sweep", *small(root), f"out={tmp_path}/out", *axes)
-    content = results(tmp_path / "out")
-    assert content["own"] == {"radius": 30.0, "norm": "sum", "weight": "unit"}
-    recall = {radius: set() for radius in (0.001, 20)}
-    for entry in content["settings"][:8]:
-        recall[entry["parameters"]["radius"]].add(json.dumps(entry["recall_at"]))
-    assert len(recall[0.001]) == 1  # nothing is that near: retrieval's order
-    assert len(recall[20]) > 1
 
 
 def test_plain_values_become_the_fields(near):

@@ -1,7 +1,6 @@
 """Shards as programs: each fills the store, and a run without shards writes the results of one machine."""
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -11,7 +10,6 @@ from functools import partial
 
 import pytest
 
-from mfvpr.storage.disk import lock_store
 from tests.programs import ROOT, run, small
 
 pytestmark = pytest.mark.slow
@@ -68,16 +66,6 @@ def test_a_plain_run_computes_the_parts_of_missing_shards(evaluate, plain, tmp_p
     assert evaluate("shard=1/3")[0] == 0
     assert evaluate(f"out={tmp_path}/out")[0] == 0
     assert tables(tmp_path / "out") == tables(plain)
-
-
-def test_the_same_shard_twice_at_the_same_time_is_refused(evaluate, tmp_path):
-    assert evaluate("shard=1/2")[0] == 0
-    folder = next(tmp_path.glob("store/Sift-*")) / "shards" / "0-of-2"
-    folder.mkdir()
-    with lock_store(folder, "features"):
-        code, _, error = evaluate("shard=0/2")
-    assert code == 2
-    assert f"{folder}: in use by process {os.getpid()}" in error
 
 
 def test_killed_shards_go_on(settings, plain, tmp_path):
