@@ -1,5 +1,6 @@
 """The programs, and a small data set for them: called, as command lines of this process, or in one of their own."""
 
+import atexit
 import csv
 import json
 import logging
@@ -16,7 +17,7 @@ import hydra
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, stages
-from mfvpr.cli.launch import launch
+from mfvpr.cli.launch import exit_at_once, launch
 from mfvpr.cli.settings import CONF
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.manifest import MATCHES, store_path
@@ -93,6 +94,7 @@ def typed(monkeypatch, capsys, program, *arguments):
         code = left.code
     finally:
         signal.signal(signal.SIGTERM, handler)
+        atexit.unregister(exit_at_once)  # else the tests end with the exit code of this command line
     return code, *capsys.readouterr()
 
 

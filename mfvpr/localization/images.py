@@ -159,6 +159,9 @@ class MapImages:
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
         for name, place in zip(images.names, places, strict=True):
             check_entry(name, place)
+        self.refresh()
+        if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
+            return 0
         with lock_map(self.folder), self._learning(images, track) as features, self._adding() as (described, add):
             missing = [row for row, name in enumerate(images.names) if name not in self._row_of_name]
             if features is None:

@@ -13,8 +13,9 @@ from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import BIN_STEP, score_candidates
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer
+from mfvpr.scoring.scorer import Scorer, require_real
 from mfvpr.types import Features, Matches
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, device_bytes, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
 
@@ -46,13 +47,22 @@ def match_and_score(
     def match_part(start: int) -> tuple[Matches, dict[str, np.ndarray]]:
         real = np.int32(np.clip(len(slots) - start, 0, size))
         matches = match_pairs(padded_query, database, pairs[start : start + size], real, matcher)
-        return jax.device_get((matches, {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}))
+        return jax.device_get((matches, {name: _scores(scorer, matches) for name, scorer in scorers.items()}))
 
     workers = min(available_cpus(), len(pairs) // size)
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
     parts = list(map_parts(match_part, range(0, len(pairs), size)))
     matches, scores = jax.tree.map(lambda *fields: np.concatenate(fields)[:number], *parts)
     return matches, {name: values[: len(slots)] for name, values in scores.items()}
+
+
+def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
+    """Scores of pairs, float32; an InputError if the scorer does not return a real number for each."""
+    scores, name = score_candidates(scorer, matches), type(scorer).__name__
+    if scores.shape != matches.mask.shape[:1]:
+        raise InputError(f"{name}: expected a number for each pair, got an array {list(scores.shape[1:])}")
+    require_real(name, scores)
+    return scores.astype(np.float32)
 
 
 def shift_of(scorers: Iterable[Scorer], pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:

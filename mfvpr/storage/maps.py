@@ -234,10 +234,11 @@ class MapRows:
         for row in rows:
             segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
         for number, segment_rows in segments.items():
-            if gone := [row for row in segment_rows if not self._segments[number].done[row]]:
+            segment = self._segments[number]
+            if gone := [row for row in segment_rows if not (segment.done & segment.features.done)[row]]:
                 raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
                                  "Open the map again, without rows that were deleted.")  # fmt: skip
-            for row, features in self._segments[number].features.read(segment_rows):
+            for row, features in segment.features.read(segment_rows):
                 yield number * SEGMENT + row, features
 
     @contextmanager

@@ -52,11 +52,11 @@ def tiny_checkpoint(tmp_path):
 def test_help_and_wrong_usage_do_not_wait_for_jax():
     code = """
 import sys
-from experiments.weights import main
+from mfvpr.cli.programs import run
 try:
-    main()
+    run("weights")
 except SystemExit:
-    print(sorted({"jax", "flax", "numpy", "torch", "hydra", "mfvpr"} & set(sys.modules)))
+    print(sorted({"jax", "flax", "numpy", "torch", "hydra"} & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.stderr == ""
@@ -257,11 +257,11 @@ def test_download_that_fails_leaves_nothing(program, folder, site, monkeypatch, 
 def test_ctrl_c_while_downloading_leaves_nothing(folder, site):
     code = f"""
 import dataclasses
-from experiments.weights import main
+from mfvpr.cli.programs import run
 from mfvpr.checkpoints.registry import REGISTRY
 entry = REGISTRY["aliked-t16"]
 REGISTRY["aliked-t16"] = dataclasses.replace(entry, source={site("slow")!r}, size={len(CONTENT)})
-main()
+run("weights")
 """
     process = subprocess.Popen([sys.executable, "-c", code, "download", "aliked-t16"], cwd=ROOT, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip

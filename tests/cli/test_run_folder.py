@@ -270,6 +270,18 @@ def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
     assert list(tmp_path.rglob("*")) == [tmp_path / "a"]
 
 
+def test_a_folder_with_results_is_complete(tmp_path):
+    def write():
+        with runs.writing(tmp_path) as new:
+            (new / "results.json").write_text("written")
+            (new / "table.csv").write_text("written")
+
+    (tmp_path / "table.csv").mkdir()  # so the file of this name cannot appear
+    with pytest.raises(IsADirectoryError):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+
+
 def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
     together = threading.Barrier(8, timeout=30)

@@ -313,7 +313,7 @@ def test_edited_tables_are_errors_or_nothing_but_text(error_with, run):
 
 
 def test_the_library_and_its_evaluation_wait_for_no_optional_package():
-    code = ("import sys, mfvpr; from experiments import evaluation; "
+    code = ("import sys; from mfvpr import Map, match; from mfvpr.cli import evaluation; "
             "assert not {'plotly', 'jinja2', 'playwright', 'optax', 'orbax'} & {*sys.modules}")  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")

@@ -49,7 +49,7 @@ def test_damaged_files_raise(tmp_path, change):
     path = tmp_path / "weight.json"
     write_weight(path, create(), PROVENANCE)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(InputError, match=r"weight\.json: .*experiments.learn"):
+    with pytest.raises(InputError, match=r"weight\.json: .*mfvpr learn"):
         read_weight(path)
 
 
@@ -57,5 +57,5 @@ def test_missing_files_and_other_json_raise(tmp_path):
     (tmp_path / "text.json").write_text("[]")
     (tmp_path / "deep.json").write_text("[" * 100_000)
     for name, reason in (("none.json", "got nothing"), ("text.json", ""), ("deep.json", "Recursion")):
-        with pytest.raises(InputError, match=f"{name}: .*experiments.learn.*{reason}"):
+        with pytest.raises(InputError, match=f"{name}: .*mfvpr learn.*{reason}"):
             read_weight(tmp_path / name)
