@@ -9,6 +9,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from experiments.benchmark.harness import duration, write_report
+from experiments.paper.systems import REAL
 from mfvpr.checkpoints import load_model
 from mfvpr.cli import build
 from mfvpr.cli.console import tell, track
@@ -25,7 +26,6 @@ from mfvpr.scoring import Scorer
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError, Runtime
 
-FOLDERS = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}
 SIZE = (336, 336)
 TOLERANCES = (1, 2, 5)  # frames
 
@@ -33,11 +33,11 @@ TOLERANCES = (1, 2, 5)  # frames
 def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Score SIFT's and ALIKED n16's matches with all images of both data sets below `data`."""
     if data is None:
-        raise InputError(f"--data: expected a folder that has {' and '.join(FOLDERS)}, got none")
+        raise InputError(f"--data: expected a folder that has {' and '.join(REAL)}, got none")
     folder = build.expand_user(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
     cache, scorers = FeatureCache(folder / "features", runtime=Runtime(progress=track, log=tell)), compared_scorers()
     parts, tables = [], []
-    for name, folders in FOLDERS.items():
+    for name, folders in REAL.items():
         dataset = folder_dataset(*(data / name / folder for folder in folders), name=name, ground_truth="order")
         for features, extractor in extractors().items():
             retrieval = Retrieval(Aggregated(extractor, VladFitting()))

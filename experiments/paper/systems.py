@@ -16,10 +16,7 @@ from mfvpr.datasets.published import PUBLISHED
 from mfvpr.reranking.results import RETRIEVAL
 
 DRAWN = "streets_seasons"
-REAL = {  # data sets of plain folders, and their folders
-    "grief_season": ("database", "queries"),
-    "corridor": ("ref", "query"),
-}
+REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
 _SIDES = ("database", "queries")
 _POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
 COMBINED = f"histogram + {RETRIEVAL}"

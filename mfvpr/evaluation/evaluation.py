@@ -8,7 +8,6 @@
 Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -56,7 +55,10 @@ def evaluate(
     calls = [partial(_score, dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
     of_cohort = [] if system.cohort is None else [partial(_score_cohort, dataset, system, system.cohort, cache, watch)]
     scored: list[Scored] = together(*of_cohort, *calls)
-    strengths = _hubness(len(dataset.database), *scored.pop(0)) if of_cohort else {}
+    strengths, size = dict[str, np.ndarray](), len(dataset.database)
+    if of_cohort:
+        cohort, values = scored.pop(0)
+        strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
     ways = system.fused, system.correlated, system.ties
     ranked = [rank_by_systems(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
     matched = [sequence for sequence, _ in scored]
@@ -80,8 +82,3 @@ def _score_cohort(dataset: Dataset, system: System, cohort: int, cache: FeatureC
     cache = replace(cache, runtime=replace(cache.runtime, progress=lambda label: progress(f"cohort {label}")))
     with watch(COHORT):
         return _score(dataset, sequence, system, cache, Stopwatch())
-
-
-def _hubness(size: int, matched: Matched, scores: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Hubness `[N]` of the N = `size` database images by name of the scorer, from those of the cohort."""
-    return {name: hubness(matched.candidates, values, size, name=name) for name, values in scores.items()}

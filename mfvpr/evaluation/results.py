@@ -6,7 +6,7 @@ from functools import reduce
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
@@ -26,11 +26,6 @@ class Recall:
     @property
     def by_sequence(self) -> Float[np.ndarray, "sequences tolerances ks"]:
         return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
-
-    @property
-    def queries(self) -> Int[np.ndarray, " sequences"]:
-        """Number of queries of each sequence."""
-        return np.array([of_sequence[0].queries for of_sequence in self.tallies])
 
     @property
     def mean(self) -> Float[np.ndarray, "tolerances ks"]:

@@ -13,8 +13,6 @@ from mfvpr.utils.progress import Track, no_progress
 class Runtime:
     """Devices, memory, progress and messages of a call.
 
-        mfvpr.evaluate(dataset, system, runtime=Runtime(memory=4.0, log=print))
-
     Attributes:
         devices: that share the work; None = the default device of JAX.
         memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from PIL import Image
 
 from mfvpr.cli import stages
 from mfvpr.cli.evaluation import evaluate
-from mfvpr.datasets import read_image
 from tests.programs import composed, csv_rows, folder
 
 pytestmark = pytest.mark.thorough
@@ -102,40 +100,23 @@ def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street,
     assert recall(exact) == recall(widened, tolerance=0)
 
 
-@pytest.mark.slow
-def test_turned_and_16_bit_copies_give_the_same_and_it_is_said(small_street, tmp_path, run):
+def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
+    for side in ("database", "queries"):
+        (tmp_path / side).mkdir()
     exif = Image.Exif()
     exif[0x0112] = 6
-    turned, plain, deep = folders = [tmp_path / name for name in ("turned", "plain", "deep")]
-    for place in folders:
-        place.mkdir()
-    for path in sorted((small_street / "database").iterdir()):
-        Image.fromarray(np.rot90(read_image(path))).save(turned / path.name, exif=exif)
-    for path in sorted((small_street / "queries").iterdir()):
-        gray = np.asarray(Image.open(path).convert("L"))
-        Image.fromarray(gray).save(plain / path.name)
-        Image.fromarray(gray.astype(np.uint16) * 257).save(deep / path.name)
-
-    store = f"cache={tmp_path}/store"
-    common = ("dataset=folder", "dataset.ground_truth=order", store)
-    usual = run(*common, f"dataset.database={small_street}/database", f"dataset.queries={plain}", name="usual")
-    other = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", name="other")
-    assert [row["recall_at"] for row in usual[0]] == [row["recall_at"] for row in other[0]]
-    assert (usual[2] / "predictions.csv").read_text() == (other[2] / "predictions.csv").read_text()
-    assert usual[0][0]["reading"]["query"]["scaled_16bit"] == usual[0][0]["reading"]["database"]["turned"] == 0
-    assert other[0][0]["reading"] == {
-        "database": {"orient": True, "turned": 10, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
-        "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 10, "largest_16bit": ANY},
+    Image.new("RGB", (120, 160)).save(tmp_path / "database" / "0.png", exif=exif)
+    Image.fromarray(np.full((120, 160), 65535, np.uint16)).save(tmp_path / "queries" / "0.png")
+    data = folder(tmp_path)[:3]
+    _, images = stages.prepare(composed(*QUICK, *data, "dataset.ground_truth=order"), stages.Stopwatch())
+    assert images.reading == {
+        "database": {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
+        "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 1, "largest_16bit": 65535},
     }  # fmt: skip
-    assert "note: 10 database images are turned" in other[1].err
-    assert "note: 10 16-bit query images are scaled to 8 bits" in other[1].err
-    assert "warning: the largest value" not in other[1].err
-
-    # The same store: what was read otherwise is not taken for it.
-    off = run(*common, f"dataset.database={turned}", f"dataset.queries={deep}", "dataset.orient=false",
-              "dataset.bits=12", name="off")  # fmt: skip
-    assert "so that they come out cut off; dataset.bits=16 would use their range" in off[1].err
-    assert (off[2] / "predictions.csv").read_text() != (other[2] / "predictions.csv").read_text()
+    stderr = capsys.readouterr().err
+    assert "note: 1 database images are turned" in stderr
+    assert "note: 1 16-bit query images are scaled to 8 bits" in stderr
+    assert "warning: the largest value" not in stderr
 
 
 @pytest.mark.parametrize(("largest", "words"), [

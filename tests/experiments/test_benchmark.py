@@ -138,7 +138,7 @@ def test_help_needs_no_jax():
 def test_all_scores_are_measured_on_the_same_matches(small_street, tmp_path, monkeypatch, capsys):
     from experiments.benchmark import real
 
-    for name, (database, queries) in real.FOLDERS.items():
+    for name, (database, queries) in real.REAL.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / database).symlink_to(small_street / "database")
         (tmp_path / name / queries).symlink_to(small_street / "queries")
