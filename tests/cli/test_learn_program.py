@@ -170,7 +170,7 @@ def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained
 
 
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
-    saved, save = [], checkpoints.save
+    saved, save = [], checkpoints.save_checkpoint
 
     def interrupted(folder, step, *rest):
         saved.append((folder.name, step))
@@ -178,7 +178,7 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
             raise KeyboardInterrupt
         save(folder, step, *rest)
 
-    monkeypatch.setattr(checkpoints, "save", interrupted)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", interrupted)
     again = (*SHORT, f"checkpoints={tmp_path}/kept")
     with pytest.raises(KeyboardInterrupt):
         learn(tmp_path / "out", *again)

@@ -89,7 +89,7 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
     sizes, weights = (2, 3, 5), (0.45, 0.15, 0.4)
     extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=sizes, scale_weights=weights)
     lines = []
-    cache = partial(FeatureCache, tmp_path, tell=lines.append)
+    cache = partial(FeatureCache, tmp_path, runtime=mfvpr.Runtime(log=lines.append))
     options = {"candidates": 6, "cache": cache()}
     report = evaluate_parts(dataset, extractor, Retrieval(extractor), SCORERS, **options)
     assert sum("images to do" in line for line in lines) == 2  # one pass a side: descriptors and patches

@@ -120,7 +120,7 @@ def test_several_sequences_and_scales_and_more_shards_than_images(small_street, 
         small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
     )
     extractor = TwoScales()
-    run = run_of(several, extractor, Retrieval(extractor), candidates=3, memory=1e-4)
+    run = run_of(several, extractor, Retrieval(extractor), candidates=3, runtime=mfvpr.Runtime(memory=1e-4))
     expected = run(FeatureCache(tmp_path / "s"))
     for count in (3, 17):
         assert_same(shared(tmp_path / f"s{count}", count, run)[0], expected)
