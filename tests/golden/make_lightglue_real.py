@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.benchmark.real import FOLDERS, SIZE
+from experiments.benchmark.real import SIZE
+from experiments.paper.systems import REAL
 from mfvpr.checkpoints import load_model
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.datasets import read_image, resize
@@ -21,7 +22,7 @@ from tests.golden.make_lightglue import as_tensors, public
 
 KEYPOINTS = 160
 QUERIES = (20, 70)  # of each place, with their own database images
-PAIRS = [f"{place}/{query}" for place in FOLDERS for query in QUERIES]
+PAIRS = [f"{place}/{query}" for place in REAL for query in QUERIES]
 
 
 def features(golden: dict[str, np.ndarray], pair: str) -> list[Features]:
@@ -40,7 +41,7 @@ def main(clone: str, weights: str, data: str) -> dict[str, np.ndarray]:
     network, golden = public(clone, read_checkpoint(Path(weights))), {}
     for pair in PAIRS:
         place, query = pair.split("/")
-        for side, folder in zip("01", reversed(FOLDERS[place]), strict=True):
+        for side, folder in zip("01", reversed(REAL[place]), strict=True):
             paths = sorted((Path(data) / place / folder).iterdir(), key=lambda path: (len(path.name), path.name))
             [described] = extractor(resize(read_image(paths[int(query)]), SIZE)[None])
             real = np.asarray(described.features.mask)
