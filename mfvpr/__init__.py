@@ -5,7 +5,7 @@ rankings become recall. `evaluate` runs all stages on a data set; `Map` localize
 are the single stages as functions of arrays. The packages add images, files and caches. `value`, `Scorer` and the names
 after them are for a scorer of your own; `mfvpr.testing.check_scorer` tests its contract.
 
-The names by stage: `__init__.pyi`. Each is imported when it is first used, so that `import mfvpr` takes no time.
+`__init__.pyi` lists the names by stage. Each name is imported when it is first used.
 """
 
 import lazy_loader

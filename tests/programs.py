@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 
 import hydra
+import pytest
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, stages
@@ -67,6 +68,19 @@ def small(root, *more):
     )  # fmt: skip
 
 
+def job_of(root, config, job, figures):
+    """A function that runs a job in this process, without figures unless asked; what results.json holds comes back."""
+
+    def call(out, *overrides, pictures=False):
+        with pytest.MonkeyPatch.context() as patch:
+            if not pictures:
+                patch.setattr(*figures, lambda *_: [])
+            job(composed(*small(root), f"out={out}", *overrides, config=config))
+        return results(out)
+
+    return call
+
+
 def matches_path(settings):
     """The folder in which a program keeps the matches of its data set, and their recipe."""
     tools, images = stages.prepare(settings, stages.Stopwatch())
@@ -84,7 +98,7 @@ def typed(monkeypatch, capsys, program, *arguments):
     handler, code = signal.getsignal(signal.SIGTERM), 0
     capsys.readouterr()
     try:
-        if program in programs.PROGRAMS:
+        if program in programs.COMMANDS:
             programs.run(program)
         elif program == "paper":
             launch("paper")

@@ -84,12 +84,8 @@ def _compare(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def _check(settings: Mapping[str, Any]) -> None:
-    if settings["features"]["name"] == "import":
-        raise SettingsError("features=import: a map takes features of images itself; choose others")
     if "method" not in settings["scorer"]:
         raise SettingsError("scorer: expected one score, as scorer=histogram, got several")
-    if settings["candidates"] == "all":
-        raise SettingsError("candidates=all: a map matches so many, whatever it holds; set a number")
     retrieval = settings["retrieval"]["name"]
     if retrieval in ("ssm", "pairs", "import") or settings["retrieval"].get("whiten"):
         raise SettingsError(f"retrieval={retrieval}: expected vlad, same or a network, without whiten")

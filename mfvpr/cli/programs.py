@@ -5,8 +5,7 @@ from pathlib import Path
 
 from mfvpr.cli.launch import Parser, launch, refuse, run_command, version
 
-# Command -> what it does.
-PROGRAMS = {
+COMMANDS = {
     "demo": "evaluate the paper's scores on a drawn street",
     "evaluate": "two folders of images in, recall, rankings and figures out",
     "sweep": "score a data set by a grid of parameters",
@@ -24,13 +23,13 @@ def main() -> None:
     """Run the command `mfvpr PROGRAM ...`."""
     program = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if program in ("-h", "--help"):
-        width = max(map(len, PROGRAMS))
-        lines = [f"  {name:<{width}}  {about}" for name, about in PROGRAMS.items()]
+        width = max(map(len, COMMANDS))
+        lines = [f"  {name:<{width}}  {about}" for name, about in COMMANDS.items()]
         print("usage: mfvpr PROGRAM [setting=value ...]", "", *lines, "", "mfvpr PROGRAM --help says more.", sep="\n")
     elif program == "--version":
         print(version())
-    elif program not in PROGRAMS:
-        refuse(f"{program}: expected one of {', '.join(PROGRAMS)}; see mfvpr --help")
+    elif program not in COMMANDS:
+        refuse(f"{program}: expected one of {', '.join(COMMANDS)}; see mfvpr --help")
     else:
         del sys.argv[1]
         run(program)
@@ -39,7 +38,7 @@ def main() -> None:
 def run(program: str) -> None:
     """Run a program with the arguments of the command line."""
     if program == "demo":
-        sys.argv[1:1] = ["scorer=demo"]
+        program, sys.argv[1:1] = "evaluate", ["scorer=demo"]
     if program == "map" and sys.argv[1:2] == ["build"]:
         del sys.argv[1]
         launch("map")
@@ -47,7 +46,7 @@ def run(program: str) -> None:
         description, add_arguments = _ARGUMENTS[program]
         run_command(f"mfvpr {program}", description, add_arguments)
     else:
-        launch({"demo": "config", "evaluate": "config"}.get(program, program))
+        launch("config" if program == "evaluate" else program)
 
 
 def _add_map_commands(parser: Parser) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import OmegaConf
 
 from mfvpr.cli import build
@@ -35,7 +36,7 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
             says what was expected.
     """
     try:
-        values = _read_run(Path(name)) if str(name).endswith(".json") else _compose(str(name), settings)
+        values = _read_run(Path(name), settings) if str(name).endswith(".json") else _compose(str(name), settings)
         check(values)
         return build.system(values, build.pipeline(values, None))
     except SettingsError as error:
@@ -47,7 +48,7 @@ def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     overrides = {"system": name}
     for setting, value in nodes(settings):
         if not isinstance(value, Mapping):
-            overrides[setting] = value if isinstance(value, str) else json.dumps(value)
+            overrides[setting] = value if isinstance(value, str) else json.dumps(value, default=np.generic.item)
     for setting, value in overrides.items():
         check_choice(setting, value, _PROGRAM)
     arguments = [quote(f"{setting}={value}") for setting, value in overrides.items()]
@@ -56,8 +57,14 @@ def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return OmegaConf.to_container(config, resolve=True)  # pyright: ignore[reportReturnType]
 
 
-def _read_run(path: Path) -> dict[str, Any]:
+def _read_run(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run of `mfvpr evaluate`."""
+    if settings:
+        raise SettingsError(f"{path}: expected no other settings, got {', '.join(settings)}; load a system by name")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))["settings"]
+        values = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        if not {"scorer", "cohort", "previous_queries"} <= {*values}:
+            raise ValueError("another file")
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise SettingsError(f"{path}: expected the run.json of a run of mfvpr evaluate, got {error}") from error
+    return values

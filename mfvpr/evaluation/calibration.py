@@ -102,9 +102,9 @@ class Confidence:
 
 def fit_confidence(
     values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *,
-    inputs: Sequence[Input] = INPUTS, apart: int = APART, ridge: float = 1.0,
+    inputs: Sequence[Input] = INPUTS, apart: int = APART,
 ) -> Confidence:  # fmt: skip
-    """Fit a logistic model with weights of at least 0 by maximum likelihood.
+    """Fit a logistic model with weights of at least 0 by penalized maximum likelihood.
 
     If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
@@ -115,7 +115,6 @@ def fit_confidence(
         correct: whether the top prediction is correct; False for queries without a place in the database.
         inputs: names of the values.
         apart: with which the values were computed.
-        ridge: penalty on weights: half of it times the sum of their squares is added to the negative log likelihood.
 
     Raises:
         InputError: no predictions.
@@ -127,7 +126,7 @@ def fit_confidence(
     center, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     columns = np.column_stack([np.ones(len(values)), (values - center) / scale])
-    penalty = np.array([0.0, *[ridge] * values.shape[1]])
+    penalty = np.array([0.0, *[1.0] * values.shape[1]])
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         odds, bias = columns @ weights, weights[0]

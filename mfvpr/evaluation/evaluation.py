@@ -33,11 +33,11 @@ Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q,
 def evaluate(
     dataset: Dataset, system: System, *, cache: FeatureCache | None = None, runtime: Runtime | None = None
 ) -> Result:
-    """Rank every query's candidates by the retrieval, by every scorer, and by what combines scores.
+    """Rank every query's candidates by the retrieval, by every scorer, and by combined scores.
 
     Args:
         dataset: one database, one or more query sequences.
-        system: what finds, matches, scores and ranks candidates.
+        system: finds, matches, scores and ranks candidates.
         cache: where features and matches are kept; None = in memory.
         runtime: devices, memory, progress and messages; None = those of the cache.
 

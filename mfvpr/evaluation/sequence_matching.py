@@ -51,8 +51,7 @@ def match_sequence(
         dataset: of the sequence.
         sequence: Q queries.
         pipeline: how candidates are found and matched.
-        cache: see `evaluate`.
-        runtime: see `evaluate`.
+        cache, runtime: see `evaluate`.
         watch: gets the seconds of the stages.
 
     Raises:

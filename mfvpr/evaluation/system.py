@@ -59,8 +59,8 @@ class Pipeline:
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
         if isinstance(self.matcher, type) or not callable(self.matcher):
             got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
-            raise InputError(f"matcher: expected what maps the features of two images to Matches, got {got}; see "
-                             "mfvpr.Matcher")  # fmt: skip
+            raise InputError(f"matcher: expected a function of the features of two images that returns Matches, got "
+                             f"{got}; see mfvpr.Matcher")  # fmt: skip
         if isinstance(self.matcher, NearestNeighborMatcher):
             require_word("cross_check", self.matcher.cross_check, CrossCheck)
         if isinstance(self.matcher, LightGlueMatcher):
@@ -69,7 +69,7 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class System:
-    """Matches -> scores -> rankings: by the retrieval, by each scorer, and by what combines scores.
+    """Matches -> scores -> rankings: by the retrieval, by each scorer, and by combined scores.
 
     Attributes:
         pipeline: finds and matches candidates.

@@ -136,11 +136,8 @@ class Map(MapImages):
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
         rankings = rank_by_systems(shortlist, padded_scores, self.system.fused, {}, self.system.ties)
-        decides, retrieval = (
-            Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
-            for ranking in (rankings[self.system.headline], rankings[RETRIEVAL])
-        )
-        return decides, retrieval
+        cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
+        return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 
     def _probability(self, ranking: Ranked, retrieval: Ranked) -> float | None:
         """Probability that the top prediction is correct; None without a confidence or a finite score."""

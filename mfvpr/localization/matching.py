@@ -13,9 +13,8 @@ from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import BIN_STEP, score_candidates
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, require_real
+from mfvpr.scoring.scorer import Scorer, require_scores
 from mfvpr.types import Features, Matches
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, device_bytes, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
 
@@ -58,10 +57,8 @@ def match_and_score(
 
 def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
     """Scores of pairs, float32; an InputError if the scorer does not return a real number for each."""
-    scores, name = score_candidates(scorer, matches), type(scorer).__name__
-    if scores.shape != matches.mask.shape[:1]:
-        raise InputError(f"{name}: expected a number for each pair, got an array {list(scores.shape[1:])}")
-    require_real(name, scores)
+    scores = score_candidates(scorer, matches)
+    require_scores(type(scorer).__name__, scores, len(matches.mask))
     return scores.astype(np.float32)
 
 

@@ -14,9 +14,8 @@ from mfvpr.matching.match_set import MatchSet, Scales, batches, partition, queri
 from mfvpr.reranking.grids import score_settings
 from mfvpr.reranking.ranking import BIN_STEP, Scores, fuse_scales
 from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
+from mfvpr.scoring.scorer import Scorer, check_host, on_host, require_scores, score_pairs
 from mfvpr.types import Array, Matches, Shortlist
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context, with_static_functions
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 from mfvpr.utils.threads import ordered_map
@@ -126,6 +125,5 @@ def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]
 def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     scores = {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
     for name, values in scores.items():
-        if values.shape != matches.mask.shape[:1]:
-            raise InputError(f"{name}: expected a number for each pair, got an array {list(values.shape[1:])}")
+        require_scores(name, values, len(matches.mask))
     return scores

@@ -45,12 +45,16 @@ def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
     Raises:
         InputError: the method does not return a real number for each pair.
     """
-    scores, name = np.asarray(scorer.score_pairs(matches)), f"{type(scorer).__name__}.score_pairs"
-    if scores.shape != (len(matches.mask),):
-        raise InputError(f"{name}: expected a number for each of {len(matches.mask)} pairs, got an array "
-                         f"{list(scores.shape)}")  # fmt: skip
-    require_real(name, scores)
+    scores = np.asarray(scorer.score_pairs(matches))
+    require_scores(f"{type(scorer).__name__}.score_pairs", scores, len(matches.mask))
     return scores.astype(np.float32)
+
+
+def require_scores(name: str, scores: Array, pairs: int) -> None:
+    """Raise an InputError unless the scores are a real number for each pair."""
+    if scores.shape != (pairs,):
+        raise InputError(f"{name}: expected a number for each of {pairs} pairs, got an array {list(scores.shape)}")
+    require_real(name, scores)
 
 
 def require_real(name: str, scores: Array) -> None:

@@ -67,7 +67,7 @@ class FeatureCache:
         wait: wait for another process that writes the same store, instead of raising.
         shard: extracts its own images alone, and reads the rest from the stores of other shards; see
             `mfvpr.storage.shards`. It needs a root.
-        runtime: progress and messages; `mfvpr.evaluate` sets its own.
+        runtime: progress and messages; `mfvpr.evaluate(runtime=)` replaces it.
         watch: counts the extraction of local features as the stage `features`.
     """
 

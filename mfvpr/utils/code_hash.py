@@ -7,6 +7,7 @@ that methods call do not count. Class attributes count, private ones if they are
 
 import functools
 import inspect
+import threading
 from collections.abc import Callable, Iterable
 from types import CellType, CodeType, FunctionType
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+_PARSING = threading.Lock()  # of source: Python 3.11 raises a SystemError if several threads do
 _PLAIN = (bool, int, float, complex, str, bytes)
 _CONSTANTS = (*_PLAIN, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
 
@@ -26,7 +28,8 @@ def behavior_of(kind: type, recipe_of: Callable[[Any], Any]) -> list[Any]:
 
 def _text(kind: type) -> str:
     try:
-        return inspect.getsource(kind)
+        with _PARSING:
+            return inspect.getsource(kind)
     except (OSError, TypeError):  # typed into a terminal, or created by `type`
         return ""
 

@@ -13,7 +13,7 @@ from mfvpr.scoring.weight_files import read_weight
 from mfvpr.tuning.learning import checkpoints, teaching
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record
-from tests.programs import QUERIES, composed, results, small, snapshot
+from tests.programs import QUERIES, composed, job_of, results, small, snapshot
 
 pytestmark = pytest.mark.slow
 
@@ -26,16 +26,8 @@ WIDEST = 1  # frames
 
 @pytest.fixture(scope="session")
 def learn(root):
-    """Learns into a folder, in this process; what results.json holds comes back."""
-
-    def call(out, *overrides, pictures=False):
-        with pytest.MonkeyPatch.context() as patch:
-            if not pictures:
-                patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
-            learning.learn(composed(*small(root), f"out={out}", *overrides, config="learn"))
-        return results(out)
-
-    return call
+    """Learns into a folder."""
+    return job_of(root, "learn", learning.learn, (learning.comparisons, "comparison_figures"))
 
 
 @pytest.fixture(scope="session")

@@ -124,7 +124,7 @@ def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["ground_truth"]["kind"] == "none"
 
 
-def test_results_heading_and_tables_say_what_made_them(evaluated, capsys):
+def test_results_heading_and_tables_say_what_made_them(evaluated):
     entries = json.loads((evaluated / "results.json").read_text())
     for row in entries:
         assert {*row["recall_at"]} == {"1", "5"}

@@ -13,7 +13,7 @@ from PIL import Image
 
 from mfvpr.cli import axes, evaluation, launch, sweeping
 from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, matches_path, results, small, snapshot
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, matches_path, small, snapshot
 
 pytestmark = pytest.mark.thorough
 
@@ -22,16 +22,8 @@ SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
 
 @pytest.fixture(scope="session")
 def sweep(root):
-    """Sweeps into a folder, in this process; what results.json holds comes back."""
-
-    def call(out, *overrides, pictures=False):
-        with pytest.MonkeyPatch.context() as patch:
-            if not pictures:
-                patch.setattr(sweeping.sweeps, "heat_maps", lambda *_: [])
-            sweeping.sweep(composed(*small(root), f"out={out}", *overrides, config="sweep"))
-        return results(out)
-
-    return call
+    """Sweeps into a folder."""
+    return job_of(root, "sweep", sweeping.sweep, (sweeping.sweeps, "heat_maps"))
 
 
 GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")

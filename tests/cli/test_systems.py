@@ -14,11 +14,8 @@ from mfvpr.storage import FeatureCache
 from mfvpr.utils.fingerprints import recipe_of
 from tests.programs import CANDIDATES, composed, csv_rows, small
 
-SMALL = {
-    "features": {"max_keypoints": 60, "image_size": [160, 120]},
-    "retrieval": {"num_words": 8},
-    "candidates": CANDIDATES,
-}
+FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
+SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CANDIDATES}
 
 
 @pytest.mark.parametrize("name", choices("system"))
@@ -35,10 +32,10 @@ def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monk
     ("mix", {}, "^system=mix: expected one of mfvpr, mix_hist_10"),
     ("steering", {"sigma": 3}, "^sigma: unknown setting; the nearest is scorer[.]sigma"),
     ("steering", {"scorer": {"sgma": 3}}, "^scorer.sgma: unknown setting; the nearest is scorer[.]sigma"),
-    ("steering", {"candidates": -1}, "^candidates=-1: expected a whole number from 1"),
     ("steering", {"features": "xfeat"}, "^features=xfeat: expected one of aliked"),
     ("steering", {"features": "import"}, "^features: files of other programs belong to a data set"),
     ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),
+    ("no/run.json", {"candidates": 3}, "^no/run.json: expected no other settings, got candidates"),
 ])  # fmt: skip
 def test_what_cannot_be_loaded_is_one_line(name, settings, words):
     with pytest.raises(InputError, match=words) as error:
@@ -65,7 +62,7 @@ def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path)
 def test_the_command_runs_programs_and_refuses_others(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["mfvpr"])
     programs.main()
-    assert {*programs.PROGRAMS} <= {*capsys.readouterr().out.split()}
+    assert {*programs.COMMANDS} <= {*capsys.readouterr().out.split()}
     monkeypatch.setattr(sys, "argv", ["mfvpr", "evaluat"])
     with pytest.raises(SystemExit) as left:
         programs.main()

@@ -33,6 +33,7 @@ from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
 from tests.programs import ROOT
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -338,6 +339,12 @@ def test_of_a_score_that_is_not_finite_nothing_is_sure(dataset, folder):
     prediction = known.localize(dataset.queries.paths[0])
     assert (prediction.place, prediction.confidence, prediction.as_json()["score"]) == (None, None, None)
     assert prediction.is_refused
+
+
+def test_scores_are_floats_whatever_the_scorer_returns(dataset, folder):
+    with unchecked_shapes():
+        prediction = opened(folder, scorer=lambda matches: matches.mask.sum()).localize(dataset.queries.paths[0])
+    assert type(prediction.score) is float
 
 
 def test_two_do_not_add_at_the_same_time(dataset, tmp_path):

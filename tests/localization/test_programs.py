@@ -170,7 +170,6 @@ def test_mistakes_are_one_line(folder, call_program, arguments, words):
 
 @pytest.mark.parametrize(("more", "words"), [
     (["features.max_keypoints=50"], "was made with other features"),
-    (["candidates=all"], "candidates=all: "),
     (["retrieval.whiten=4"], "expected vlad, same or a network"),
     (["scorer=paper"], "scorer=histogram, got several"),
     (["map=STREET"], "expected a new or empty folder, or a map"),

@@ -288,6 +288,10 @@ def test_a_map_of_format_1_is_read_but_not_added_to(images, tmp_path):
     files = sorted(folder.rglob("*"))
     known = opened(tmp_path / "map", extractor)
     assert [known.localize(path).place for path in images.paths[:4]] == [0, 1, 2, 3]
+    assert known.build(first(images, 4)) == 0
     with pytest.raises(InputError, match=r"'mfvpr map 2', got 'mfvpr map 1'"):
         known.build(images)
     assert sorted(folder.rglob("*")) == files
+    next(folder.glob("features/2-*.npz")).unlink()
+    with pytest.raises(InputError, match="expected features of row 2, got none"):
+        opened(tmp_path / "map", extractor).localize(images.paths[0])
