@@ -111,7 +111,7 @@ def evaluate_all(
             cache = build.cache(chosen)
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
-            images = {side: cache.contents(folder).fingerprint for side, folder in folders.items()}
+            images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}
             correct = truth.positives_fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             fail(f"{place.name}: {error}")

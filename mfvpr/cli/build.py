@@ -27,7 +27,7 @@ from mfvpr.scoring import SCORERS, Scorer
 from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
-from mfvpr.storage import FeatureCache, Shard
+from mfvpr.storage import FeatureCache
 from mfvpr.utils import Runtime, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -179,9 +179,8 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
 def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["cache"] is None else expand_user(settings["cache"])
-    shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
-    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", wait=settings.get("multirun", False),
-                        shard=shard, runtime=runtime(settings))  # fmt: skip
+    skip_bad, wait = settings["on_bad_image"] == "skip", settings.get("multirun", False)
+    return FeatureCache(root, skip_bad=skip_bad, wait=wait, runtime=runtime(settings))
 
 
 def runtime(settings: dict[str, Any]) -> Runtime:

@@ -11,7 +11,7 @@ from mfvpr.cli.stages import Images, Tools
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import Unit
-from mfvpr.evaluation import evaluation
+from mfvpr.evaluation import Shard, evaluation, fill_shard
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.features import Source
 from mfvpr.report import runs
@@ -22,8 +22,7 @@ from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
-from mfvpr.storage import NotYet
-from mfvpr.storage.feature_writers import open_sinks
+from mfvpr.storage.extraction import open_sinks
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.versions import versions
 
@@ -45,9 +44,9 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Run all stages, print the table, fill the run folder; a shard fills the store only."""
+    """Run all stages, print the table, fill the run folder; a shard fills the cache only."""
     if settings["shard"] is not None:
-        _fill_store(settings)
+        _fill_shard(settings)
         return
     with run_folder.claim(settings) as folder:
         outcome = evaluation_of(settings)
@@ -59,15 +58,11 @@ def evaluate(settings: dict[str, Any]) -> None:
             print(f"report: {page}")
 
 
-def _fill_store(settings: dict[str, Any]) -> None:
-    """Do the part of a shard, and print what is done or missing."""
-    try:
-        evaluation_of(settings)
-    except NotYet as end:
-        advice = "when all shards are done, run without shard= for the results"
-        if not end.is_complete:
-            advice = "start it again when they are there"
-        print(f"shard {settings['shard']}: {end}; {advice}")
+def _fill_shard(settings: dict[str, Any]) -> None:
+    """Do the part of a shard, and print what is done, and what to do next."""
+    shard = Shard.parse(settings["shard"])
+    tools, images = stages.prepare(settings, Stopwatch())
+    print(fill_shard(images.dataset, build.system(settings, tools.pipeline), tools.cache, shard))
 
 
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
@@ -198,7 +193,7 @@ def _bytes_per_image(outcome: Outcome) -> int | None:
     extractor = outcome.tools.pipeline.extractor
     if isinstance(extractor, Source):
         return None
-    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, num_images=1))
+    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, []))
 
 
 def _recalls(report: EvaluationReport, system: str) -> list[dict[str, Any]]:

@@ -55,7 +55,7 @@ def check_data_set(name: str, settings: list[str], sheet: Path | None) -> None:
     [chosen] = compose_data_sets("check", ":".join([name, *settings]))
     dataset = dataset_of(chosen)
     cache = FeatureCache(None)
-    database, *contents = map(cache.contents, [dataset.database, *(part.images for part in dataset.sequences)])
+    database, *contents = map(cache.recipes.contents, [dataset.database, *(part.images for part in dataset.sequences)])
     sides = list(_sides(dataset))
     unreadable = [_unreadable(side, folder) for side, folder, _ in sides]
     rows = [

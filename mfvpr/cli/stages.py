@@ -72,10 +72,10 @@ def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | Non
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
     """The data set that the settings name, without neighbors of the queries; warns about its peculiarities."""
     dataset, neighbors = dataset_of(settings["dataset"]), settings["dataset"].get("exclude_neighbors")
-    sides = {"database": cache.contents(dataset.database)}
+    sides = {"database": cache.recipes.contents(dataset.database)}
     sequences, same_images = [], []
     for sequence in dataset.sequences:
-        contents = cache.contents(sequence.images)
+        contents = cache.recipes.contents(sequence.images)
         sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
         same_images.append(own_rows(contents, sides["database"]))
         if neighbors is not None:

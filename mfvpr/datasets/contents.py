@@ -50,13 +50,19 @@ class Contents:
         """SHA-256 over names, contents and applied conversions; the first 16 hexadecimal digits."""
         digest = hashlib.sha256()
         for name, file in zip(self.folder.names, self.files, strict=True):
-            content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
-            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + content)
-            if self.folder.orient and file.orientation != 1:
-                digest.update(b"\0turned")
-            if file.largest is not None:
-                digest.update(f"\0bits={self.folder.bits}".encode())
+            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + self._pixels(file))
         return digest.hexdigest()[:16]
+
+    @property
+    def keys(self) -> list[str]:
+        """SHA-256 of each image's content and applied conversions; the first 32 hexadecimal digits."""
+        return [hashlib.sha256(self._pixels(file)).hexdigest()[:32] for file in self.files]
+
+    def _pixels(self, file: Content) -> bytes:
+        """Everything that determines the pixels of an image."""
+        content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
+        turned = b"\0turned" if self.folder.orient and file.orientation != 1 else b""
+        return content + turned + (b"" if file.largest is None else f"\0bits={self.folder.bits}".encode())
 
     @cached_property
     def sha256(self) -> str:

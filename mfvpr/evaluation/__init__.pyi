@@ -5,6 +5,7 @@ __all__ = [
     "Pipeline",
     "Recall",
     "Result",
+    "Shard",
     "Split",
     "System",
     "Tally",
@@ -13,6 +14,7 @@ __all__ = [
     "estimate",
     "evaluate",
     "evaluation_protocol",
+    "fill_shard",
     "fit_confidence",
     "halves",
     "hits",
@@ -35,5 +37,6 @@ from .recall import Tally, hits, recall_at_k
 from .results import Recall, Result
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
+from .shards import Shard, fill_shard
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

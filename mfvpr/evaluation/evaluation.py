@@ -9,7 +9,6 @@ Features, shortlist and matches are kept in the folder of a cache, if it has one
 """
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -23,7 +22,6 @@ from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
 from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.shards import together
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
@@ -48,17 +46,14 @@ def evaluate(
     Raises:
         InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
             or a scorer; one line says which, and how to fix it.
-        NotYet: the cache has a shard, which has done what it can; see `mfvpr.storage.shards`.
     """
     watch, cache = Stopwatch(), cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
-    calls = [partial(_score, dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
-    of_cohort = [] if system.cohort is None else [partial(_score_cohort, dataset, system, system.cohort, cache, watch)]
-    scored: list[Scored] = together(*of_cohort, *calls)
     strengths, size = dict[str, np.ndarray](), len(dataset.database)
-    if of_cohort:
-        cohort, values = scored.pop(0)
+    if system.cohort is not None:
+        cohort, values = _score_cohort(dataset, system, system.cohort, cache, watch)
         strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
+    scored = [_score(dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
     ways = system.fused, system.correlated, system.ties
     ranked = [rank_by_systems(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
     matched = [sequence for sequence, _ in scored]
@@ -77,7 +72,7 @@ def _score(dataset: Dataset, sequence: QuerySequence, system: System, cache: Fea
 
 def _score_cohort(dataset: Dataset, system: System, cohort: int, cache: FeatureCache, watch: Stopwatch) -> Scored:
     """Match and score the database with itself, as a stage of its own."""
-    sequence = cohort_sequence(cache.contents(dataset.database), cohort)
+    sequence = cohort_sequence(cache.recipes.contents(dataset.database), cohort)
     progress = cache.runtime.progress
     cache = replace(cache, runtime=replace(cache.runtime, progress=lambda label: progress(f"cohort {label}")))
     with watch(COHORT):

@@ -61,8 +61,8 @@ def whitening_recipe(
     extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
 ) -> dict[str, Any]:
     """Recipe of a whitening: images, network and its input, windows, and samples."""
-    parts = {"windows": cache.recipe_of(extractor.windows), "whitening": cache.recipe_of(fitting)}
-    return {"format": FORMAT} | cache.recipe(database, extractor.maps) | parts
+    parts = {"windows": cache.recipes.of(extractor.windows), "whitening": cache.recipes.of(fitting)}
+    return {"format": FORMAT} | cache.recipes.of_folder(database, extractor.maps) | parts
 
 
 def _whitening(

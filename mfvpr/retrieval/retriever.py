@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -11,7 +10,6 @@ from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.features.extractor import Aggregated, Extractor
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.shards import together
 from mfvpr.types import Shortlist
 
 
@@ -59,10 +57,8 @@ class Retrieval:
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
         """See `Retriever`."""
-        database_vectors, query_vectors = together(
-            partial(cache.vectors, database, self.describer, database, label="database"),
-            partial(cache.vectors, sequence.images, self.describer, database, label=f"query {sequence.name}"),
-        )
+        database_vectors = cache.vectors(database, self.describer, database, label="database")
+        query_vectors = cache.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
         # An image without features has the descriptor 0, which is equally similar to all.
         is_zero = ~query_vectors.values.any(axis=1, keepdims=True)
         search = cache.once("search", lambda: self.search.fit(database_vectors.values), database, self)

@@ -1,8 +1,5 @@
 __all__ = [
     "FeatureCache",
-    "NotYet",
-    "Shard",
 ]
 
 from .feature_cache import FeatureCache
-from .shards import NotYet, Shard

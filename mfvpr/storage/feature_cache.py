@@ -4,44 +4,38 @@
     [features] = cache.local(folder, Sift())
     vectors = cache.vectors(folder, MixVprDescriptor(model))
 
-The content of the images and the recipe of the extractor name a store, not the data set, so that a database which
-several data sets share is extracted once.
+The content of an image and the recipe of the extractor name its features, not the folder or the data set: an image that
+several data sets or maps share is extracted once.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.datasets.contents import Contents, contents, files_of, state_of
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
-from mfvpr.features.feature_set import FeatureSet, FeatureSource, InMemory
+from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage import matches as match_stores
-from mfvpr.storage.feature_writers import ExtractionState, open_sinks, size_lines
-from mfvpr.storage.manifest import MATCHES, store_path
+from mfvpr.storage.disk import lock_store
+from mfvpr.storage.extraction import Extraction, open_sinks
+from mfvpr.storage.manifest import LOCKS, MATCHES, store_path
+from mfvpr.storage.memo import Memo, Value, states
+from mfvpr.storage.recipes import Recipes
 from mfvpr.storage.rows import require_space
-from mfvpr.storage.shards import Shard
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.versions import versions
 
-DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
-# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.images` gives other
-# pixels, set it to the next version: stored features are then extracted again.
-DECODING = "0.2.0"
 AGGREGATED = 16  # images at a time
 _MB = 1e6
-
-Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -64,9 +58,7 @@ class FeatureCache:
     Attributes:
         root: folder of all stores; None = in memory.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
-        wait: wait for another process that writes the same store, instead of raising.
-        shard: extracts its own images alone, and reads the rest from the stores of other shards; see
-            `mfvpr.storage.shards`. It needs a root.
+        wait: wait for another process that does the same work, instead of raising.
         runtime: progress and messages; `mfvpr.evaluate(runtime=)` replaces it.
         watch: counts the extraction of local features as the stage `features`.
     """
@@ -74,39 +66,22 @@ class FeatureCache:
     root: Path | None = None
     skip_bad: bool = False
     wait: bool = False
-    shard: Shard | None = None
     runtime: Runtime = DEFAULT_RUNTIME
     watch: Stopwatch | None = None
-    _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _memo: Memo = field(default_factory=Memo, repr=False)
     _warned: set[str] = field(default_factory=set, repr=False)
 
     def __post_init__(self) -> None:
         self.root = None if self.root is None else Path(self.root)
-        if self.shard is not None and self.root is None:
-            raise InputError(f"shard={self.shard}: expected a root as well, the folder of the stores of all shards")
 
-    def contents(self, folder: ImageFolder) -> Contents:
-        """Hashes of the files of a folder; with a root, later runs read them from there."""
-        records = None if self.root is None else self.root / "contents"
-        return self.once("contents", lambda: contents(folder, records), folder, None)
+    @property
+    def recipes(self) -> Recipes:
+        """Recipes of everything in the cache."""
+        return Recipes(self.root, self._memo)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
-        """The result of `compute`, called once in this process while the images and the recipe of `by` stay the same.
-
-        Without a recipe, the `id` of `by` counts: the extractor or retrieval that computes the result called `name`.
-        """
-        try:
-            recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
-        except TypeError:
-            recipe = id(by)
-        key = name, folder, hash(tuple(str(state_of(f"{folder.root}/{image}")) for image in folder.names)), recipe
-        if key not in self._computed:
-            self._computed[key] = compute(), by  # kept alive, so that no other object gets its id
-        return self._computed[key][0]
-
-    def recipe_of(self, value: Any) -> Any:
-        """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
-        return recipe_of(value, self._content_of)
+        """See `Memo.once`."""
+        return self._memo.once(name, compute, folder, by)
 
     def log(self, line: str) -> None:
         """Log a line; see `Runtime`."""
@@ -117,15 +92,6 @@ class FeatureCache:
         if line not in self._warned:
             self._warned.add(line)
             self.log(f"warning: {line}")
-
-    def recipe(self, folder: ImageFolder, extractor: Extractor | Aggregated | Source) -> dict[str, Any]:
-        """Everything that changes the features of a folder's images: extractor, images, versions of decoders."""
-        decoders = {"mfvpr": DECODING} | {name: versions()[name] for name in DECODERS}
-        return {
-            "extractor": self.recipe_of(extractor),
-            "images": self.contents(folder).fingerprint,
-            "versions": decoders,
-        }
 
     def local(
         self,
@@ -141,16 +107,14 @@ class FeatureCache:
 
         Raises:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
-            NotYet: other shards have not extracted their images.
         """
         if isinstance(extractor, Source):
             source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
-        state = self._extract(folder, extractor, range(len(folder)) if rows is None else [*rows], f"{label} features")
-        return tuple(
-            FeatureSet(sink.store or InMemory(sink.items, len(folder)), dict(state.bad)) for sink in state.of_scales
-        )
+        state = self.describe(folder, extractor, rows, label=f"{label} features")
+        _require_images(folder, state.bad)
+        return tuple(FeatureSet(sink.source, dict(state.bad)) for sink in state.of_scales)
 
     def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
                 label: str = "image") -> Vectors:  # fmt: skip
@@ -164,41 +128,75 @@ class FeatureCache:
         compute = partial(self._vectors, folder, describer, database, label)
         return self.once("vectors", compute, folder, describer) if folder == database else compute()
 
+    def describe(
+        self, folder: ImageFolder, extractor: Extractor, rows: Iterable[int] | None = None, *, label: str = "image"
+    ) -> Extraction:
+        """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages.
+
+        Raises:
+            InputError: an image cannot be read (unless `skip_bad`), or a store cannot be used.
+        """
+        requested = range(len(folder)) if rows is None else [*rows]
+        state = self.once("extraction", lambda: self._open(folder, extractor), folder, extractor)
+        with ExitStack() as stack:
+            if self.watch is not None and extractor.scales:
+                stack.enter_context(self.watch("features"))
+            if state.missing(requested):
+                stack.enter_context(state.writing())
+            missing = state.missing(requested)
+            for line in state.announcement(missing, len(requested)):
+                self.log(f"{label}: {line}")
+            options = {"skip_bad": self.skip_bad, "track": self.runtime.progress(label)}
+            for batch in describe_folder(folder, extractor, missing, state.bad, **options):
+                state.write(batch)
+            for line in state.size_lines() if missing else ():
+                self.log(f"{label}: {line}")
+        return state
+
     @contextmanager
     def matches(
-        self, recipe: Mapping[str, Any], names: Sequence[str], num_candidates: int, *, typical: int, label: str
+        self,
+        recipe: Mapping[str, Any],
+        sizes: tuple[int, int],
+        *,
+        rows: Sequence[int] | None = None,
+        typical: int,
+        label: str,
     ) -> Iterator[match_stores.MatchStore]:
-        """The store of the matches of queries by name, locked while queries are missing; needs a root.
+        """The store of the matches of queries, locked while queries are missing; needs a root.
 
-        `typical` is the number of matches of a pair, about; `label` names the matches in messages.
+        Args:
+            recipe: of the shortlist and the matches.
+            sizes: number of queries, and of candidates of each.
+            rows: the queries that are going to be matched, while other processes match others; None = all.
+            typical: number of matches of a pair, about.
+            label: names the matches in messages.
         """
         if self.root is None:
             raise ValueError("nothing is kept on disk: this cache has no root")
-        path = store_path(self.root, "matches", recipe, MATCHES)
-        sizes = {"num_queries": len(names), "num_candidates": num_candidates}
-        rows = range(len(names)) if self.shard is None else self.shard.rows(names)
-        with match_stores.open_match_store(path, recipe, **sizes, **self.store_options) as store:
-            if missing := sum(not store.done[row] for row in rows):
+        path, (num_queries, num_candidates) = store_path(self.root, "matches", recipe, MATCHES), sizes
+        options = {"num_queries": num_queries, "num_candidates": num_candidates}
+        part = None if rows is None else fingerprint(list(rows))
+        with match_stores.open_match_store(path, recipe, **options, lock=self._lock(part)) as store:
+            if missing := sum(not store.done[row] for row in (range(num_queries) if rows is None else rows)):
                 needed = match_stores.forecast_bytes(missing, num_candidates, typical)
                 require_space(store.folder, needed)
-                self.log(f"{label}: {missing} of {len(names)} queries to match with {num_candidates} candidates: "
+                self.log(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: "
                           f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
             else:
                 amount = "all" if store.done.all() else "its part of"
-                self.log(f"{label}: {amount} {len(names)} queries from {store.folder}")
+                self.log(f"{label}: {amount} {num_queries} queries from {store.folder}")
             yield store
 
-    @property
-    def store_options(self) -> dict[str, Any]:
-        """The arguments `waiting` and `shard` of `storage.rows.RowStore`."""
-        return {"waiting": self.log if self.wait else None, "shard": self.shard}
+    def _lock(self, part: str | None) -> Callable[[Path, str], AbstractContextManager[None]]:
+        """The lock of a part of a store, or of all of it; it waits for another process, or refuses."""
 
-    def _content_of(self, path: PurePath) -> Any:
-        path = Path(path)
-        if not path.exists():
-            return str(path)
-        content = self.contents(files_of(path))
-        return content.fingerprint if path.is_dir() else content.sha256
+        def lock(folder: Path, content: str) -> AbstractContextManager[None]:
+            folder = folder if part is None else folder / LOCKS / part
+            folder.mkdir(parents=True, exist_ok=True)
+            return lock_store(folder, content, self.log if self.wait else None)
+
+        return lock
 
     def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
         opened = source.open(folder, partial=self.skip_bad)
@@ -207,65 +205,24 @@ class FeatureCache:
         self.log(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
         return opened
 
-    def _extract(self, folder: ImageFolder, extractor: Extractor, rows: Sequence[int], label: str) -> ExtractionState:
-        """Run the extractor on the rows that are missing."""
-        state = self.once("state", lambda: self._open_state(folder, extractor), folder, extractor)
-        with ExitStack() as stack:
-            if self.watch is not None and extractor.scales:
-                stack.enter_context(self.watch("features"))
-            if any(sink.missing(rows) for sink in state.sinks):
-                for sink in state.sinks:
-                    if sink.store is not None:
-                        stack.enter_context(sink.store)
-            if self.skip_bad:
-                state.read_bad()
-            missing = state.missing(rows if self.shard is None else self.shard.rows(folder.names, rows))
-            self._announce(extractor, state, missing, len(rows), len(folder), label)
-            options = {"skip_bad": self.skip_bad, "track": self.runtime.progress(label)}
-            for batch in describe_folder(folder, extractor, missing, state.bad, **options):
-                for sink in state.sinks:
-                    sink.write(batch)
-            if missing:
-                state.write_bad()
-                for line in size_lines(state.of_scales, extractor.scales):
-                    self.log(f"{label}: {line}")
-        if self.shard is not None:
-            self.shard.require_rows(state.look(rows), folder.names, label)
-        if len(state.bad) == len(folder):
-            raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: "
-                             f"{state.bad[min(state.bad)]}")  # fmt: skip
-        return state
-
-    def _open_state(self, folder: ImageFolder, extractor: Extractor) -> ExtractionState:
-        recipe = self.recipe(folder, extractor) if self.root is not None else {}
-        sinks = open_sinks(self.root, extractor, recipe, num_images=len(folder), **self.store_options)
-        return ExtractionState(sinks, sinks[bool(extractor.vector_size) :])
-
-    def _announce(
-        self, extractor: Extractor, state: ExtractionState, missing: Sequence[int], count: int, total: int, label: str
-    ) -> None:
-        """Tell how many of `count` images are missing; if none, only once."""
-        stores = [sink.store for sink in state.sinks if sink.store is not None]
-        if not stores or not count or (state.is_announced and not missing):
-            return
-        where, state.is_announced = ", ".join(str(store.folder) for store in stores), True
-        if not missing:
-            number = f"all {total}" if count == total else f"the {count} of {total}"
-            self.log(f"{label}: {number} images from {where}")
-            return
-        needed = sum(sink.forecast(len(missing)) for sink in state.sinks)
-        require_space(stores[0].folder, needed)
-        scales = [f"about {scale.typical_count} features of {scale.dimension} dimensions each"
-                  for scale in extractor.scales]  # fmt: skip
-        each = ", ".join(scales) or f"descriptors of {extractor.vector_size} numbers"
-        self.log(f"{label}: {len(missing)} of {total} images to do, {each}: about {needed / _MB:.1f} MB in {where}")
+    def _open(self, folder: ImageFolder, extractor: Extractor) -> Extraction:
+        if self.root is not None:
+            contents, recipe = self.recipes.contents(folder), self.recipes.of_features(extractor)
+            lock = self._lock(contents.fingerprint)
+            return Extraction(extractor, open_sinks(self.root, extractor, recipe, contents.keys, lock=lock))
+        sinks = open_sinks(None, extractor, {}, states(folder))
+        memory = self._memo.once("memory", lambda: [sink.items for sink in sinks], None, extractor)
+        for sink, items in zip(sinks, memory, strict=True):
+            sink.items = items
+        return Extraction(extractor, sinks)
 
     def _vectors(
         self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
     ) -> Vectors:
         if isinstance(describer, Aggregated):
             return self._aggregate(folder, describer, database, label)
-        state = self._extract(folder, describer, range(len(folder)), f"{label} descriptors")
+        state = self.describe(folder, describer, label=f"{label} descriptors")
+        _require_images(folder, state.bad)
         values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
         for row, vector in state.sinks[0].read():
             values[row] = vector
@@ -285,3 +242,8 @@ class FeatureCache:
                 values[list(images)] = aggregation(list(images.values()))
         values[list(features.bad)] = np.nan
         return Vectors(values, features.bad)
+
+
+def _require_images(folder: ImageFolder, bad: Mapping[int, str]) -> None:
+    if len(bad) == len(folder):
+        raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")

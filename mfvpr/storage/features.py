@@ -1,6 +1,6 @@
-"""Local features of the images of one folder on disk, read by every later run.
+"""Local features of images on disk, read by every later run.
 
-    with open_store(store_path(root, "sift", recipe), recipe, num_images=len(folder)) as store:
+    with open_store(store_path(root, "sift", recipe), recipe, num_images=len(keys), keys=keys) as store:
         store.write({row: features})  # batch by batch, the rows that are not done
         for row, features in store.read():
             ...
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mfvpr.storage.manifest import FEATURES, Kind
-from mfvpr.storage.rows import RowStore, row_bytes
+from mfvpr.storage.rows import RowFormat, RowStore, row_bytes
 from mfvpr.types import Features
 
 FeatureStore = RowStore[Features]
@@ -28,11 +28,11 @@ _NUM_ARRAYS = 5
 def open_store(
     folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
 ) -> FeatureStore:
-    """The store in `folder`, see `rows.RowStore`; `options` are its `waiting`, `shard` and `tokens`.
+    """The store in `folder`, see `rows.RowStore`; `options` are its `keys`, `tokens` and `lock`.
 
     A store that is part of a map has another `kind`, with other messages.
     """
-    return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=pack_features, unpack=_unpack, **options)
+    return RowStore(folder, RowFormat(kind, pack_features, _unpack), recipe, {"num_images": num_images}, **options)
 
 
 def forecast_bytes(num_images: int, features_per_image: float, dimension: int) -> int:

@@ -6,7 +6,9 @@ It is written before anything else, and compared, part by part, whenever the sto
 import json
 import os
 import re
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,11 @@ from mfvpr.utils.files import replacing
 from mfvpr.utils.fingerprints import difference, fingerprint, short_json
 
 MANIFEST = "manifest.json"
+LOCKS = "locks"  # folder of the locks of a store that several processes write
 _OLD_MANIFEST = "zarr.json"  # of format 1
 # Temporary files of a process that was killed while it wrote.
-_LEFTOVER = re.compile(r"\.(manifest|images|bad|shortlist|vocabulary|\d+-\d+)-\w+\.(json|npz)")
+_LEFTOVER = re.compile(r"\.(manifest|images|vocabulary|[0-9a-f]+-\d+)-\w+\.(json|npz)")
+_ABANDONED = 3600  # seconds, after which a temporary file belongs to no running process: files are written within one
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,9 @@ def check_folder(folder: Path, kind: Kind) -> None:
                 f"{folder}: expected {kind.format!r}, got the format of an earlier version; choose another path, or "
                 "delete this folder"
             )
-        foreign = sorted(path.name for path in folder.iterdir() if path.name != "lock" and not _is_leftover(path))
+        foreign = sorted(
+            path.name for path in folder.iterdir() if path.name not in ("lock", LOCKS) and not _is_leftover(path)
+        )
         if foreign and not (folder / MANIFEST).exists():  # it may have appeared since
             raise InputError(
                 f"{folder}: expected a folder of {kind.content}, got one without {MANIFEST} that holds "
@@ -103,9 +109,11 @@ def has_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> bool:
 
 
 def remove_store_leftovers(folder: Path) -> None:
-    """Remove temporary files of a killed process. The caller has the lock of the store."""
-    for leftover in filter(_is_leftover, folder.iterdir()):
-        leftover.unlink()
+    """Remove temporary files of killed processes; others may be writing."""
+    for leftover in filter(_is_leftover, folder.iterdir() if folder.is_dir() else ()):
+        with suppress(FileNotFoundError):
+            if leftover.stat().st_mtime < time.time() - _ABANDONED:
+                leftover.unlink()
 
 
 def write_manifest(folder: Path, kind: Kind, manifest: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.storage.manifest import Kind
-from mfvpr.storage.rows import RowStore
+from mfvpr.storage.rows import RowFormat, RowStore
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
 
@@ -37,7 +37,7 @@ EntryStore = RowStore[Entry]
 
 def open_entry_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind, **how: Any) -> EntryStore:
     """The store in `folder`; see `features.open_store`."""
-    return RowStore(folder, kind, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **how)
+    return RowStore(folder, RowFormat(kind, _pack, _unpack), recipe, {"num_images": num_images}, **how)
 
 
 def check_entry(name: Any, place: Any) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from mfvpr.matching.match_set import QueryMatches
 from mfvpr.storage.manifest import MATCHES
-from mfvpr.storage.rows import RowStore, row_bytes
+from mfvpr.storage.rows import RowFormat, RowStore, row_bytes
 from mfvpr.types import Matches
 
 _OF_QUERY = ("counts", "indices", "filter_scores")
@@ -34,8 +34,9 @@ def open_match_store(
     folder: Path, recipe: Mapping[str, Any], *, num_queries: int, num_candidates: int, **options: Any
 ) -> MatchStore:
     """The store in `folder` of the matches of Q queries with C candidates each; see `features.open_store`."""
-    sizes, pack = {"num_queries": num_queries, "num_candidates": num_candidates}, partial(_pack, num_candidates)
-    return RowStore(folder, MATCHES, recipe, sizes, pack=pack, unpack=_unpack, **options)
+    sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
+    form = RowFormat(MATCHES, partial(_pack, num_candidates), _unpack)
+    return RowStore(folder, form, recipe, sizes, **options)
 
 
 class StoredMatches(Sequence[Matches]):

@@ -3,34 +3,51 @@
 A store is a folder with a manifest, which holds the recipe of the rows, and one file for each row that is done:
 `<row>-<entries>.npz` (`mfvpr.utils.arrays`). A file appears when all of it is on disk, so a process may be killed at
 any moment, and the next one goes on. A file knows its store and its row: exchanged files are noticed like damaged ones.
-Shards write stores of their own in the folder `shards` of a store; readers see one store.
+
+A store by key is shared by many lists of rows: the key of a row (of an image: a hash of its content) stands in its
+file's name instead of the number, below a folder with the key's first two characters.
 """
 
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.storage.disk import disk_errors_as_input_errors, free_disk_bytes, full_disk_error, lock_store, used_bytes
+from mfvpr.storage.disk import disk_errors_as_input_errors, free_disk_bytes, full_disk_error, lock_store
 from mfvpr.storage.manifest import Kind, check_folder, has_manifest, manifest_of, remove_store_leftovers, write_manifest
-from mfvpr.storage.shards import Shard
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import difference
 from mfvpr.utils.threads import ordered_map
 
-SHARDS = "shards"  # the folder of a store in which each shard has its own
 THREADS = 4  # that read ahead, or write the rows of a batch
 BLOCK = 4096  # bytes that a file system hands out at a time
 ARRAY_OVERHEAD = 400  # bytes at most that an array takes in its file beside its values
-_ROW = re.compile(r"(0|[1-9]\d{0,8})-(0|[1-9]\d{0,8})\.npz")  # the name of the file of a row
+_FILE = re.compile(r"(0|[1-9]\d{0,8}|[0-9a-f]{32})-(0|[1-9]\d{0,8})\.npz")  # the name of the file of a row
 
 Item = TypeVar("Item")
 Parts = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class RowFormat(Generic[Item]):
+    """What a row holds.
+
+    Attributes:
+        kind: of the store.
+        pack: item -> arrays by name; the first has a value for each of the row's entries.
+        unpack: arrays by name -> item.
+    """
+
+    kind: Kind
+    pack: Callable[[Item], Parts]
+    unpack: Callable[[Parts], Item]
 
 
 class RowStore(Generic[Item]):
@@ -43,7 +60,6 @@ class RowStore(Generic[Item]):
         folder: absolute path.
         kind: of its content.
         sizes: lengths of axes by name, first M, the number of rows.
-        shard: that writes, into a folder of its own; None = one process writes the whole store.
         is_writable: whether rows may be written.
         counts: `[M]` int32 entries of each row, -1 = not done, when the store was last opened, entered or looked at.
     """
@@ -51,38 +67,38 @@ class RowStore(Generic[Item]):
     def __init__(
         self,
         folder: Path,
-        kind: Kind,
+        form: RowFormat[Item],
         recipe: Mapping[str, Any],
         sizes: Mapping[str, int],
         *,
-        pack: Callable[[Item], Parts],
-        unpack: Callable[[Parts], Item],
-        waiting: Callable[[str], None] | None = None,
-        shard: Shard | None = None,
+        keys: Sequence[str] | None = None,
         tokens: np.ndarray | None = None,
+        lock: Callable[[Path, str], AbstractContextManager[None]] = lock_store,
     ) -> None:
         """Open the store, and find the rows that are done.
 
         Args:
             folder: see `manifest.store_path`.
+            form: of the rows.
             recipe: of the rows (JSON values only). Kept in plain text.
-            pack: item -> arrays by name; the first has a value for each of the row's entries.
-            unpack: arrays by name -> item.
-            waiting: called with one line that names the process that a writer waits for; None = refuse a store in use.
+            sizes: see above; a store by key has no other.
+            keys: `[M]` of the rows, 32 hexadecimal digits each; rows with the same key are one. None = rows by number.
             tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written
                 with another number is a damaged one. None = names alone tell rows apart.
+            lock: of the folder while rows are written, with the content for messages.
 
         Raises:
             InputError: made from something else, or no store at all.
         """
         self.folder = folder.absolute()  # the working directory may change
-        self.kind, self.sizes, self.shard, self.is_writable = kind, sizes, shard, False
-        self._manifest, self._waiting, self._tokens = manifest_of(kind, recipe, sizes), waiting, tokens
-        self._pack, self._unpack = pack, unpack
+        self.kind, self.sizes, self.is_writable = form.kind, sizes, False
+        self._manifest = manifest_of(form.kind, recipe, sizes if keys is None else {})
+        self._form, self._tokens, self._lock = form, tokens, lock
+        self._keys = keys
         self._layout: dict[str, str] | None = None
         self._blocks: list[ExitStack] = []  # that are entered
-        with disk_errors_as_input_errors(self.folder, kind.content):
-            check_folder(self.folder, kind)
+        with disk_errors_as_input_errors(self.folder, self.kind.content):
+            check_folder(self.folder, self.kind)
         self.look()
 
     def __enter__(self) -> Self:
@@ -91,12 +107,11 @@ class RowStore(Generic[Item]):
             if not self._blocks:
                 self.look()
             if not self.is_writable and not self.done.all():
-                if self.shard is not None:
-                    write_manifest(self.folder, self.kind, self._manifest)
-                self.write_folder.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(lock_store(self.write_folder, self.kind.content, self._waiting))
-                remove_store_leftovers(self.write_folder)
-                write_manifest(self.write_folder, self.kind, self._manifest)
+                self.folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(self._lock(self.folder, self.kind.content))
+                for folder in {self.folder, *self._folders}:
+                    remove_store_leftovers(folder)
+                write_manifest(self.folder, self.kind, self._manifest)
                 self.look()
                 stack.callback(setattr, self, "is_writable", False)
                 self.is_writable = True
@@ -106,23 +121,23 @@ class RowStore(Generic[Item]):
     def __exit__(self, *_: object) -> None:
         self._blocks.pop().close()
 
-    @property
-    def write_folder(self) -> Path:
-        """The folder in which rows are written."""
-        return self.folder if self.shard is None else self.folder / SHARDS / self.shard.folder
-
     def look(self) -> None:
         """Find the rows that are done by now; raises `InputError` if they were made from something else."""
+        entries: dict[str, int] = {}
         with disk_errors_as_input_errors(self.folder, self.kind.content):
             exists = has_manifest(self.folder, self.kind, self._manifest)
-            shards = [path for path in (self.folder / SHARDS).glob("*-of-*") if path.is_dir()]
-            self._folders = [self.folder, *sorted({self.write_folder, *shards} - {self.folder})]
-            self.counts = np.full(next(iter(self.sizes.values())), -1, np.int32)
-            self._folder_of = np.zeros(len(self.counts), np.int16)  # index of each row's folder
-            for number, folder in enumerate(self._folders if exists else ()):
-                for path in folder.iterdir() if folder.is_dir() else ():
-                    if (name := _ROW.fullmatch(path.name)) and int(name[1]) < len(self.counts):
-                        self.counts[int(name[1])], self._folder_of[int(name[1])] = int(name[2]), number
+            for folder in filter(Path.is_dir, self._folders if exists else ()):
+                found = filter(None, map(_FILE.fullmatch, os.listdir(folder)))
+                entries |= {match[1]: int(match[2]) for match in found}
+        names = map(str, range(next(iter(self.sizes.values())))) if self._keys is None else self._keys
+        self.counts = np.fromiter((entries.get(name, -1) for name in names), np.int32)
+
+    @property
+    def _folders(self) -> list[Path]:
+        """Folders with files of rows."""
+        if self._keys is None:
+            return [self.folder]
+        return [self.folder / start for start in sorted({key[:2] for key in self._keys})]
 
     @property
     def done(self) -> Bool[np.ndarray, " rows"]:
@@ -131,8 +146,12 @@ class RowStore(Generic[Item]):
 
     @property
     def size_bytes(self) -> int:
-        """Bytes that the store takes on disk."""
-        return used_bytes(self.folder)
+        """Bytes that the rows take on disk, except those that another process removes meanwhile."""
+        total = 0
+        for path in {self._path(row) for row in np.flatnonzero(self.done).tolist()}:
+            with suppress(FileNotFoundError):
+                total += path.stat().st_blocks * 512
+        return total
 
     def write(self, items: Mapping[int, Item]) -> None:
         """Store a batch of items by row. When this returns they are done, and on disk.
@@ -154,7 +173,7 @@ class RowStore(Generic[Item]):
         rows: dict[int, Parts] = {}
         for row, item in items.items():
             try:
-                rows[row] = self._pack(item)
+                rows[row] = self._form.pack(item)
             except ValueError as error:
                 raise ValueError(f"{self.folder}: row {row}: {error}") from None
         self._check_layouts(rows)
@@ -192,7 +211,12 @@ class RowStore(Generic[Item]):
 
     def _path(self, row: int) -> Path:
         """The file of a row that is done."""
-        return self._folders[self._folder_of[row]] / f"{row}-{self.counts[row]}.npz"
+        return self._file(row, self.counts[row])
+
+    def _file(self, row: int, count: int) -> Path:
+        if self._keys is None:
+            return self.folder / f"{row}-{count}.npz"
+        return self.folder / self._keys[row][:2] / f"{self._keys[row]}-{count}.npz"
 
     def _about(self, row: int, path: Path) -> str:
         token = "" if self._tokens is None else f" {self._tokens[row]:x}"
@@ -201,14 +225,14 @@ class RowStore(Generic[Item]):
     def _write_row(self, row_parts: tuple[int, Parts]) -> None:
         row, parts = row_parts
         count = len(next(iter(parts.values())))
-        path = self.write_folder / f"{row}-{count}.npz"
+        path = self._file(row, count)
+        path.parent.mkdir(exist_ok=True)
         write_arrays(path, parts, self._about(row, path), compress=self.kind.compress)
-        self._folder_of[row] = self._folders.index(self.write_folder)
         self.counts[row] = count
 
     def _read_item(self, row: int) -> Item | None:
         parts = self._read_parts(row)
-        return None if parts is None else self._unpack(parts)
+        return None if parts is None else self._form.unpack(parts)
 
     def _read_parts(self, row: int) -> Parts | None:
         """Arrays by name; None if the file is damaged, or of another row, or gone."""

@@ -1,4 +1,4 @@
-"""Global descriptors of the images of one folder on disk, read by every later run.
+"""Global descriptors of the images on disk, read by every later run.
 
 A row store (`mfvpr.storage.rows`). A row holds one `vector` float32 `[D]`, or several `[V, D]`, to the bit.
 """
@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from mfvpr.storage.manifest import VECTORS
-from mfvpr.storage.rows import RowStore, row_bytes
+from mfvpr.storage.rows import RowFormat, RowStore, row_bytes
 
 VectorStore = RowStore[np.ndarray]
 
 
 def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> VectorStore:
     """The store in `folder`; see `features.open_store`."""
-    return RowStore(folder, VECTORS, recipe, {"num_images": num_images}, pack=_pack, unpack=_unpack, **options)
+    return RowStore(folder, RowFormat(VECTORS, _pack, _unpack), recipe, {"num_images": num_images}, **options)
 
 
 def forecast_bytes(num_images: int, size: int) -> int:

@@ -218,7 +218,7 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
 
 def test_files_are_known_by_content(dataset, files, tmp_path):
     def recipe(root):
-        return FeatureCache(tmp_path / "s").recipe(dataset.database, FeatureFiles(at(dataset, root, ".npz")))
+        return FeatureCache(tmp_path / "s").recipes.of_folder(dataset.database, FeatureFiles(at(dataset, root, ".npz")))
 
     moved = Path(shutil.copytree(files, tmp_path / "elsewhere"))
     assert recipe(moved) == recipe(files)
@@ -233,9 +233,9 @@ def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     changed = [sides, {folder: second, other_folder: first}, sides | {folder: replace(first, prefix="other/")}]
     readers = FeatureFiles, DescriptorFiles, lambda at: Retrieval(Aggregated(FeatureFiles(at), VladFitting()))
     for read in readers:
-        assert len({fingerprint(feature_cache.recipe_of(read(at))) for at in changed}) == len(changed)
+        assert len({fingerprint(feature_cache.recipes.of(read(at))) for at in changed}) == len(changed)
     pairs = [ShortlistFiles({folder: first}, prefix) for prefix in ("", "database/")]
-    assert len({fingerprint(feature_cache.recipe_of(shortlists)) for shortlists in pairs}) == 2
+    assert len({fingerprint(feature_cache.recipes.of(shortlists)) for shortlists in pairs}) == 2
 
 
 def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several, tmp_path, monkeypatch):

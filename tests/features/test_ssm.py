@@ -199,7 +199,7 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     assert len(kept(tmp_path)) == 2
     assert not np.array_equal(*(extractor.whitening.components for extractor in extractors))
     # A hash of it is part of all that is computed with it.
-    recipes = [cache.recipe(dataset.database, extractor) for extractor in extractors]
+    recipes = [cache.recipes.of_folder(dataset.database, extractor) for extractor in extractors]
     assert "whitening" in difference(*recipes)
     variants = [
         cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),

@@ -119,7 +119,7 @@ def test_every_scorer_is_ranked_with_the_cohort_as_well(dataset, cache_folder, e
         np.testing.assert_array_equal(result.systems[name][0].rows, ranked.rows)
         np.testing.assert_array_equal(result.systems[name][0].scores, ranked.scores)
     cache = FeatureCache(cache_folder)
-    sequence = cohort_sequence(cache.contents(dataset.database), 2)
+    sequence = cohort_sequence(cache.recipes.contents(dataset.database), 2)
     cohort = match_sequence(dataset, sequence, mfvpr.Pipeline(SIFT, VLAD, candidates=5), cache=cache)
     candidates = cohort.candidates
     assert (np.abs(candidates.indices - np.arange(10)[:, None])[candidates.mask] > 2).all()

@@ -10,12 +10,14 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mfvpr import InputError
+from mfvpr.storage.disk import lock_store
 from mfvpr.storage.features import forecast_bytes, open_store
 from tests.io.checks import one_line_error
 from tests.small_disks import UNSHARE, mount, need_small_disks
@@ -121,7 +123,8 @@ def test_rows_that_are_written_during_the_wait_for_the_lock_are_done(tmp_path):
             holder.write({1: features_of(1)})
             stack.close()
 
-        with open_store(tmp_path / "s", RECIPE, num_images=3, waiting=finish) as store:
+        lock = partial(lock_store, waiting=finish)
+        with open_store(tmp_path / "s", RECIPE, num_images=3, lock=lock) as store:
             assert store.done.tolist() == [False, True, False]
 
 

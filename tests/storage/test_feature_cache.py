@@ -12,8 +12,9 @@ from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.images import resize
 from mfvpr.features import Aggregated, Description, VladFitting
-from mfvpr.storage import FeatureCache, feature_cache, vectors
+from mfvpr.storage import FeatureCache, recipes, vectors
 from mfvpr.storage.features import forecast_bytes
+from mfvpr.storage.recipes import Recipes
 from mfvpr.utils import InputError
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
 from tests.storage.synthetic_features import assert_same
@@ -83,15 +84,46 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk)
         assert features.counts.tolist() == [number] * len(folder)
 
 
-def test_what_another_version_decodes_are_other_images(folder, monkeypatch):
-    known, recipe = feature_cache.versions(), FeatureCache().recipe(folder, SIFT)
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_images_are_known_by_their_content(folder, tmp_path, on_disk):
+    """In a part of the folder, under other names, and twice in one folder."""
+    extractor, cache = Counted(), FeatureCache(tmp_path / "s" if on_disk else None)
+    [features] = cache.local(folder, extractor)
+    [part] = cache.local(replace(folder, names=folder.names[7:2:-2]), extractor)
+    assert_same_features(part, [features[row] for row in (7, 5, 3)])
+    if on_disk:
+        root = tmp_path / "images"
+        shutil.copytree(folder.root, root)
+        shutil.copy(root / "0003.png", root / "again.png")
+        [copied] = cache.local(image_folder(root), extractor)
+        assert_same_features(copied, [*all_of(features), features[3]])
+    assert extractor.seen == len(folder)
+
+
+@pytest.mark.parametrize("change", [{"bits": 12}, {"orient": False}])
+def test_other_conversions_give_other_images(tmp_path, change):
+    """Of a 16-bit image, and of one that is turned."""
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    noise = np.random.default_rng(0).integers(0, 4096, (120, 160))
+    Image.fromarray(noise.astype(np.uint16)).save(tmp_path / "deep.png")
+    Image.fromarray((noise // 16).astype(np.uint8)).save(tmp_path / "turned.jpg", exif=exif)
+    cache, folder = FeatureCache(tmp_path / "s"), image_folder(tmp_path)
+    before, after = (cache.recipes.contents(images).keys for images in (folder, replace(folder, **change)))
+    assert [first == second for first, second in zip(before, after, strict=True)] == (
+        [False, True] if "bits" in change else [True, False]
+    )
+
+
+def test_what_another_version_decodes_are_other_images(monkeypatch):
+    known, recipe = recipes.versions(), Recipes(None).of_features(SIFT)
     for name in ("opencv-python-headless", "pillow"):
-        monkeypatch.setattr(feature_cache, "versions", lambda name=name: {**known, name: "0"})
-        assert FeatureCache().recipe(folder, SIFT) != recipe
-    monkeypatch.setattr(feature_cache, "versions", lambda: {**known, "mfvpr": "0"})  # a release decodes as the last one
-    assert FeatureCache().recipe(folder, SIFT) == recipe
-    monkeypatch.setattr(feature_cache, "DECODING", "0")
-    assert FeatureCache().recipe(folder, SIFT) != recipe
+        monkeypatch.setattr(recipes, "versions", lambda name=name: {**known, name: "0"})
+        assert Recipes(None).of_features(SIFT) != recipe
+    monkeypatch.setattr(recipes, "versions", lambda: {**known, "mfvpr": "0"})  # a release decodes as the last one
+    assert Recipes(None).of_features(SIFT) == recipe
+    monkeypatch.setattr(recipes, "DECODING", "0")
+    assert Recipes(None).of_features(SIFT) != recipe
 
 
 @pytest.mark.parametrize("on_disk", [True, False])

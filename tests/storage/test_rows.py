@@ -249,5 +249,8 @@ def test_a_start_that_was_killed_goes_on(tmp_path):
     assert fill(tmp_path / "s", num_rows=3, batch=1) == [0, 1, 2]
     (tmp_path / "s" / "1-40.npz").rename(tmp_path / "s" / ".1-40-x1y_2.npz")
     (tmp_path / "s" / ".notes.npz").write_text("not of the store")
+    (tmp_path / "s" / ".2-40-abc.npz").write_text("of a process that is writing")
+    for path in (tmp_path / "s").glob(".*x1y_2*"):
+        os.utime(path, (0, 0))
     assert fill(tmp_path / "s") == [1]
-    assert [path.name for path in (tmp_path / "s").glob(".*")] == [".notes.npz"]
+    assert [path.name for path in sorted((tmp_path / "s").glob(".*"))] == [".2-40-abc.npz", ".notes.npz"]

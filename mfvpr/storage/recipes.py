@@ -1,0 +1,49 @@
+"""Recipes of results: the content of images and files, the extractor, and the versions of decoders."""
+
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+from mfvpr.datasets.contents import Contents, contents, files_of
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.storage.memo import Memo
+from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.versions import versions
+
+DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
+# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.images` gives other
+# pixels, set it to the next version: stored features are then extracted again.
+DECODING = "0.2.0"
+
+
+@dataclass
+class Recipes:
+    """Recipes of a cache in the folder `root`; None = hashes of files are not kept on disk."""
+
+    root: Path | None
+    _memo: Memo = field(default_factory=Memo, repr=False)
+
+    def contents(self, folder: ImageFolder) -> Contents:
+        """Hashes of the files of a folder; with a root, later runs read them from there."""
+        records = None if self.root is None else self.root / "contents"
+        return self._memo.once("contents", lambda: contents(folder, records), folder, None)
+
+    def of(self, value: Any) -> Any:
+        """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
+        return recipe_of(value, self._content_of)
+
+    def of_features(self, extractor: Any) -> dict[str, Any]:
+        """Everything but the image that changes its features: extractor, versions of decoders."""
+        decoders = {"mfvpr": DECODING} | {name: versions()[name] for name in DECODERS}
+        return {"extractor": self.of(extractor), "versions": decoders}
+
+    def of_folder(self, folder: ImageFolder, extractor: Any) -> dict[str, Any]:
+        """Everything that changes the features of a folder's images."""
+        return self.of_features(extractor) | {"images": self.contents(folder).fingerprint}
+
+    def _content_of(self, path: PurePath) -> Any:
+        path = Path(path)
+        if not path.exists():
+            return str(path)
+        content = self.contents(files_of(path))
+        return content.fingerprint if path.is_dir() else content.sha256
