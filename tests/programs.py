@@ -19,9 +19,9 @@ from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, stages
 from mfvpr.cli.launch import exit_at_once, launch
-from mfvpr.cli.settings import CONF
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.manifest import MATCHES, store_path
+from mfvpr.systems.settings import CONF
 
 ROOT = Path(__file__).parent.parent
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")

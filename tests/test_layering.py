@@ -25,9 +25,13 @@ PERMISSIONS = {
         "datasets", "features", "matching", "reranking", "retrieval", "scoring", "storage", "types", "utils",
     },
     "testing": {"reranking", "scoring", "types", "utils"},
+    "systems": {
+        "checkpoints", "datasets", "evaluation", "features", "matching", "networks", "reranking", "retrieval",
+        "scoring", "utils",
+    },
     "localization": {
-        "datasets", "evaluation", "features", "matching", "reranking", "retrieval", "scoring", "storage", "types",
-        "utils",
+        "datasets", "evaluation", "features", "matching", "reranking", "retrieval", "scoring", "storage", "systems",
+        "types", "utils",
     },
     "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {
@@ -35,7 +39,7 @@ PERMISSIONS = {
     },
     "cli": {
         "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "networks", "report",
-        "reranking", "retrieval", "scoring", "storage", "tuning", "types", "utils",
+        "reranking", "scoring", "storage", "systems", "tuning", "types", "utils",
     },
 }  # fmt: skip
 LIBRARIES = {

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import overrides
-from mfvpr.cli.settings import CONF, RULES, check, scorer_rules
 from mfvpr.datasets import image_folder
 from mfvpr.features import Sift
 from mfvpr.io import write_features
 from mfvpr.storage import FeatureCache
+from mfvpr.systems.settings import CONF, RULES, check, scorer_rules
 from tests import random_checkpoints
 from tests.builders import make_matches
 from tests.programs import QUICK, ROOT, composed, run, typed

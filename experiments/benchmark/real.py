@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 from experiments.benchmark.harness import duration, write_report
 from experiments.paper.systems import REAL
 from mfvpr.checkpoints import load_model
-from mfvpr.cli import build
 from mfvpr.cli.console import tell, track
 from mfvpr.cli.overrides import compose_program
 from mfvpr.datasets import folder_dataset
@@ -24,7 +23,9 @@ from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
 from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
 from mfvpr.utils import InputError, Runtime
+from mfvpr.utils.files import expand_user
 
 SIZE = (336, 336)
 TOLERANCES = (1, 2, 5)  # frames
@@ -34,7 +35,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     """Score SIFT's and ALIKED n16's matches with all images of both data sets below `data`."""
     if data is None:
         raise InputError(f"--data: expected a folder that has {' and '.join(REAL)}, got none")
-    folder = build.expand_user(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
+    folder = expand_user(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")  # as in conf/common.yaml
     cache, scorers = FeatureCache(folder / "features", runtime=Runtime(progress=track, log=tell)), compared_scorers()
     parts, tables = [], []
     for name, folders in REAL.items():
@@ -52,7 +53,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
 def compared_scorers() -> dict[str, Scorer]:
     """The scorers of `scorer=compared`, by name."""
     settings: Any = OmegaConf.to_container(compose_program("config", ["scorer=compared"]).scorer)
-    return build.scorers(settings)
+    return assembly.scorers(settings)
 
 
 def extractors() -> dict[str, Extractor]:

@@ -14,13 +14,13 @@ from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.cli import build, run_folder, truth
 from mfvpr.cli.console import tell
 from mfvpr.cli.launch import how_to_install
-from mfvpr.cli.settings import SettingsError
 from mfvpr.cli.stages import dataset_of
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 
 

@@ -14,8 +14,8 @@ from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder
 from mfvpr.cli.overrides import compose_program
-from mfvpr.cli.settings import SettingsError, check
 from mfvpr.report.runs import write_json
+from mfvpr.systems.settings import SettingsError, check
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.locks import lock_folder

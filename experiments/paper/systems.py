@@ -11,9 +11,9 @@ from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
 from mfvpr.cli.build import expand_user
 from mfvpr.cli.overrides import quote
-from mfvpr.cli.settings import RULES, SettingsError
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.systems.settings import RULES, SettingsError
 
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders

@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.cli import build
 from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.evaluation import Pipeline, System, evaluation
 from mfvpr.localization.vectors import Vectors
 from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
@@ -38,9 +38,12 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     candidates = settings["candidates"]
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
-    extractor = build.extractor(settings["features"], None)
-    retriever, matcher = build.retriever(settings["retrieval"], extractor, None), build.matcher(settings["matching"])
-    scorers, seconds = build.scorers(settings["scorer"]), dict[str, float]()
+    extractor = assembly.extractor(settings["features"], None)
+    retriever, matcher = (
+        assembly.retriever(settings["retrieval"], extractor, None),
+        assembly.matcher(settings["matching"]),
+    )
+    scorers, seconds = assembly.scorers(settings["scorer"]), dict[str, float]()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
         cache = FeatureCache(Path(folder) / "cache")

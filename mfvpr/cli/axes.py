@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from mfvpr.cli import build
-from mfvpr.cli.settings import SettingsError
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching.match_set import block_bytes, scales
 from mfvpr.scoring import SCORERS
 from mfvpr.scoring.fields import parameters_of
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
@@ -33,7 +33,7 @@ def axes(settings: dict[str, Any]) -> Axes:
     if "method" not in settings["scorer"]:
         raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
-    [(method, scorer)] = build.scorers(settings["scorer"]).items()
+    [(method, scorer)] = assembly.scorers(settings["scorer"]).items()
     known = {*parameters_of(scorer), *_NOT_OF_SCORER}
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     for name, axis in values.items():

@@ -1,53 +1,18 @@
-"""Turn checked settings into objects of the library, by fixed tables: nothing named in a YAML file is called."""
+"""Turn checked settings into a data set, a cache and a runtime; `mfvpr.systems.assembly` has the parts of a system."""
 
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
-from mfvpr import features
-from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.cli import console
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import Dataset, folder_dataset, sequences_dataset
 from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
-from mfvpr.evaluation import Pipeline, System
-from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
-from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.reranking.results import COHORT
-from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever, ShortlistFiles, WhitenedSearch
-from mfvpr.retrieval.precomputed import File
-from mfvpr.retrieval.search import EXACT
-from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.scoring.fields import from_values
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
-from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import Runtime, recipe_of
-from mfvpr.utils.fingerprints import fingerprint
-
-# Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
-_NETWORK_EXTRACTORS = {
-    "features": {
-        "aliked": "AlikedFeatures",
-        "d2net": "D2NetFeatures",
-        "ssm": "SsmCells",
-        "patch_netvlad": "PatchNetVladFeatures",
-        "selavpr": "SelaVprFeatures",
-    },
-    "retrieval": {"mixvpr": "MixVprDescriptor", "ssm": "SsmWindows"}
-    | dict.fromkeys(["netvlad", "gem", "dinov2"], "GlobalDescriptor"),
-}
-
-
-def expand_user(path: str) -> Path:
-    """A path with ~ replaced by the home folder."""
-    return Path(os.path.expanduser(path))
+from mfvpr.systems.settings import SettingsError
+from mfvpr.utils import Runtime
+from mfvpr.utils.files import expand_user
 
 
 def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
@@ -72,7 +37,7 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         )
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
-    options = _without(settings, "root", "exclude_neighbors")
+    options = {name: value for name, value in settings.items() if name not in ("root", "exclude_neighbors")}
     several = isinstance(options["queries"], list)
     if several == ("database_labels" in options):  # only a single sequence has labels
         expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
@@ -83,97 +48,6 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
     for name in ("database", "queries", "index_file", "database_labels", "query_labels"):
         options[name] = expand_user(options[name]) if options[name] else None
     return folder_dataset(**options)
-
-
-def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
-    """The extractor of local features, or the feature files of another program."""
-    name, options = settings["name"], _without(settings, "name")
-    options["image_size"] = options["image_size"] and tuple(options["image_size"])
-    if name == "import":
-        return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
-    if name != "sift":
-        return _network_extractor("features", name, options)
-    if (kind := options["interpolation"]).startswith("torch"):
-        raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
-    return Sift(**_require_fields(options, Sift, "features=sift"))
-
-
-def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
-    """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
-    name, options = settings["name"], _without(settings, "name", "whiten")
-    if name == "pairs":
-        return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
-    if name == "ssm":
-        from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
-
-        return SsmVoting(_network_extractor("retrieval", name, options))
-    search = EXACT if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
-    if name == "import":
-        return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
-    if name == "vlad":
-        return Retrieval(
-            Aggregated(local, VladFitting(**_require_fields(options, VladFitting, "retrieval=vlad"))), search
-        )
-    if name != "same":
-        return Retrieval(_network_extractor("retrieval", name, options), search)
-    if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
-                            "choose another retrieval")  # fmt: skip
-    return Retrieval(local, search)
-
-
-def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
-    """An extractor with a network; the options are fields of the extractor or of its fitting."""
-    extractor_class = getattr(features, _NETWORK_EXTRACTORS[group][name])
-    options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
-    names = {field.name for field in fields(extractor_class)}
-    if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
-        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's retrieval"}[name]
-        expected = list(extractor_class.image_size)
-        raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
-    networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
-    model = _network(group, networks, options.pop("weights", None))
-    if name == "dinov2":
-        from mfvpr.networks.vit import TokenDescriptor
-
-        model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))
-    if "whitening" in names:
-        published = extractor_class.whitening
-        replaced = {field.name for field in fields(published)} & options.keys()
-        options["whitening"] = replace(published, **{option: options.pop(option) for option in replaced})
-    return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
-
-
-def matcher(settings: dict[str, Any]) -> Matcher:
-    """The matcher of an image pair."""
-    name, options = settings["name"], _without(settings, "name")
-    weights = options.pop("weights", None)
-    if name == "neighbors":
-        return NearestNeighborMatcher(**_require_fields(options, NearestNeighborMatcher, "matching=neighbors"))
-    options = _require_fields(options, LightGlueMatcher, "matching=lightglue")
-    return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
-
-
-def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
-    """Files of another program, by folder of the images."""
-    if data is None:
-        raise SettingsError(f"{group}: files of other programs belong to a data set; choose others")
-    queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
-    if len(queries) not in (1, len(data.sequences)):
-        raise SettingsError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
-                            f"got {len(queries)}")  # fmt: skip
-    files = {} if settings["database"] is None else {
-        data.database.root: File(expand_user(settings["database"]), settings["database_prefix"])
-    }  # fmt: skip
-    for index, sequence in enumerate(data.sequences):
-        root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
-        file = File(path, settings["query_prefix"])
-        if files.setdefault(root, file) != file:
-            raise SettingsError(
-                f"{group}.queries={path}: expected the file and the prefix of {group}.database, since the queries and "
-                f"the database are one folder, {root}; give one file with all of its images for both"
-            )
-    return files
 
 
 def cache(settings: dict[str, Any]) -> FeatureCache:
@@ -191,76 +65,3 @@ def runtime(settings: dict[str, Any]) -> Runtime:
     if number != "all" and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
     return Runtime(devices if number == "all" else devices[:number], settings["memory"], console.track, console.tell)
-
-
-def pipeline(settings: dict[str, Any], data: Dataset | None) -> Pipeline:
-    """The pipeline that the settings name; files of other programs need their data set."""
-    local = extractor(settings["features"], data)
-    retrieval = retriever(settings["retrieval"], local, data)
-    return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"])
-
-
-def system(settings: dict[str, Any], pipeline: Pipeline) -> System:
-    """The system that the settings name: the main scorer is fused with the retrieval, also its scores with a cohort."""
-    chosen, fusing, cohort = scorers(settings["scorer"]), fusion(settings), settings["cohort"]
-    main = main_scorer(chosen)
-    fused = {main: fusing}
-    if cohort is not None and fusing.members(main) == [main]:
-        fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
-    headline = fusing.system(main) if settings["final"] == "combined" else main
-    correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
-    return System(pipeline, chosen, fused, correlated, cohort, settings["ties"], headline)
-
-
-def main_scorer(scorers: Mapping[str, Any]) -> str:
-    """Name of the scorer that decides: the histogram of shifts, or the first."""
-    return "histogram" if "histogram" in scorers else next(iter(scorers))
-
-
-def fusion(settings: dict[str, Any]) -> Fusion:
-    """The fusion of a score with that of the retrieval, and with those of other scorers."""
-    c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
-    c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
-    return Fusion(c, retrieval_score, weights or {})
-
-
-def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
-    """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in REGISTRY.values() if entry.network in names]
-    if weights not in known:
-        raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
-    return load_model(weights)
-
-
-def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings of the chosen scorer, or of several, by name."""
-    return {settings["method"]: settings} if "method" in settings else settings
-
-
-def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
-    return {
-        name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
-        if values.get("weight", "fs") not in WEIGHTS
-        else {**values}
-        for name, values in by_scorer(settings).items()
-    }
-
-
-def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
-    """The chosen scorer, or several, by name."""
-    return {
-        name: from_values(SCORERS[values["method"]], _without(values, "method"))
-        for name, values in by_scorer(settings).items()
-    }
-
-
-def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in names}
-
-
-def _require_fields(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
-    """The options, if they all are fields of the extractor; others come from a mixture of two choices."""
-    if unknown := options.keys() - {field.name for field in fields(extractor)}:
-        raise SettingsError(f"{choice} has no setting {', '.join(sorted(unknown))}; see --help")
-    return options

@@ -21,8 +21,8 @@ from mfvpr.cli.console import tell
 from mfvpr.cli.groups import PROGRAMS, check_choice, choices_with, groups
 from mfvpr.cli.launch import import_job, on_interrupt, one_line
 from mfvpr.cli.overrides import PATHS, compose_program, quote, split_first
-from mfvpr.cli.settings import CONF, SettingsError, check, nodes
 from mfvpr.cli.wording import in_settings
+from mfvpr.systems.settings import CONF, SettingsError, check, nodes
 
 _MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group

@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mfvpr.cli import build, truth
+from mfvpr.cli import truth
 from mfvpr.cli.console import tell
-from mfvpr.cli.settings import SettingsError
 from mfvpr.cli.stages import Images
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import Confidence, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.report.evaluations import EvaluationReport
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.files import expand_user
 from mfvpr.utils.versions import versions
 
 # Confidences depend on these settings.
@@ -28,7 +30,7 @@ class ConfidenceFile(NamedTuple):
 def read_file(settings: Mapping[str, Any]) -> ConfidenceFile | None:
     """Read the file that the settings name; None if there is none."""
     path = settings["confidence"]
-    return None if path is None else ConfidenceFile(path, *read_confidences(build.expand_user(path)))
+    return None if path is None else ConfidenceFile(path, *read_confidences(expand_user(path)))
 
 
 def check_confidence(
@@ -66,7 +68,7 @@ def check_confidence(
 def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any], candidates: int) -> list[str]:
     """The settings of a run or of a map that were others when a confidence was fitted."""
     before = _system_settings(origin.get("settings"), system)
-    now = _system_settings({**settings, "scorer": build.describe_settings(settings["scorer"])}, system)
+    now = _system_settings({**settings, "scorer": assembly.describe_settings(settings["scorer"])}, system)
     names = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
     return names + ["candidates"] * (origin.get("candidates") != candidates)
 
@@ -91,7 +93,7 @@ def _system_settings(settings: Any, system: str) -> dict[str, Any]:
     if not isinstance(scorers, Mapping) or not isinstance(scorers.get("method", ""), str):
         return {}
     members = system.split(" + ")
-    parts = {name: values for name, values in build.by_scorer(scorers).items() if name in members}
+    parts = {name: values for name, values in assembly.by_scorer(scorers).items() if name in members}
     for name, values in parts.items():
         if isinstance(values, Mapping) and "weight_content" in values:
             parts[name] = {**values, "weight": None}
@@ -107,7 +109,8 @@ def provenance(settings: Mapping[str, Any], images: Images, evaluation: Evaluati
         "correct_within": _threshold(settings, images),
         "candidates": num_candidates(settings["candidates"], images.dataset.database),
         "ground_truth": truth.describe(settings, images.dataset),
-        "settings": {name: settings[name] for name in _NAMES} | {"scorer": build.describe_settings(settings["scorer"])},
+        "settings": {name: settings[name] for name in _NAMES}
+        | {"scorer": assembly.describe_settings(settings["scorer"])},
         "command": settings.get("command"),
         "versions": versions(),
     }

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from mfvpr.cli.settings import CONF
 from mfvpr.scoring import ALONE, PAPER, SCORERS, fields
+from mfvpr.systems.settings import CONF
 from mfvpr.utils.files import write_text
 
 _FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"

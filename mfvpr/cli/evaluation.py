@@ -5,8 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import build, confidences, run_folder, stages, truth
-from mfvpr.cli.settings import SettingsError
+from mfvpr.cli import confidences, run_folder, stages, truth
 from mfvpr.cli.stages import Images, Tools
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
@@ -23,6 +22,8 @@ from mfvpr.reranking import Fusion
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
 from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage.extraction import open_sinks
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.versions import versions
 
@@ -62,16 +63,16 @@ def _fill_shard(settings: dict[str, Any]) -> None:
     """Do the part of a shard, and print what is done, and what to do next."""
     shard = Shard.parse(settings["shard"])
     tools, images = stages.prepare(settings, Stopwatch())
-    print(fill_shard(images.dataset, build.system(settings, tools.pipeline), tools.cache, shard))
+    print(fill_shard(images.dataset, assembly.system(settings, tools.pipeline), tools.cache, shard))
 
 
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
-    scorers, watch, confidence = build.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
-    main = build.main_scorer(scorers)
-    build.fusion(settings).check(main, scorers)  # before anything slow
+    scorers, watch, confidence = assembly.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
+    main = assembly.main_scorer(scorers)
+    assembly.fusion(settings).check(main, scorers)  # before anything slow
     tools, images = stages.prepare(settings, watch)
-    system, figure_queries = build.system(settings, tools.pipeline), query_rows(settings["figures"], images.dataset)
+    system, figure_queries = assembly.system(settings, tools.pipeline), query_rows(settings["figures"], images.dataset)
     headline = system.headline
     confidence = confidences.check_confidence(confidence, headline, settings, images)
     result = evaluation.evaluate(images.dataset, system, cache=tools.cache)
@@ -93,7 +94,7 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
 
 def _parameters(settings: dict[str, Any], main: str, fusions: Mapping[str, Fusion]) -> dict[str, dict[str, Any]]:
     """Parameters by system: retrieval, scorers, scorers with a cohort, fusions."""
-    scorers = build.describe_settings(settings["scorer"])
+    scorers = assembly.describe_settings(settings["scorer"])
     if (cohort := settings["cohort"]) is not None:
         scorers |= {f"{name} + {COHORT}": values | {"cohort": cohort} for name, values in scorers.items()}
     members = fusions[main].members(main)

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from mfvpr.cli.settings import CONF, SettingsError
+from mfvpr.systems.settings import CONF, SettingsError
 
 # File in conf/ -> the command, and its job for `launch.import_job`.
 PROGRAMS = {

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from mfvpr.cli.groups import check_choice, choices, defaults, groups
-from mfvpr.cli.settings import CONF
+from mfvpr.systems.settings import CONF
 
 _WHOLE = ("system", "experiment")  # groups that set values of all other groups
 _SECTIONS = {"launcher": "hydra"}  # the section of a group's settings, if it has another name than the group

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
 
-from mfvpr.cli.settings import SettingsError
+from mfvpr.systems.settings import SettingsError
 
 if TYPE_CHECKING:  # it imports JAX
     from mfvpr.checkpoints.registry import Entry

@@ -5,22 +5,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mfvpr.cli import build, console, run_folder, stages, truth
+from mfvpr.cli import console, run_folder, stages, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.cli.settings import SettingsError
 from mfvpr.cli.stages import Images
 from mfvpr.datasets.sequences import OwnRows, own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
+from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.comparison import Checkpoints, compare
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.losses import LOSSES
 from mfvpr.tuning.learning.teaching import Options
 from mfvpr.utils import Stopwatch, recipe_of
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import expand_user, write_text
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
 
@@ -153,7 +153,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
         "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }  # fmt: skip
     name = "" if settings["checkpoints"] else f"{settings['dataset']['name']}_learning-{fingerprint(recipe)}"
-    return Checkpoints(build.expand_user(root) / name, recipe)
+    return Checkpoints(expand_user(root) / name, recipe)
 
 
 def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:

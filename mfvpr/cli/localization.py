@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli import build, confidences, maps
+from mfvpr.cli import confidences, maps
 from mfvpr.cli.console import tell
 from mfvpr.cli.query_images import images
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.report.file_names import file_names
 from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime
-from mfvpr.utils.files import printable
+from mfvpr.utils.files import expand_user, printable
 
 
 def localize(settings: dict[str, Any]) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
     robot_map = maps.open_map(
-        build.expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
+        expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
         runtime=Runtime(memory=settings["memory"]),
     )  # fmt: skip
     drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
@@ -96,7 +96,7 @@ class _LocalizationFigures:
         figures, self._map, self._failed = settings["figures"], robot_map, 0
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
-        self._out, self._root = (settings[name] and build.expand_user(settings[name]) for name in ("out", "root"))
+        self._out, self._root = (settings[name] and expand_user(settings[name]) for name in ("out", "root"))
         if self._root and not self._root.is_dir():
             raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
@@ -133,7 +133,7 @@ def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     file = confidences.read_file(settings)
     if file is None:
         return None
-    map_settings = maps.read_settings(build.expand_user(settings["map"]))
+    map_settings = maps.read_settings(expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "

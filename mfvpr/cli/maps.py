@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import build
 from mfvpr.cli.console import track
-from mfvpr.cli.settings import SettingsError, check
 from mfvpr.cli.stages import dataset_of
 from mfvpr.evaluation import System
 from mfvpr.localization import Map
 from mfvpr.storage.disk import used_bytes
-from mfvpr.utils.files import printable, write_text
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError, check
+from mfvpr.utils.files import expand_user, printable, write_text
 
 SETTINGS = "settings.json"
 _FORMAT = "mfvpr map 1"
@@ -43,7 +43,7 @@ def add_images(folder: Path, images: list[Path], place: str | None) -> None:
 
 def map_of_settings(settings: Mapping[str, Any]) -> Map:
     """The map in the folder of the settings, which is created if it is not there; its settings must be the same."""
-    folder, map_settings = build.expand_user(settings["map"]), {name: settings[name] for name in _GROUPS}
+    folder, map_settings = expand_user(settings["map"]), {name: settings[name] for name in _GROUPS}
     _check(map_settings)
     if (folder / SETTINGS).exists():
         _compare(folder, map_settings)
@@ -93,4 +93,4 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 def map_of(folder: Path, settings: Mapping[str, Any], **options: Any) -> Map:
     """The map in a folder, with these settings."""
-    return Map(folder, System(build.pipeline({**settings}, None), build.scorers(settings["scorer"])), **options)
+    return Map(folder, System(assembly.pipeline({**settings}, None), assembly.scorers(settings["scorer"])), **options)

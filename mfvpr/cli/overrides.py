@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mfvpr.cli.groups import choices
-from mfvpr.cli.settings import CONF, SettingsError, check
+from mfvpr.systems.settings import CONF, SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels", "map", "images"}

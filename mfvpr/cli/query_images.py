@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli import build
 from mfvpr.cli.console import tell
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.videos import VIDEO_SUFFIXES, read_frames
-from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name
+from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user
 
 POLL = 0.2  # seconds between two looks at a folder
 
@@ -22,7 +21,7 @@ POLL = 0.2  # seconds between two looks at a folder
 def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | UInt8[np.ndarray, "height width channels"]]]:
     """(name, file or pixels) in order; names do not depend on the spelling of a path."""
     paths = settings["images"] if isinstance(settings["images"], list) else [settings["images"]]
-    paths = [build.expand_user(path) for path in paths]
+    paths = [expand_user(path) for path in paths]
     for path in paths:
         if not path.exists():
             raise SettingsError(f"images={path}: expected an image, a folder or a video, got nothing")

@@ -5,12 +5,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import build, console
-from mfvpr.cli.settings import SettingsError
+from mfvpr.cli import console
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
+from mfvpr.utils.files import expand_user
 from mfvpr.utils.versions import versions
 
 _NO_SETTINGS = ("multirun", "command")  # added by `command_line`
@@ -20,7 +21,7 @@ _NO_SETTINGS = ("multirun", "command")  # added by `command_line`
 def claim(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
     """The run folder that the settings name, for this run alone; with options of `runs.claim_run_folder`."""
     out, name = settings["out"], settings["dataset"]["name"]
-    folder = build.expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
+    folder = expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))

@@ -19,6 +19,7 @@ from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.scoring.weight_registry import provenance
 from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
@@ -66,7 +67,7 @@ def prepare(settings: dict[str, Any], watch: Stopwatch) -> tuple[Tools, Images]:
 
 
 def _tools(settings: dict[str, Any], cache: FeatureCache, dataset: Dataset | None) -> Tools:
-    return Tools(build.pipeline(settings, dataset), cache)
+    return Tools(assembly.pipeline(settings, dataset), cache)
 
 
 def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
@@ -152,7 +153,7 @@ def _note_candidates(settings: dict[str, Any], available: int) -> None:
 
 def _warn_of_weights(settings: dict[str, Any], images: Images) -> None:
     """Warn of a match weight that was learned on these images, or with other features or matches."""
-    names = {values.get("weight", "fs") for values in build.by_scorer(settings["scorer"]).values()}
+    names = {values.get("weight", "fs") for values in assembly.by_scorer(settings["scorer"]).values()}
     for name in sorted(names | {*((settings.get("grid") or {}).get("weight") or ())}):
         origin = provenance(name)
         data_sets = origin["data_sets"] if isinstance(origin.get("data_sets"), list) else [origin]

@@ -4,13 +4,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import build, console, run_folder, stages, truth
+from mfvpr.cli import console, run_folder, stages, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.report import runs, sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome
 from mfvpr.utils import Stopwatch
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import expand_user, write_text
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
 
@@ -65,7 +65,7 @@ def _block_folder(settings: dict[str, Any], tools: stages.Tools, images: stages.
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
     name = fingerprint({"matches": recipe, "sweep": sweep_settings, "versions": software})
-    return build.expand_user(settings["cache"]) / f"{settings['dataset']['name']}_sweep-{name}"
+    return expand_user(settings["cache"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
 def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from mfvpr.cli import build
 from mfvpr.cli.command_line import hydra_errors
 from mfvpr.cli.groups import check_choice
 from mfvpr.cli.overrides import compose_program, quote
-from mfvpr.cli.settings import SettingsError, check, nodes
 from mfvpr.evaluation import System
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError, check, nodes
 from mfvpr.utils.errors import InputError
 
 _PROGRAM = "config"  # its settings include those of systems
@@ -38,7 +38,7 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
     try:
         values = _read_run(Path(name), settings) if str(name).endswith(".json") else _compose(str(name), settings)
         check(values)
-        return build.system(values, build.pipeline(values, None))
+        return assembly.system(values, assembly.pipeline(values, None))
     except SettingsError as error:
         raise InputError(str(error)) from error
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mfvpr import evaluation
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import Dataset, Truth
 from mfvpr.evaluation import EvaluationProtocol
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import fingerprints
 
 _FILES = ("index_file", "query_labels", "database_labels")

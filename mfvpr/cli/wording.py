@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from mfvpr.cli.settings import SettingsError
+from mfvpr.systems.settings import SettingsError
 
 _FILES = "(index_file|database_labels|query_labels)"
 # Pattern in a message of the library -> words of the settings. GROUP stands for `features` or `retrieval`.

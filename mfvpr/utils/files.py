@@ -90,3 +90,8 @@ def path_inside(root: Path, name: str) -> Path:
     raise InputError(
         f"{clip_middle(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere"
     )
+
+
+def expand_user(path: str) -> Path:
+    """A path with ~ replaced by the home folder."""
+    return Path(os.path.expanduser(path))

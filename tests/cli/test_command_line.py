@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr.cli import groups
 from mfvpr.cli.overrides import quote
-from mfvpr.cli.settings import CONF
+from mfvpr.systems.settings import CONF
 from tests.programs import ROOT, composed, run
 
 pytestmark = pytest.mark.thorough

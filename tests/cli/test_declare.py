@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
-from mfvpr.cli import axes, build, command_line, declare, groups, help_text, overrides, settings
-from mfvpr.cli.settings import CONF
+from mfvpr.cli import axes, command_line, declare, groups, help_text, overrides
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
 from mfvpr.scoring.fields import (
     check_choices,
@@ -23,6 +22,8 @@ from mfvpr.scoring.fields import (
 )
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
+from mfvpr.systems import assembly, settings
+from mfvpr.systems.settings import CONF
 from mfvpr.tuning.learning.parameters import can_learn, starts
 from mfvpr.types import Array, Matches
 from tests.programs import composed
@@ -139,7 +140,7 @@ def test_rules_follow_from_the_class(near, refuse, program, arguments, words):
 
 def test_all_scores_contain_it(near):
     with hydra.initialize_config_dir(str(near), version_base="1.3"):
-        scorers = build.scorers(
+        scorers = assembly.scorers(
             hydra.compose("config", ["scorer=all", "scorer.near.size=[1,2]", "scorer.near.norm=largest"])["scorer"]
         )
     assert [*scorers] == [name for name in SCORERS if name not in ALONE]

@@ -10,9 +10,10 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
-from mfvpr.cli import build, evaluation, settings
-from mfvpr.cli.settings import CONF, SettingsError
+from mfvpr.cli import evaluation
 from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
+from mfvpr.systems import assembly, settings
+from mfvpr.systems.settings import CONF, SettingsError
 from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run
 
 pytestmark = pytest.mark.thorough
@@ -62,12 +63,12 @@ def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
 
 
 def test_scorers_of_conf_are_as_their_fields_say():
-    assert build.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
-    every = build.scorers(composed("scorer=all")["scorer"])
+    assert assembly.scorers(composed()["scorer"]) == {name: SCORERS[name]() for name in PAPER}
+    every = assembly.scorers(composed("scorer=all")["scorer"])
     assert every == {name: scorer() for name, scorer in SCORERS.items() if name not in ALONE}
     ratio = {"anchor": AnchorPoints(weight=RatioWeight()), "histogram": HistogramOfShifts(weight=RatioWeight())}
-    assert build.scorers(composed("scorer=ratio")["scorer"]) == ratio
-    compared = build.scorers(composed("scorer=compared")["scorer"])
+    assert assembly.scorers(composed("scorer=ratio")["scorer"]) == ratio
+    compared = assembly.scorers(composed("scorer=compared")["scorer"])
     assert compared["homography_8"] == Homography(8.0)
     assert compared["magsac_8"] == OpenCvHomography(8.0, estimator="magsac")
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mfvpr.cli import axes, build, evaluation, settings
+from mfvpr.cli import axes, evaluation
+from mfvpr.systems import assembly, settings
 from tests.programs import composed, csv_rows, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
@@ -48,10 +49,10 @@ def test_our_system_fuses_two_scores_and_retrieval():
         config = composed("system=mfvpr", *arguments)
         settings.check(config)
         assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
-        fusion = build.fusion(config)
+        fusion = assembly.fusion(config)
         assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": weight, "anchor": 1})
         assert fusion.system("histogram") == SYSTEM
-        assert build.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + retrieval"
+        assert assembly.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + retrieval"
     alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
     config = composed("system=mfvpr", *alone, config="sweep")
     settings.check(config)

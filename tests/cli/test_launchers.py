@@ -6,7 +6,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 
 from mfvpr.cli.groups import choices
-from mfvpr.cli.settings import CONF
+from mfvpr.systems.settings import CONF
 from tests.programs import composed
 
 PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import console, evaluation, run_folder
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import mcnemar
@@ -27,6 +26,7 @@ from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.report import runs
 from mfvpr.report.evaluations import SequenceFigures
 from mfvpr.scoring import HistogramOfShifts
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
 

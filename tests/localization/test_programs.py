@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import build, maps, query_images
-from mfvpr.cli.settings import SettingsError
+from mfvpr.cli import maps, query_images
 from mfvpr.datasets import read_image
 from mfvpr.datasets.videos import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.storage.maps import lock_map
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
 from tests.programs import ROOT, composed, output_of
@@ -348,7 +349,10 @@ def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path,
     settings = json.loads((folder / "settings.json").read_text())
     for candidates in (settings["candidates"], settings["candidates"] + 1):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
-        origin = {"settings": same | {"scorer": build.describe_settings(settings["scorer"])}, "candidates": candidates}
+        origin = {
+            "settings": same | {"scorer": assembly.describe_settings(settings["scorer"])},
+            "candidates": candidates,
+        }
         write_confidences(tmp_path / "c.json", {"histogram": SURE}, origin)
         [line], stderr = localize(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert 0 <= line["confidence"] <= 1

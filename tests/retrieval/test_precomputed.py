@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import build
-from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
+from mfvpr.utils.files import expand_user
 from tests.io.other_programs import feature
 
 
@@ -45,11 +47,11 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     data = Dataset("same", same, (QuerySequence("same", same, None),))
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
     for group, build_stage, defaults in (("features", build.extractor, {"image_size": None}),
-                             ("retrieval", lambda *options: build.retriever(*options[:1], SimpleNamespace(), data),
+                             ("retrieval", lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data),
                               {"whiten": None})):  # fmt: skip
         settings = {"name": "import"} | common | defaults | change
         if not refused:
-            assert build_stage(settings, data).files == {tmp_path: File(build.expand_user("a.h5"))}
+            assert build_stage(settings, data).files == {tmp_path: File(expand_user("a.h5"))}
             continue
         with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
             build_stage(settings, data)

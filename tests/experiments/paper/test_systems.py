@@ -10,9 +10,9 @@ from experiments.paper.printed import printed_tables
 from experiments.paper.runs import input_fingerprints, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, row_result
-from mfvpr.cli.settings import SettingsError
 from mfvpr.cli.truth import positives_fingerprint
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
+from mfvpr.systems.settings import SettingsError
 
 pytestmark = pytest.mark.thorough
 

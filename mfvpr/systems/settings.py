@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli.rules import Rule, any_of, either, list_of, number, one_of, or_list, pattern, whole
+from mfvpr.systems.rules import Rule, any_of, either, list_of, number, one_of, or_list, pattern, whole
 
 _INSTALLED = Path(__file__).parent / "conf"  # in a wheel; in a clone, it stands beside the package
 CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"

@@ -1,0 +1,10 @@
+"""Systems from settings: checked values become an extractor, a retrieval, a matcher, scorers and their fusion.
+
+Read first: settings (checks), assembly (settings -> System), rules (of values).
+
+Imports checkpoints, datasets, evaluation, features, matching, networks, reranking, retrieval, scoring, utils.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

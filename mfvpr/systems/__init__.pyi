@@ -1,0 +1,8 @@
+__all__ = [
+    "SettingsError",
+    "assembly",
+    "settings",
+]
+
+from . import assembly, settings
+from .settings import SettingsError
