@@ -10,7 +10,7 @@ systems (`load_system`). Then overrides, help_text, wording (of errors), declare
 scorers). Settings are checked and become systems in `mfvpr.systems`; other values in build, truth and confidences.
 Jobs share stages, run_folder, axes, console.
 
-Imports checkpoints, datasets, evaluation, features, localization, matching, networks, report, reranking, scoring,
+Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, scoring,
 storage, systems, tuning, types, utils.
 """
 

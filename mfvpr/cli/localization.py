@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli import confidences, maps
+from mfvpr.cli import confidences
 from mfvpr.cli.console import tell
 from mfvpr.cli.query_images import images
 from mfvpr.datasets import read_image
-from mfvpr.evaluation import Confidence
+from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
+from mfvpr.localization.declaration import read_declaration, read_system
 from mfvpr.report.file_names import file_names
 from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
@@ -25,10 +26,10 @@ from mfvpr.utils.files import expand_user, printable
 
 def localize(settings: dict[str, Any]) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
-    robot_map = maps.open_map(
-        expand_user(settings["map"]), confidence=_confidence(settings), threshold=settings["threshold"],
-        runtime=Runtime(memory=settings["memory"]),
-    )  # fmt: skip
+    folder, runtime = expand_user(settings["map"]), Runtime(memory=settings["memory"])
+    system = read_system(folder)
+    confidence = _confidence(settings, system)
+    robot_map = Map(folder, system, confidence=confidence, threshold=settings["threshold"], runtime=runtime)
     drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
@@ -128,13 +129,14 @@ class _LocalizationFigures:
                                 "the lines have them, or the last parts of these")  # fmt: skip
 
 
-def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
-    """The confidence of the score that the map was made with."""
+def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | None:
+    """The confidence that the settings name, of the score that the map was made with."""
     file = confidences.read_file(settings)
     if file is None:
         return None
-    map_settings = maps.read_settings(expand_user(settings["map"]))
-    name = map_settings["scorer"]["method"]
+    map_settings, name = read_declaration(expand_user(settings["map"])), system.headline
+    if map_settings["final"] == "score":
+        del map_settings["fusion"]
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip

@@ -87,8 +87,8 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
         marks.mkdir(parents=True, exist_ok=True)
         write_text(paths[shard.index], "described\n")
     if missing := [index for index, path in enumerate(paths) if not path.exists()]:
-        some = ", ".join(map(str, missing[:SOME])) + ", ..." * (len(missing) > SOME)
-        return f"shard {shard}: its images are described, those of shards {some} are not; start it again when they are"
+        named = ", ".join(map(str, missing[:SOME])) + ", ..." * (len(missing) > SOME)
+        return f"shard {shard}: its images are described, those of shards {named} are not; start it again when they are"
     for sequence in sequences:
         match_rows(dataset, sequence, pipeline, shard.rows(sequence.images.names), cache)
     return f"shard {shard}: its images and queries are done; when all shards are, run without shard= for the results"

@@ -82,6 +82,7 @@ class System:
             sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
         final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.
+        settings: that it was made from, by `mfvpr.load_system`; a map keeps them, so that `Map.open` needs no system.
     """
 
     pipeline: Pipeline
@@ -91,6 +92,7 @@ class System:
     cohort: int | None = None
     ties: Ties = "retrieval"
     final: str | None = None
+    settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the scorers and the names of their combinations.

@@ -1,7 +1,6 @@
 """Localization: a map of images with known places, in which one image at a time is localized.
 
-    known = Map("map", system)
-    known.build(folder, places)            # or, image by image: known.add(image, place)
+    known = Map.create("map", folder, system)  # then Map.open("map"); image by image: known.add(image, place)
     prediction = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
     route = Route(Drive(advance=1))        # if the map and the queries are in the order of a drive:
     located = route(prediction, known.there)   # the row that is most probable given all images so far and the motion
@@ -10,10 +9,9 @@ Other processes may read a map while one process adds to it, and several threads
 
 Read first: map (localize one image), images (the images of a map, and how they are added), predictions. Then their
 parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
-matches), route (a drive through a map).
+matches), declaration and calibration (what a map keeps in its folder), route (a drive through a map).
 
-Imports datasets, evaluation, features, matching, reranking, retrieval, scoring, storage,
-types, utils.
+Imports datasets, evaluation, features, matching, reranking, retrieval, scoring, storage, systems, types, utils.
 """
 
 import lazy_loader

@@ -13,7 +13,8 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.features.extraction import describe_folder, describe_images
 from mfvpr.features.extractor import Aggregation, Description, Extractor
-from mfvpr.storage.features import FeatureStore, round_as_stored
+from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.storage.features import round_as_stored
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
@@ -56,22 +57,27 @@ class Describing:
         self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
     ) -> Iterator[dict[int, Described]]:
         """Describe some images of a folder: batches of descriptions by row; raises as `image`."""
-        for batch in batches(images, self.extractor, rows, track):
+        for batch in _batches(images, self.extractor, rows, track):
             features = [round_as_stored(description.features) for description in batch.values()]
             descriptions = [*batch.values()]
             for describer in self._extractors[1:]:
-                parts = batches(images, describer, [*batch], no_progress)
+                parts = _batches(images, describer, [*batch], no_progress)
                 descriptions = [description for part in parts for description in part.values()]
             vectors = self._vectors(features, descriptions)
             yield dict(zip(batch, zip(features, vectors, strict=True), strict=True))
 
-    def stored(self, store: FeatureStore, rows: Sequence[int]) -> Iterator[dict[int, Described]]:
-        """Describe images whose local features are in a store, by an aggregation, as `folder` describes images."""
-        size = self.extractor.batch_size
-        for start in range(0, len(rows), size):
-            images = dict(store.read(rows[start : start + size]))
-            vectors = self._vectors([*images.values()], [])
-            yield dict(zip(images, zip(images.values(), vectors, strict=True), strict=True))
+    def cached(self, images: ImageFolder, rows: Sequence[int], cache: FeatureCache) -> Iterator[dict[int, Described]]:
+        """Describe images by way of a cache, which extracts what it lacks; it may skip bad ones."""
+        [features] = cache.local(images, self.extractor, rows)
+        describer = self.describer if isinstance(self.describer, Extractor) else None
+        vectors = None if describer is None else cache.vectors(images, describer, images)
+        bad, size = {*features.bad, *(vectors.bad if vectors else ())}, self.extractor.batch_size
+        used = [row for row in rows if row not in bad]
+        for start in range(0, len(used), size):
+            batch = {row: round_as_stored(local) if cache.root is None else local
+                     for row, local in features.read(used[start : start + size])}  # fmt: skip
+            values = self._vectors([*batch.values()], []) if vectors is None else vectors.values[[*batch]]
+            yield dict(zip(batch, zip(batch.values(), values, strict=True), strict=True))
 
     @property
     def _extractors(self) -> list[Extractor]:
@@ -113,7 +119,7 @@ def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description
     return description
 
 
-def batches(
+def _batches(
     images: ImageFolder, extractor: Extractor, rows: Sequence[int], track: Track
 ) -> Iterator[dict[int, Description]]:
     """Batches of descriptions by row; an image that is not finite raises an InputError, too."""

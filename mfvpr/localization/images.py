@@ -1,5 +1,6 @@
 """The images of a map: names, places and global descriptors in memory, features on demand; and how images are added."""
 
+import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,12 +14,13 @@ from jaxtyping import Bool
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Aggregation, Extractor
 from mfvpr.features.vlad import VladFitting
+from mfvpr.localization.declaration import LEARNING
 from mfvpr.localization.describing import Describing, Image, is_file
 from mfvpr.localization.evidence import MapStrength
 from mfvpr.localization.resident import Resident
 from mfvpr.localization.vectors import Vectors
 from mfvpr.localization.vocabulary import VocabularyFile
-from mfvpr.storage.features import FeatureStore
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.map_entries import Entry, check_entry
 from mfvpr.storage.maps import MapImage, MapRows, has_settings, lock_map, write_settings
 from mfvpr.types import Features
@@ -26,6 +28,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.runtime import Runtime
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -131,25 +134,29 @@ class MapImages:
         return len(self) - before
 
     @exclusive
-    def learn(self, images: ImageFolder, *, track: Track = no_progress) -> None:
-        """Learn the vocabulary from some images, unless the map has one.
-
-        Raises:
-            InputError: images cannot be read, or have too few features, or another process adds.
-        """
+    def learn(self, images: ImageFolder, *, cache: FeatureCache | None = None, track: Track = no_progress) -> None:
+        """Learn the vocabulary from some images, unless the map has one; arguments and errors are those of `build`."""
         if self._described is None:
-            with lock_map(self.folder), self._learning(images, track):
+            with lock_map(self.folder), self._learning(images, cache, track):
                 pass
 
     @exclusive
-    def build(self, images: ImageFolder, places: Sequence[Any] | None = None, *, track: Track = no_progress) -> int:
+    def build(
+        self,
+        images: ImageFolder,
+        places: Sequence[Any] | None = None,
+        *,
+        cache: FeatureCache | None = None,
+        track: Track = no_progress,
+    ) -> int:
         """Add the images whose names the map does not have yet; return how many were added.
 
         Args:
-            images: to add. If the map needs a vocabulary and has none, it is learned from them first; meanwhile the
-                folder takes twice the space.
+            images: to add. If the map needs a vocabulary and has none, it is learned from them first.
             places: of each image, JSON values; None = the names.
-            track: progress.
+            cache: keeps the features, so that images that it knows are not described again. Without one, the folder
+                takes twice the space while a vocabulary is learned.
+            track: progress, without a cache, which has its own.
 
         Raises:
             InputError: an image cannot be read, another process adds, or the disk is full: what was added stays.
@@ -162,19 +169,22 @@ class MapImages:
         self.refresh()
         if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
             return 0
-        with lock_map(self.folder), self._learning(images, track) as features, self._adding() as (described, add):
+        before = len(self)
+        with lock_map(self.folder), self._learning(images, cache, track) as cache, self._adding() as (described, add):
             missing = [row for row, name in enumerate(images.names) if name not in self._row_of_name]
-            if features is None:
-                batches = described.describing.folder(images, missing, track)
-            else:
-                batches = described.describing.stored(features, missing)
-            for batch in batches:
+            before = len(self)
+            describing = described.describing
+            described_images = (
+                describing.folder(images, missing, track) if cache is None
+                else describing.cached(images, missing, cache)
+            )  # fmt: skip
+            for batch in described_images:
                 add([
                     (features, Entry(images.names[row], places[row], vector))
                     for row, (features, vector) in batch.items()
                 ])  # fmt: skip
         self.refresh()
-        return len(missing)
+        return len(self) - before
 
     @exclusive
     def add(self, image: Image, place: Any, *, name: str | None = None) -> None:
@@ -223,15 +233,22 @@ class MapImages:
         self.refresh()
 
     @contextmanager
-    def _learning(self, images: ImageFolder, track: Track) -> Iterator[FeatureStore | None]:
-        """Learn the vocabulary if it is missing, within `lock_map`; yield the features it was learned from, or None."""
+    def _learning(self, images: ImageFolder, cache: FeatureCache | None, track: Track) -> Iterator[FeatureCache | None]:
+        """Learn the vocabulary if it is missing, within `lock_map`; yield the cache with its features, if any."""
         self.refresh()
         if self._described is not None or self._vocabulary is None:
-            yield None
+            yield cache
             return
-        with self._vocabulary.learn(images, self._settings, track) as features:
+        self._declare()
+        temporary = self.folder / LEARNING
+        shutil.rmtree(temporary, ignore_errors=True)  # left by a process that was killed
+        try:
+            cache = cache or FeatureCache(temporary, runtime=Runtime(progress=lambda label: track))
+            self._vocabulary.learn(cache.local(images, self.extractor)[0], self._settings)
             self._use(self._vocabulary.read())
-            yield features
+            yield cache
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
     @contextmanager
     def _adding(self) -> Iterator[tuple[DescribedMap, Callable[[Sequence[MapImage]], None]]]:
@@ -239,9 +256,13 @@ class MapImages:
         described = self._open_parts()
         self.refresh()  # first: nothing of this map goes into one that replaced it
         write_settings(self.folder, self._settings)
+        self._declare()
         with described.rows.adding() as add:
             self.refresh()
             yield described, add
+
+    def _declare(self) -> None:
+        """Write what else the folder of a map holds, before the first image is added."""
 
     def _use(self, describer: Extractor | Aggregation) -> None:
         """Open the rows, which are described by `describer`."""

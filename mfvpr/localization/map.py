@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.datasets.datasets import ImageFolder, folder_dataset, image_folder
 from mfvpr.evaluation.calibration import Confidence
 from mfvpr.evaluation.system import System
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
+from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
+from mfvpr.localization.declaration import check_declaration, read_system, write_declaration
 from mfvpr.localization.describing import Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import MapImages, exclusive
@@ -23,6 +26,7 @@ from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
+from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
@@ -33,11 +37,10 @@ from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 class Map(MapImages):
     """Images with their places in a folder, in which one image at a time is localized.
 
-        sift = Sift()
-        pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
-        known = Map("map", System(pipeline, {"histogram": HistogramOfShifts()}))
-        known.build(images, places)
-        known.localize("query.jpg").place
+        street = Map.create("map", "day/", mfvpr.load_system("mfvpr"))
+        street.calibrate("day/", "night/", ground_truth="order")
+        street.localize("query.jpg").place
+        street = Map.open("map")  # later, and in other processes
 
     Any number of processes read the same folder while one adds to it; they see complete rows only. Any number of
     threads use the same `Map`, which serves one at a time; open another one to localize while `build` runs.
@@ -60,7 +63,7 @@ class Map(MapImages):
                 extractor, or aggregated from the local features by a vocabulary, which is learned once (`learn`, or
                 `build`) and stored in the folder. The ranking that decides may combine scores.
             confidence: gives the probability that the top prediction is correct, as an evaluation with the same system
-                wrote it; None = no probability.
+                wrote it; None = that of `calibrate`, or no probability.
             threshold: of the confidence, below which there is no place.
             runtime: memory that features may take on the device.
 
@@ -68,11 +71,62 @@ class Map(MapImages):
             InputError: a system that a map cannot use, a threshold without a confidence, or a folder with a map that
                 was made with another system.
         """
-        if threshold is not None and confidence is None:
-            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         extractor, describer, candidates = _extractor(system), _describer(system), system.pipeline.candidates
-        self.system, self.confidence, self.threshold = system, confidence, threshold
+        check_declaration(Path(folder), system)
+        self.confidence = confidence or read_confidence(Path(folder), system.headline)
+        if threshold is not None and self.confidence is None:
+            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
+        self.system, self.threshold = system, threshold
         super().__init__(folder, extractor, describer, candidates=int(candidates), memory=runtime.memory)
+
+    @classmethod
+    def open(cls, folder: Path | str, *, threshold: float | None = None, runtime: Runtime = DEFAULT_RUNTIME) -> "Map":
+        """Open a map that `create` or `mfvpr map build` made, with the system and the confidence in its folder.
+
+        Raises:
+            InputError: there is no map, or it was made with a system of your own: `Map(folder, system)` opens it.
+        """
+        return cls(folder, read_system(Path(folder)), threshold=threshold, runtime=runtime)
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path | str,
+        images: ImageFolder | Path | str,
+        system: System,
+        *,
+        places: Sequence[Any] | None = None,
+        cache: FeatureCache | None = None,
+        runtime: Runtime = DEFAULT_RUNTIME,
+    ) -> "Map":
+        """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
+        images = images if isinstance(images, ImageFolder) else image_folder(images)
+        known = cls(folder, system, runtime=runtime)
+        known.build(images, places, cache=cache, track=runtime.progress("images"))
+        return known
+
+    def calibrate(
+        self,
+        database: Path | str,
+        queries: Path | str,
+        *,
+        ground_truth: str = "order",
+        cache: FeatureCache | None = None,
+    ) -> Confidence:
+        """Fit the confidence on a drive, and keep it in the folder of the map.
+
+        It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m.
+
+        Args:
+            database: folder of images along a path, best another than that of the map.
+            queries: folder of images of the drive along this path.
+            ground_truth: see `mfvpr.datasets.folder`.
+            cache: keeps features.
+        """
+        dataset = folder_dataset(database, queries, ground_truth=ground_truth)
+        self.confidence = fit_on_drive(dataset, self.system, cache)
+        write_confidence(self.folder, self.system.headline, self.confidence)
+        return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0) -> Prediction:
         """Find where an image was taken; see `localize_with_evidence`."""
@@ -128,6 +182,9 @@ class Map(MapImages):
             )
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
+    def _declare(self) -> None:
+        write_declaration(self.folder, self.system)
+
     def _rank(
         self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]
     ) -> tuple[Ranked, Ranked]:
@@ -135,7 +192,9 @@ class Map(MapImages):
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        rankings = rank_by_systems(shortlist, padded_scores, self.system.fused, {}, self.system.ties)
+        fused = {name: fusion for name, fusion in self.system.fused.items()
+                 if fusion.system(name) == self.system.headline}  # fmt: skip
+        rankings = rank_by_systems(shortlist, padded_scores, fused, {}, self.system.ties)
         cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 

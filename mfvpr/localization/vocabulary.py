@@ -1,28 +1,21 @@
 """The vocabulary of a map whose global descriptors are VLAD: one file in the folder of the map, learned once."""
 
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Extractor
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.describing import batches
 from mfvpr.storage.disk import disk_errors_as_input_errors
-from mfvpr.storage.features import FeatureStore, open_store, round_as_stored
 from mfvpr.storage.maps import MAP, file_stamp, has_rows, write_settings
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.progress import Track
 
 _VOCABULARY = "vocabulary.npz"
-_LEARNING = "learning"  # the folder of features that a vocabulary is being learned from
 
 
 class VocabularyFile:
@@ -62,26 +55,14 @@ class VocabularyFile:
             raise InputError(f"{self._path}: expected the file that the map was opened with, got one that replaced it, "
                              "or none. Open the map again.")  # fmt: skip
 
-    @contextmanager
-    def learn(self, images: ImageFolder, settings: Mapping[str, Any], track: Track) -> Iterator[FeatureStore]:
+    def learn(self, features: FeatureSet, settings: Mapping[str, Any]) -> None:
         """Learn and write the vocabulary of a map with these settings, within `lock_map`.
 
-        Yields the local features, which are deleted afterwards.
-
         Raises:
-            InputError: images cannot be read or have too few features, or the disk is full.
+            InputError: there are too few features, or the disk is full.
         """
-        folder = self._folder / _LEARNING
-        shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed
-        try:
-            with open_store(folder, settings, num_images=len(images)) as store:
-                for batch in batches(images, self._extractor, range(len(images)), track):
-                    store.write({row: round_as_stored(description.features) for row, description in batch.items()})
-            vocabulary = self._fitting.fit(FeatureSet(store, {}))
-            write_settings(self._folder, settings)
-            with disk_errors_as_input_errors(self._folder, MAP.content):
-                arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
-                write_arrays(self._path, arrays, self._key)
-            yield store
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        vocabulary = self._fitting.fit(features)
+        write_settings(self._folder, settings)
+        with disk_errors_as_input_errors(self._folder, MAP.content):
+            arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
+            write_arrays(self._path, arrays, self._key)

@@ -1,5 +1,8 @@
 __all__ = [
     "FeatureCache",
+    "Recipes",
+    "Vectors",
 ]
 
-from .feature_cache import FeatureCache
+from .feature_cache import FeatureCache, Vectors
+from .recipes import Recipes

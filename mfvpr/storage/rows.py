@@ -37,7 +37,7 @@ Parts = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class RowFormat(Generic[Item]):
-    """What a row holds.
+    """Content of a row.
 
     Attributes:
         kind: of the store.
@@ -127,8 +127,8 @@ class RowStore(Generic[Item]):
         with disk_errors_as_input_errors(self.folder, self.kind.content):
             exists = has_manifest(self.folder, self.kind, self._manifest)
             for folder in filter(Path.is_dir, self._folders if exists else ()):
-                found = filter(None, map(_FILE.fullmatch, os.listdir(folder)))
-                entries |= {match[1]: int(match[2]) for match in found}
+                matches = filter(None, map(_FILE.fullmatch, os.listdir(folder)))
+                entries |= {match[1]: int(match[2]) for match in matches}
         names = map(str, range(next(iter(self.sizes.values())))) if self._keys is None else self._keys
         self.counts = np.fromiter((entries.get(name, -1) for name in names), np.int32)
 

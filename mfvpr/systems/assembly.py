@@ -146,7 +146,7 @@ def system(settings: dict[str, Any], pipeline: Pipeline) -> System:
         fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
     headline = fusing.system(main) if settings["final"] == "combined" else main
     correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
-    return System(pipeline, chosen, fused, correlated, cohort, settings["ties"], headline)
+    return System(pipeline, chosen, fused, correlated, cohort, settings["ties"], headline, settings)
 
 
 def main_scorer(scorers: Mapping[str, Any]) -> str:

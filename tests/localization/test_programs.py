@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,12 +15,13 @@ import pytest
 from PIL import Image
 
 from mfvpr.cli import maps, query_images
-from mfvpr.datasets import read_image
+from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.videos import read_frames
 from mfvpr.evaluation import write_confidences
+from mfvpr.localization import Map
+from mfvpr.localization.declaration import read_declaration
 from mfvpr.storage.maps import lock_map
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
 from tests.programs import ROOT, composed, output_of
@@ -156,7 +158,7 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queri
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["map=/no/such", "images=/no"], "map=/no/such: expected a folder with a map, got none"),
+    (["map=/no/such", "images=/no"], "/no/such: expected a folder with a map, got none"),
     (["map=MAP", "images=/no"], "images=/no: expected an image"),
     (["map=MAP", "images=MAP/settings.json", "watch=true"], "watch=true: expected images=DIR, one folder"),
     (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR"),
@@ -171,8 +173,8 @@ def test_mistakes_are_one_line(folder, call_program, arguments, words):
 
 @pytest.mark.parametrize(("more", "words"), [
     (["features.max_keypoints=50"], "was made with other features"),
-    (["retrieval.whiten=4"], "expected vlad, same or a network"),
-    (["scorer=paper"], "scorer=histogram, got several"),
+    (["retrieval.whiten=4"], "a map retrieves by global descriptors without whitening"),
+    (["scorer=paper"], "was made with other scorer"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
 ])  # fmt: skip
 def test_other_settings_are_refused(folder, small_street, build_map, more, words):
@@ -181,19 +183,14 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
     assert words in stderr
 
 
-def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, monkeypatch):
+def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
     settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    open_map = maps.map_of
-
-    def build_other_first(*arguments):
-        monkeypatch.undo()
-        maps.map_of_settings(settings[1])
-        return open_map(*arguments)
-
-    monkeypatch.setattr(maps, "map_of", build_other_first)
-    with pytest.raises(SettingsError, match="was made with other candidates"):
-        maps.map_of_settings(settings[0])
-    assert maps.read_settings(tmp_path / "map")["candidates"] == 6
+    first, second = map(maps.map_of_settings, settings)
+    images = image_folder(small_street / "database")
+    second.build(images)
+    with pytest.raises(InputError, match="was made with other candidates"):
+        first.build(replace(images, root=small_street, names=("queries/0000.png",)))
+    assert read_declaration(tmp_path / "map")["candidates"] == 6
 
 
 @pytest.mark.slow
@@ -226,7 +223,7 @@ def test_so_many_answers_are_drawn_and_those_without_a_candidate(folder, tmp_pat
 def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_path, localize):
     """Its names are data: of a map that somebody gave away they may say anything."""
     query = small_street / "queries/0004.png"
-    maps.open_map(folder).add(query, "there", name=f"..{query}")
+    Map.open(folder).add(query, "there", name=f"..{query}")
     [line], stderr = localize(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database", code=2)
     assert (line["place"], line["figure"]) == ("there", None)
     warning, error = stderr.splitlines()
@@ -291,11 +288,11 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, build_
     for number, line in enumerate(first):  # nothing of the newest three, nor of itself
         assert all(alternative["row"] < 2 + number - 3 for alternative in line["alternatives"])
     assert values_of("route", first[:2]) == [None, None]  # while the map has three images at most
-    assert maps.open_map(tmp_path / "map").names[2:] == names
+    assert Map.open(tmp_path / "map").names[2:] == names
     again, _ = localize(twice, *settings)
     assert without_seconds(again) == without_seconds(first)
     assert not any(values_of("added", again))
-    assert len(maps.open_map(tmp_path / "map")) == 19
+    assert len(Map.open(tmp_path / "map")) == 19
 
 
 def test_a_drive_that_was_interrupted_goes_on(twice, folder, localize):

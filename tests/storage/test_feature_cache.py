@@ -86,7 +86,7 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk)
 
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_images_are_known_by_their_content(folder, tmp_path, on_disk):
-    """In a part of the folder, under other names, and twice in one folder."""
+    """Take parts of a folder, other names, and an image that is there twice."""
     extractor, cache = Counted(), FeatureCache(tmp_path / "s" if on_disk else None)
     [features] = cache.local(folder, extractor)
     [part] = cache.local(replace(folder, names=folder.names[7:2:-2]), extractor)
@@ -102,7 +102,7 @@ def test_images_are_known_by_their_content(folder, tmp_path, on_disk):
 
 @pytest.mark.parametrize("change", [{"bits": 12}, {"orient": False}])
 def test_other_conversions_give_other_images(tmp_path, change):
-    """Of a 16-bit image, and of one that is turned."""
+    """Take a 16-bit image, and of one that is turned."""
     exif = Image.Exif()
     exif[0x0112] = 3
     noise = np.random.default_rng(0).integers(0, 4096, (120, 160))

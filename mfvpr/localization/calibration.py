@@ -1,0 +1,43 @@
+"""The confidence of a map: fitted on a drive whose places are known, and kept in the folder of the map."""
+
+from pathlib import Path
+
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.datasets.truth import middle
+from mfvpr.evaluation.calibration import (
+    Confidence,
+    confidence_inputs,
+    fit_confidence,
+    read_confidences,
+    write_confidences,
+)
+from mfvpr.evaluation.evaluation import evaluate
+from mfvpr.evaluation.system import System
+from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.utils.errors import InputError
+
+_FILE = "confidence.json"
+TOLERANCES, RADIUS = (1, 2, 5), 25.0  # of the programs: a prediction is correct within 2 frames, or 25 m
+
+
+def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> Confidence:
+    """Evaluate a system on a data set, and fit the confidence of the ranking that decides."""
+    sequence = dataset.only
+    if sequence.truth is None:
+        raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
+    result = evaluate(dataset, system, cache=cache)
+    threshold = middle(sequence.truth.thresholds(tolerances=TOLERANCES, radius=RADIUS))
+    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
+    [positives] = result.positives(threshold)
+    return fit_confidence(confidence_inputs(ranked, by_retrieval), positives.contains(ranked.rows)[:, 0])
+
+
+def write_confidence(folder: Path, name: str, confidence: Confidence) -> None:
+    """Keep the confidence of the ranking that decides in the folder of a map."""
+    write_confidences(folder / _FILE, {name: confidence}, {})
+
+
+def read_confidence(folder: Path, name: str) -> Confidence | None:
+    """The confidence of a map for the ranking that decides; None if it was never calibrated."""
+    return read_confidences(folder / _FILE)[0].get(name) if (folder / _FILE).exists() else None

@@ -1,0 +1,105 @@
+"""A map as a program of one's own makes, opens and calibrates it."""
+
+import json
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import InputError, Map
+from mfvpr.datasets import folder_dataset
+from mfvpr.features import VladFitting
+from mfvpr.storage import FeatureCache
+from tests.builders import map_system
+from tests.storage.extractors import SIFT, Counted
+
+pytestmark = pytest.mark.thorough
+
+SMALL = {"features": {"max_keypoints": 60, "image_size": [160, 120]}, "retrieval": {"num_words": 8}, "candidates": 5}
+
+
+def small(name, **more):
+    """A system by name with SIFT, small and quick."""
+    return mfvpr.load_system(name, **(SMALL | more))
+
+
+@pytest.fixture(scope="module")
+def street(small_street, tmp_path_factory):
+    return Map.create(tmp_path_factory.mktemp("map") / "map", small_street / "database", small("steering"))
+
+
+def test_a_map_is_opened_by_its_folder_alone(street, small_street):
+    again = Map.open(street.folder)
+    query = small_street / "queries/0003.png"
+    assert again.names == street.names
+    assert again.localize(query) == street.localize(query)
+
+
+def test_what_is_there_is_not_added_again(street, small_street):
+    extended = Map.create(street.folder, small_street / "database", street.system)
+    assert len(extended) == len(street) == 10
+
+
+def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
+    features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
+    system = mfvpr.load_system("mfvpr", **features, retrieval={"num_words": 8}, candidates=5)
+    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    result = mfvpr.evaluate(dataset, system, cache=FeatureCache(tmp_path / "cache"))
+    known = Map.create(tmp_path / "map", dataset.database, system)
+    assert system.headline == "histogram + anchor + retrieval"
+    [ranked] = result.systems[system.headline]
+    for row, path in enumerate(dataset.queries.paths):
+        alternatives = known.localize(path).alternatives
+        assert [alternative.row for alternative in alternatives] == ranked.rows[row].tolist()
+        np.testing.assert_allclose([each.score for each in alternatives], ranked.scores[row], rtol=1e-4, atol=1e-4)
+
+
+def test_images_that_a_cache_knows_are_not_described_again(small_street, tmp_path):
+    extractor, cache = Counted(), FeatureCache(tmp_path / "cache")
+    system = map_system(extractor, VladFitting(num_words=8), candidates=5)
+    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    mfvpr.evaluate(dataset, system, cache=cache)
+    seen = extractor.seen
+    known = Map.create(tmp_path / "map", dataset.database, system, cache=cache)
+    assert extractor.seen == seen
+    assert not (tmp_path / "map" / "learning").exists()
+    plain = Map.create(tmp_path / "plain", dataset.database, map_system(SIFT, VladFitting(num_words=8), candidates=5))
+    for path in dataset.queries.paths[:3]:
+        assert known.localize(path) == plain.localize(path)
+
+
+def test_a_system_of_ones_own_opens_its_map(small_street, tmp_path):
+    system = map_system(SIFT, VladFitting(num_words=8), candidates=5)
+    Map.create(tmp_path, small_street / "database", system)
+    with pytest.raises(InputError, match="of a system of your own with `Map"):
+        Map.open(tmp_path)
+    assert len(Map(tmp_path, system)) == 10
+
+
+@pytest.mark.parametrize(
+    "change", [{"format": "mfvpr map 9"}, {"candidates": 0}, {"features": {"name": "no"}}, {"scorer": 3}]
+)
+def test_damaged_settings_are_named(street, tmp_path, change):
+    content = json.loads((street.folder / "settings.json").read_text())
+    (tmp_path / "settings.json").write_text(json.dumps(content | change))
+    with pytest.raises(InputError, match=str(tmp_path)):
+        Map.open(tmp_path)
+
+
+def test_a_folder_of_something_else_is_refused(small_street):
+    with pytest.raises(InputError, match="expected a new or empty folder, or a map"):
+        Map(small_street, small("steering"))
+
+
+def test_a_map_keeps_its_confidence(small_street, tmp_path):
+    known = Map.create(tmp_path, small_street / "database", small("steering"))
+    query = small_street / "queries/0003.png"
+    assert known.localize(query).confidence is None
+    with pytest.raises(InputError, match=r"threshold=0\.5: expected a confidence"):
+        Map.open(tmp_path, threshold=0.5)
+    confidence = known.calibrate(small_street / "database", small_street / "queries")
+    assert known.confidence == confidence
+    prediction = Map.open(tmp_path).localize(query)
+    assert prediction == known.localize(query)
+    assert 0 < prediction.confidence < 1
+    assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
