@@ -54,7 +54,6 @@ LIBRARIES = {
     "hydra": {"cli"},
     "omegaconf": {"cli"},
     "torch": set(),
-    "tqdm": {"cli"},
 }
 
 
