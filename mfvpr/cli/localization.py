@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli import build, confidences, maps
+from mfvpr.cli import build, maps
 from mfvpr.cli.console import tell
 from mfvpr.cli.query_images import images
 from mfvpr.cli.settings import SettingsError
@@ -17,7 +17,6 @@ from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.report.file_names import file_names
-from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
 from mfvpr.utils import InputError, Runtime
 from mfvpr.utils.files import printable
@@ -110,6 +109,8 @@ class _LocalizationFigures:
         self._missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = self._out / f"{file}.png"
+        from mfvpr.report.localizations import localization_figure  # here: Matplotlib takes 0.4 s
+
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)
         except Exception as error:
@@ -130,9 +131,11 @@ class _LocalizationFigures:
 
 def _confidence(settings: Mapping[str, Any]) -> Confidence | None:
     """The confidence of the score that the map was made with."""
-    file = confidences.read_file(settings)
-    if file is None:
+    if settings["confidence"] is None:
         return None
+    from mfvpr.cli import confidences  # here: it imports the reports
+
+    file: Any = confidences.read_file(settings)
     map_settings = maps.read_settings(build.expand_user(settings["map"]))
     name = map_settings["scorer"]["method"]
     if name not in file.systems:
