@@ -54,7 +54,7 @@ def run(config: str) -> None:
             arguments = [override for override in overrides if not override.startswith("launcher=")]
             command = f"{name} {shlex.join(arguments)}"
             job = import_job(job_path)
-            _require_device()
+            _set_up_jax(settings.pop("compiled"))
             with on_interrupt(signal.default_int_handler), in_settings(settings):
                 job(settings | {"multirun": is_multirun, "command": command})
 
@@ -73,10 +73,14 @@ def run(config: str) -> None:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
 
 
-def _require_device() -> None:
-    """Raise a SettingsError if JAX has no device, before anything else happens."""
+def _set_up_jax(compiled: bool) -> None:
+    """Keep compiled programs if `compiled`, and raise a SettingsError if JAX has no device, before any work."""
     import jax
 
+    from mfvpr.utils.compiled_programs import VARIABLE, keep_compiled_programs
+
+    os.environ[VARIABLE] = str(compiled).lower()  # which a map reads as well
+    keep_compiled_programs()
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
