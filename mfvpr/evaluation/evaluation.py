@@ -24,6 +24,7 @@ from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.shards import together
+from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
@@ -38,7 +39,8 @@ def evaluate(
     Args:
         dataset: one database, one or more query sequences.
         system: finds, matches, scores and ranks candidates.
-        cache: where features and matches are kept; None = in memory.
+        cache: where features and matches are kept; None = in memory. With a folder, compiled programs stay on disk as
+            well, see `mfvpr.utils.compiled_programs`.
         runtime: devices, memory, progress and messages; None = those of the cache.
 
     Returns:
@@ -52,6 +54,8 @@ def evaluate(
     """
     watch, cache = Stopwatch(), cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
+    if cache.root is not None:
+        keep_compiled_programs()
     calls = [partial(_score, dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
     of_cohort = [] if system.cohort is None else [partial(_score_cohort, dataset, system, system.cohort, cache, watch)]
     scored: list[Scored] = together(*of_cohort, *calls)
