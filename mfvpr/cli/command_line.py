@@ -1,6 +1,7 @@
 """Turn the command line into checked settings with Hydra, and Hydra's errors into one line."""
 
 import difflib
+import gc
 import os
 import re
 import shlex
@@ -55,7 +56,7 @@ def run(config: str) -> None:
             command = f"{name} {shlex.join(arguments)}"
             job = import_job(job_path)
             _set_up_jax(settings.pop("compiled"))
-            with on_interrupt(signal.default_int_handler), in_settings(settings):
+            with on_interrupt(signal.default_int_handler), in_settings(settings), _frozen_imports():
                 job(settings | {"multirun": is_multirun, "command": command})
 
     name, job_path = PROGRAMS[config]
@@ -90,6 +91,16 @@ def _set_up_jax(compiled: bool) -> None:
         raise SettingsError(
             f"{setting}: expected a device that JAX can use here ({reason}); set JAX_PLATFORMS=cpu"
         ) from error
+
+
+@contextmanager
+def _frozen_imports() -> Iterator[None]:
+    """Spare objects of imported modules from garbage collection: it took an eighth of a short job's time."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 @contextmanager
