@@ -58,7 +58,6 @@ LIBRARIES = {
     "hydra": {"cli"},
     "omegaconf": {"cli"},
     "torch": set(),
-    "tqdm": {"cli"},
 }
 
 

@@ -14,13 +14,10 @@ PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out, **options)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
-    "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
-    "real": "recall of every score on the same matches of real images, time per query (1 round)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
     "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
 }
-OPTIONS = {"stores": "scale", "data": "real"}  # option -> the only benchmark that takes it
 
 
 def main() -> None:
@@ -38,19 +35,17 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--stores", type=Path, help="for scale: folder that keeps its features (default: 6 GB, deleted)"
     )
-    parser.add_argument("--data", type=Path, help="for real: folder with grief_season and corridor")
     parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
-def run(benchmark: str, rounds: int | None, out: Path | None, **options: Path | None) -> None:
+def run(benchmark: str, rounds: int | None, out: Path | None, stores: Path | None) -> None:
     """Run a benchmark with the options that it takes."""
-    paths = {option: path for option, path in options.items() if path}
-    for option in paths:
-        if OPTIONS[option] != benchmark:
-            refuse(f"--{option} is for {OPTIONS[option]} alone; see {PROGRAM} --help")
+    if stores and benchmark != "scale":
+        refuse(f"--stores is for scale alone; see {PROGRAM} --help")
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module = import_module(f"experiments.benchmark.{benchmark}")
-    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **paths)
+    options = {"stores": stores} if stores else {}
+    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **options)
 
 
 def positive_int(text: str) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from experiments.benchmark.harness import write_report
 from experiments.benchmark.synthetic_features import SyntheticSet
 from mfvpr import HistogramOfShifts
-from mfvpr.cli.console import bar
+from mfvpr.cli.console import Progress
 from mfvpr.evaluation import stages
 from mfvpr.features import FeatureSet, FeatureSource, InMemory
 from mfvpr.report import Table
@@ -69,11 +69,11 @@ def run(rounds: int | None, out: Path, stores: Path | None = None) -> None:
         for data in SETS:
             data.stores(root)
         pools = []
-        for data in bar("first queries", len(SETS), SETS):
+        for data in Progress("first queries", len(SETS), SETS):
             pools.append(stack.enter_context(ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))))
             pools[-1].submit(_next_turn, data, root, rounds or ROUNDS, time.monotonic()).result()
         turns = [pool for _ in range(rounds or ROUNDS) for pool in pools]
-        for pool in bar("rounds", len(turns), turns):
+        for pool in Progress("rounds", len(turns), turns):
             pool.submit(_next_turn).result()
         results = {data.title: pool.submit(_next_turn).result() for data, pool in zip(SETS, pools, strict=True)}
     setting = {"queries": SETS[0].queries, "candidates": CANDIDATES, "keypoints": SETS[0].keypoints, "memory": MEMORY}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.cli.console import bar
+from mfvpr.cli.console import Progress
 from mfvpr.storage.features import FeatureStore, forecast_bytes, open_store
 from mfvpr.storage.manifest import store_path
 from mfvpr.storage.rows import require_space
@@ -83,7 +83,7 @@ class SyntheticSet:
             require_space(store.folder, forecast_bytes(len(missing_rows), self.keypoints, self.dimension))
             features = ordered_map(make, missing_rows.tolist(), workers=2)
             batches = np.split(missing_rows, range(BATCH, len(missing_rows), BATCH))
-            for rows in bar(f"{side} of {self.title}", len(batches), batches):
+            for rows in Progress(f"{side} of {self.title}", len(batches), batches):
                 store.write(dict(zip(rows.tolist(), islice(features, len(rows)), strict=True)))
         return store
 

@@ -1,7 +1,7 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,21 +30,35 @@ def paper(settings: dict[str, Any]) -> None:
     places, left_out = systems.places(settings["data"], settings["datasets"])
     lacking = _missing_weights(rows, places[0], settings) if places else {}
     rows = [row for row in rows if row.run not in lacking]
-    left_out = [*left_out, *lacking.values()]
-    if places and rows:
-        names = _names(rows)
-        tell(
-            f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
-            f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
-            f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
-        )
-    for line in left_out:
-        tell(f"left out: {line}")
     if not places or not rows:
+        for line in (*left_out, *lacking.values()):
+            tell(f"left out: {line}")
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
+    _announce(rows, places, settings, left_out, [*lacking])
     out = Path(settings["out"]).expanduser()
     with runs.lock_output(out):
-        _evaluate_and_report(rows, places, settings, out, left_out)
+        _evaluate_and_report(rows, places, settings, out, [*left_out, *lacking.values()])
+
+
+def _announce(
+    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any], missing: Sequence[str],
+    lacking: Sequence[str],
+) -> None:  # fmt: skip
+    """Print the plan, and what is left out in one line; folders that cannot be used have lines of their own."""
+    names, absent = _names(rows), [line for line in missing if systems.ABSENT in line]
+    tell(
+        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
+        f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
+        f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
+    )
+    groups = {
+        f"data sets that are not in {settings['data'] or 'data=DIR'}, see `mfvpr data list`":
+            [line.partition(systems.ABSENT)[0] for line in absent],
+        "evaluations without their weights, see `mfvpr weights list`": lacking,
+    }  # fmt: skip
+    parts = [f"{len(members)} {words} ({', '.join(members)})" for words, members in groups.items() if members]
+    for line in ["; ".join(parts)] * bool(parts) + [line for line in missing if line not in absent]:
+        tell(f"left out: {line}")
 
 
 def _names(rows: Sequence[Row]) -> list[str]:
@@ -65,7 +79,11 @@ def _missing_weights(rows: Sequence[Row], place: Place, settings: Mapping[str, A
 def _evaluate_and_report(
     rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any], out: Path, left_out: Sequence[str]
 ) -> None:
-    datasets, failures = evaluate_all(rows, places, settings)
+    def write_tables(datasets: Mapping[str, Dataset]) -> None:
+        finished = _finished_runs(rows, [place for place in places if place.name in datasets], settings)
+        _write_tables(out, _read_evaluations(rows, datasets, finished))
+
+    datasets, failures = evaluate_all(rows, places, settings, write_tables)
     readable = [place for place in places if place.name in datasets]
     if not readable:
         raise SettingsError(f"nothing was evaluated: {failures[0]}")
@@ -92,9 +110,16 @@ def _evaluate_and_report(
 
 
 def evaluate_all(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]
+    rows: Sequence[Row],
+    places: Sequence[Place],
+    settings: Mapping[str, Any],
+    write_tables: Callable[[Mapping[str, Dataset]], None],
 ) -> tuple[dict[str, Dataset], list[str]]:
-    """Evaluate; return the data sets that could be read, and a line for each evaluation that failed."""
+    """Evaluate, and write tables of the data sets so far after each that has new evaluations.
+
+    Returns:
+        The data sets that could be read, and a line for each evaluation that failed.
+    """
     names = _names(rows)
     total, finished = len(places) * len(names), 0
     datasets: dict[str, Dataset] = {}
@@ -116,7 +141,7 @@ def evaluate_all(
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue
-        datasets[place.name] = dataset
+        datasets[place.name], before = dataset, finished
         for difference in published_differences(dataset):
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names, start=number * len(names) + 1):
@@ -133,6 +158,8 @@ def evaluate_all(
                     continue
             if not (folder / PAGE).is_file():
                 run_folder.report_page(folder)
+        if finished - before < len(names):
+            write_tables(datasets)
     if finished:
         tell(f"{finished} of {total} evaluations were finished before")
     return datasets, failures

@@ -52,6 +52,7 @@ def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str
     composed |= {name: settings[name] for name in _SHARED}
     composed["out"] = str(folder_of(run, place, settings))
     check(composed)
+    del composed["compiled"]  # a setting of this process
     return composed | {"command": f"mfvpr evaluate {' '.join(chosen)}"}
 
 

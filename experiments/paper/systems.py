@@ -18,6 +18,7 @@ from mfvpr.systems.settings import RULES, SettingsError
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
 _SIDES = ("database", "queries")
+ABSENT = ": needs "  # between the name of a data set that is not there, and what it needs
 _POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
 COMBINED = f"histogram + {RETRIEVAL}"
 
@@ -135,16 +136,16 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
             if root and (root / name).is_dir():
                 missing.append(f"{root / name}: the drawn data set has this name; rename the folder")
         elif name in located and name in (*REAL, *PUBLISHED):
-            missing.append(f"{name}: needs another layout than that of names with positions; rename the folder")
+            missing.append(f"{name}: expected another layout than that of names with positions; rename the folder")
         elif name in located and not RULES["dataset.name"].holds(name):
-            missing.append(f"{name}: needs a folder's name of {RULES['dataset.name'].expected}; rename it")
+            missing.append(f"{name}: expected a folder's name of {RULES['dataset.name'].expected}; rename it")
         elif name in located:
             available.append(located[name])
         elif folder := _folder(root, name, located):
             available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={folder}")), folder))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
-            missing.append(f"{name}: needs {data or 'data=DIR'}/{name} {needs}")
+            missing.append(f"{name}{ABSENT}{data or 'data=DIR'}/{name} {needs}")
     return available, missing
 
 

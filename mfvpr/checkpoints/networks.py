@@ -90,7 +90,7 @@ class Blueprint:
         from flax.traverse_util import unflatten_dict
 
         arrays = convert(arrays, _RUNTIME, self.shapes)
-        values = {_keys(path): jax.numpy.asarray(array) for path, array in arrays.items()}
+        values = {_keys(path): jax.device_put(array) for path, array in arrays.items()}
         state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, which the next line changes
         nnx.replace_by_pure_dict(state, unflatten_dict(values))
         module = nnx.merge(self._graph, state)

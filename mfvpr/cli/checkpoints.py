@@ -7,11 +7,10 @@ from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
 
-from tqdm import tqdm
-
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, weights_folder
 from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, read_manifest
 from mfvpr.checkpoints.registry import Entry
+from mfvpr.cli.console import Progress
 from mfvpr.cli.launch import WEIGHTS, how_to_install, refuse, with_command
 from mfvpr.report import Table
 from mfvpr.utils import InputError
@@ -84,11 +83,11 @@ def _fetch(entry: Entry, target: Path) -> None:
             replacing(target) as temporary,
             urlopen(entry.source, timeout=30) as response,
             temporary.open("wb") as file,
-            tqdm(total=entry.size, unit="B", unit_scale=True, desc=entry.file) as bar,
+            Progress(entry.file, entry.size or 0) as progress,
         ):
             while chunk := response.read(_CHUNK):
-                bar.update(file.write(chunk))
-                if entry.size and bar.n > entry.size:
+                progress.update(file.write(chunk))
+                if entry.size and progress.n > entry.size:
                     break  # the hash will differ
             file.flush()
             check_sha256(file_sha256(temporary), entry, entry.source)

@@ -42,8 +42,9 @@ def launch(config: str) -> None:
             print(help_text.help_text(config, sys.argv[1:]))
         else:
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
-            if not os.environ.get("MFVPR_CACHE"):  # empty is unset, or the cache would be the root of the file system
-                os.environ.pop("MFVPR_CACHE", None)
+            for name in ("MFVPR_CACHE", "MFVPR_COMPILED"):  # empty is unset, or / would be the cache
+                if not os.environ.get(name):
+                    os.environ.pop(name, None)
             from mfvpr.cli import command_line
 
             command_line.run(config)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli import confidences
 from mfvpr.cli.console import tell
 from mfvpr.cli.query_images import images
 from mfvpr.datasets import read_image
@@ -17,7 +16,6 @@ from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.localization.declaration import read_declaration, read_system
 from mfvpr.report.file_names import file_names
-from mfvpr.report.localizations import localization_figure
 from mfvpr.storage.maps import Entry
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime
@@ -111,6 +109,8 @@ class _LocalizationFigures:
         self._missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = self._out / f"{file}.png"
+        from mfvpr.report.localizations import localization_figure  # here: Matplotlib takes 0.4 s
+
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)
         except Exception as error:
@@ -131,9 +131,11 @@ class _LocalizationFigures:
 
 def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | None:
     """The confidence that the settings name, of the score that the map was made with."""
-    file = confidences.read_file(settings)
-    if file is None:
+    if settings["confidence"] is None:
         return None
+    from mfvpr.cli import confidences  # here: it imports the reports
+
+    file: Any = confidences.read_file(settings)
     map_settings, name = read_declaration(expand_user(settings["map"])), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]

@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
 
-from tqdm import tqdm
-
 from mfvpr.cli import build, truth
-from mfvpr.cli.console import bar, tell
+from mfvpr.cli.console import Progress, tell
 from mfvpr.datasets import Dataset, QuerySequence
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.published import published_differences
@@ -110,18 +108,8 @@ def recipe(tools: Tools, images: Images) -> dict[str, Any]:
 
 def dataset_of(settings: dict[str, Any]) -> Dataset:
     """The data set, with a progress bar if it must be drawn."""
-    bars: list[tqdm] = []
-
-    def progress(done: int, total: int) -> None:
-        if not bars:
-            bars.append(bar("drawing streets", total))
-        bars[0].update(done - bars[0].n)
-
-    try:
-        return build.dataset(settings, progress)
-    finally:
-        for progress_bar in bars:
-            progress_bar.close()
+    with Progress("drawing streets", 0) as progress:
+        return build.dataset(settings, progress.reach)
 
 
 def _warn_of_reading(images: Images) -> None:

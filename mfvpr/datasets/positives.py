@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its subpackages take 0.2 s, and are imported at their first use
 from jaxtyping import Bool, Int, Integer, Num
-from scipy.sparse import block_diag, csr_array, vstack
-from scipy.spatial import KDTree
 
 from mfvpr.utils.errors import InputError
 
@@ -68,7 +67,7 @@ class Positives:
         matrix = np.asarray(matrix, bool)
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        return cls._from_csr(csr_array(matrix))
+        return cls._from_csr(scipy.sparse.csr_array(matrix))
 
     @classmethod
     def _from_csr(cls, matrix: Any) -> "Positives":
@@ -155,18 +154,18 @@ class Positives:
         if sizes[0] != sizes[1]:
             raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
 
-    def _csr(self) -> csr_array:
+    def _csr(self) -> "scipy.sparse.csr_array":
         return _csr(self.rows, self.offsets, self.num_database)
 
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries and databases of independent data sets."""
-    return Positives._from_csr(block_diag([part._csr() for part in parts], format="csr"))
+    return Positives._from_csr(scipy.sparse.block_diag([part._csr() for part in parts], format="csr"))
 
 
 def stack_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries of the same database."""
-    return Positives._from_csr(vstack([part._csr() for part in parts], format="csr"))
+    return Positives._from_csr(scipy.sparse.vstack([part._csr() for part in parts], format="csr"))
 
 
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
@@ -175,7 +174,7 @@ def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) ->
     if not len(database_xy):
         yield from (np.zeros(0, np.int32) for _ in query_xy)
         return
-    tree = KDTree(database_xy)
+    tree = scipy.spatial.KDTree(database_xy)
     for first in range(0, len(query_xy), _QUERIES_AT_A_TIME):
         block = query_xy[first : first + _QUERIES_AT_A_TIME]
         for rows in tree.query_ball_point(block, radius, return_sorted=True):
@@ -206,8 +205,8 @@ def radius_positives(
     return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
 
 
-def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> csr_array:
-    return csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))
+def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> "scipy.sparse.csr_array":
+    return scipy.sparse.csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))
 
 
 def _offsets(counts: Any) -> np.ndarray:

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 from jaxtyping import Bool, Float
-from scipy import optimize, special
 
 from mfvpr.reranking.results import Ranked
 from mfvpr.utils.errors import InputError
@@ -97,7 +97,7 @@ class Confidence:
     def probability(self, inputs: Float[np.ndarray, "queries inputs"]) -> Float[np.ndarray, " queries"]:
         """Probabilities from inputs; an infinite input counts as its center."""
         centered = (np.where(np.isinf(inputs), self.center, inputs) - self.center) / np.array(self.scale)
-        return special.expit(centered @ np.array(self.weights) + self.bias)
+        return scipy.special.expit(centered @ np.array(self.weights) + self.bias)
 
 
 def fit_confidence(
@@ -131,14 +131,14 @@ def fit_confidence(
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         odds, bias = columns @ weights, weights[0]
         value = np.logaddexp(0, odds).sum() - odds[correct].sum() + penalty @ weights**2 / 2
-        gradient = columns.T @ (special.expit(odds) - correct) + penalty * weights
-        gradient[0] += special.expit(bias) - 0.5
+        gradient = columns.T @ (scipy.special.expit(odds) - correct) + penalty * weights
+        gradient[0] += scipy.special.expit(bias) - 0.5
         return value + np.logaddexp(0, bias) - bias / 2, gradient
 
     bounds = [(None, None), *[(0.0, None)] * values.shape[1]]
     options = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
     start = np.zeros(len(bounds))
-    best = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    best = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     bias, *weights = np.where(np.abs(best) > _LEAST_WEIGHT, best, 0.0).tolist()
     return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 

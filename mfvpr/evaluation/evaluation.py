@@ -22,6 +22,7 @@ from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
 from mfvpr.reranking.fusion import rank_by_systems
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
@@ -36,7 +37,8 @@ def evaluate(
     Args:
         dataset: one database, one or more query sequences.
         system: finds, matches, scores and ranks candidates.
-        cache: where features and matches are kept; None = in memory.
+        cache: where features and matches are kept; None = in memory. With a folder, compiled programs stay on disk as
+            well, see `mfvpr.utils.compiled_programs`.
         runtime: devices, memory, progress and messages; None = those of the cache.
 
     Returns:
@@ -49,6 +51,8 @@ def evaluate(
     """
     watch, cache = Stopwatch(), cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
+    if cache.root is not None:
+        keep_compiled_programs()
     strengths, size = dict[str, np.ndarray](), len(dataset.database)
     if system.cohort is not None:
         cohort, values = _score_cohort(dataset, system, system.cohort, cache, watch)

@@ -5,10 +5,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import UInt8
 
+from mfvpr.datasets.images import resize
+from mfvpr.evaluation import stages
 from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matching.lightglue import LightGlueMatcher
+from mfvpr.matching.match_set import Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher, NearestNeighborMatcher
 from mfvpr.matching.nearest_neighbors import CrossCheck
 from mfvpr.reranking.frame_correlation import FrameCorrelation
@@ -19,6 +24,7 @@ from mfvpr.retrieval.retriever import Retriever
 from mfvpr.scoring.fields import check_bounds
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
+from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 
@@ -122,6 +128,36 @@ class System:
     def headline(self) -> str:
         """Name of the ranking that decides."""
         return self.final or next(iter(self.scorers), RETRIEVAL)
+
+    def warm_up(self, image_size: tuple[int, int]) -> None:
+        """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.
+
+        Programs depend on the number of features in steps, so that other images may compile a few more. A map compiles
+        programs of its own: see `Map.warm_up`.
+
+        Args:
+            image_size: (width, height) px, before images are resized to the size of the extractor.
+
+        Raises:
+            InputError: the extractor does not extract, but reads features.
+        """
+        extractor, candidates = self.pipeline.extractor, self.pipeline.candidates
+        if isinstance(extractor, Source):
+            raise InputError(f"{type(extractor).__name__}: expected an extractor of images, got a reader of features")
+        rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
+        shortlist = Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)
+        image = resize(noise_image(image_size), extractor.image_size, extractor.interpolation)
+        [description] = extractor(image[None])
+        sets = [(FeatureSet.of([scale], unit_length=False), FeatureSet.of([scale] * rows.size, unit_length=False))
+                for scale in description.local]  # fmt: skip
+        matches = tuple(stages.match(*sides, shortlist, self.pipeline.matcher) for sides in sets)
+        weights = tuple(scale.weight for scale in extractor.scales)
+        stages.score(self.scorers, matches[0] if len(matches) == 1 else Scales(matches, weights), shortlist)
+
+
+def noise_image(size: tuple[int, int] = (64, 48)) -> UInt8[np.ndarray, "height width 3"]:
+    """An image of random pixels, (width, height) px, in which every extractor finds features."""
+    return np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
 
 
 def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:

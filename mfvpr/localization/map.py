@@ -12,14 +12,14 @@ import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder, folder_dataset, image_folder
 from mfvpr.evaluation.calibration import Confidence
-from mfvpr.evaluation.system import System
+from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
 from mfvpr.localization.declaration import check_declaration, read_system, write_declaration
-from mfvpr.localization.describing import Image
+from mfvpr.localization.describing import Described, Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
-from mfvpr.localization.images import MapImages, exclusive
+from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.reranking.fusion import rank_by_systems
@@ -28,6 +28,7 @@ from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.types import Shortlist
+from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
 from mfvpr.utils.fingerprints import recipe_of
@@ -44,6 +45,8 @@ class Map(MapImages):
 
     Any number of processes read the same folder while one adds to it; they see complete rows only. Any number of
     threads use the same `Map`, which serves one at a time; open another one to localize while `build` runs.
+
+    Compiled programs stay on disk, see `mfvpr.utils.compiled_programs`: the next process starts fast.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class Map(MapImages):
         if threshold is not None and self.confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.system, self.threshold = system, threshold
+        keep_compiled_programs()
         super().__init__(folder, extractor, describer, candidates=int(candidates), memory=runtime.memory)
 
     @classmethod
@@ -149,18 +153,40 @@ class Map(MapImages):
         """
         recent = _whole_number("recent", recent)
         before = None if before is None else _whole_number("before", before)
+        described = self._refresh_images()
+        description, total = described.describing.image(image), self._vectors.total
+        end = max(0, (total if before is None else min(before, total)) - recent)
+        return self._localize(described, description, end)
+
+    @exclusive
+    def warm_up(self) -> None:
+        """Compile what the first `localize` needs, so that no image of a drive waits for it; the map stays as it is.
+
+        Raises:
+            InputError: the map is empty.
+        """
+        described = self._refresh_images()
+        _, vector = described.describing.image(noise_image())
+        rows, _ = self._vectors.nearest(vector, 1)
+        for _, features in described.rows.features(rows.tolist()):  # its own best candidate: nothing is left out
+            self._localize(described, (features, vector), self._vectors.total)
+
+    def _refresh_images(self) -> DescribedMap:
+        """The parts of a map with images."""
         self.refresh()
         if not len(self) or self._described is None:
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
-        features, vector = description = self._described.describing.image(image)
-        total = self._vectors.total
-        end = max(0, (total if before is None else min(before, total)) - recent)
-        if strength(features) < LEAST_STRENGTH * self._described.strength(end):
+        return self._described
+
+    def _localize(self, described: DescribedMap, description: Described, end: int) -> Localization:
+        """Localize an image that has been described, in the rows before `end`."""
+        features, vector = description
+        if strength(features) < LEAST_STRENGTH * described.strength(end):
             return refusal("too few features", description)
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return refusal("no candidates", description)
-        arrays, slots = self._described.resident.hold(rows.tolist(), features, total)
+        arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
         matcher, scorers = self.system.pipeline.matcher, self.system.scorers
         matches, scores = match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
         ranking, by_retrieval = self._rank(rows, similarities, scores)

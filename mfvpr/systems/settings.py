@@ -36,7 +36,7 @@ RULES: dict[str, Rule] = {
     name: rule
     for names, rule in {
         # choices
-        "widen_index orient multiscale zero_row watch add": one_of(True, False),
+        "widen_index orient multiscale zero_row watch add .compiled": one_of(True, False),
         "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
         "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
         "matching.name": one_of("neighbors", "lightglue"),

@@ -3,9 +3,11 @@ __all__ = [
     "NoGradientError",
     "Runtime",
     "Stopwatch",
+    "keep_compiled_programs",
     "recipe_of",
 ]
 
+from .compiled_programs import keep_compiled_programs
 from .errors import InputError, NoGradientError
 from .fingerprints import recipe_of
 from .progress import Stopwatch

@@ -5,9 +5,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 from jaxtyping import Float
-from scipy.linalg import eigh
-from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
 from mfvpr.utils.errors import InputError
 
@@ -76,13 +75,13 @@ def _largest(products: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]
     """The largest eigenvalues `[number]` of a symmetric matrix, descending, and their vectors in columns."""
     order = len(products)
     if FEW * number < order:  # as exact, and much faster
-        with suppress(ArpackNoConvergence):
+        with suppress(scipy.sparse.linalg.ArpackNoConvergence):
             start = np.random.default_rng(0).normal(size=order)
-            squares, vectors = eigsh(products, k=number, which="LA", v0=start)
+            squares, vectors = scipy.sparse.linalg.eigsh(products, k=number, which="LA", v0=start)
             descending = np.argsort(-squares)
             return squares[descending], vectors[:, descending]
     interval = (order - number, order - 1)
-    squares, vectors = eigh(products, subset_by_index=interval, overwrite_a=True, check_finite=False)
+    squares, vectors = scipy.linalg.eigh(products, subset_by_index=interval, overwrite_a=True, check_finite=False)
     return squares[::-1], vectors[:, ::-1]
 
 

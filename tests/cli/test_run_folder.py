@@ -385,25 +385,43 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
 # --- progress ----------------------------------------------------------------------------------------------------
 
 
-def test_progress_without_a_terminal_is_a_line_per_tenth(capsys):
-    assert list(console.track("matching")(range(234), 234)) == list(range(234))
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.split()[1] for line in lines] == ["0", *(f"{percent}" for percent in range(0, 101, 10))]
-    assert lines[1].startswith("matching               0 %  1 of 234  ")  # says soon how long the rest takes
-    assert lines[6].startswith("matching              50 %  117 of 234  ")
-    assert all(line.endswith(" s left") for line in lines[1:-1])
-    bar = console.bar("drawing", 3)
-    bar.update(3)
-    bar.close()
-    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["0", "100"]
+class Clock:
+    """A clock that its user sets."""
+
+    now = 0.0
+
+    def monotonic(self):
+        return self.now
 
 
-def test_no_progress_is_shown_of_nothing(capsys):
-    assert list(console.track("features")([], 0)) == []
+def count(monkeypatch, label, seconds):
+    """Track items that take some seconds each."""
+    clock = Clock()
+    monkeypatch.setattr(console, "time", clock)
+    for taken in console.track(label)(seconds, len(seconds)):
+        clock.now += taken
+
+
+def test_progress_without_a_terminal_is_a_line_per_ten_seconds(monkeypatch, capsys):
+    count(monkeypatch, "matching", [0.5] * 100)
+    assert capsys.readouterr().err.splitlines() == [
+        "matching               4 %  4 of 100  2 s, about 48 s left",
+        *(f"matching              {2 * seconds} %  {2 * seconds} of 100  {seconds} s, about {50 - seconds} s left"
+          for seconds in range(12, 50, 10)),
+        "matching             100 %  100 of 100  50 s",
+    ]  # fmt: skip
+    count(monkeypatch, "features", [])
+    count(monkeypatch, "features", [0.01] * 199)  # of less than two seconds
     assert capsys.readouterr().err == ""
 
 
-def test_progress_in_a_terminal_is_a_bar(monkeypatch, capsys):
+def test_progress_in_a_terminal_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert list(console.track("matching")(range(9), 9)) == list(range(9))
-    assert "\rmatching            : 100%|" in capsys.readouterr().err
+    count(monkeypatch, "matching", [1.0] * 4)
+    lines = [
+        "matching              50 %  2 of 4  2 s, about 2 s left",
+        "matching              75 %  3 of 4  3 s, about 1 s left",
+    ]
+    assert capsys.readouterr().err == "".join(f"\r\x1b[K{line}" for line in [*lines, ""])
+    console.tell("warning: a line of its own")
+    assert capsys.readouterr().err == "\r\x1b[Kwarning: a line of its own\n"

@@ -10,9 +10,7 @@ import pytest
 from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.checkpoints.networks import NETWORKS, Network
 from mfvpr.checkpoints.tables import SELAVPR
-from mfvpr.features import Sift
 from mfvpr.networks import SelaVpr
-from mfvpr.scoring import MatchCount
 from tests.programs import run
 
 pytestmark = pytest.mark.slow
@@ -133,26 +131,3 @@ def test_help_needs_no_jax():
     assert done.returncode == 0
     assert all(f"{name} " in done.stdout and about in done.stdout for name, about in BENCHMARKS.items())
     assert " jax\n" not in done.stderr
-
-
-def test_all_scores_are_measured_on_the_same_matches(small_street, tmp_path, monkeypatch, capsys):
-    from experiments.benchmark import real
-
-    for name, (database, queries) in real.REAL.items():
-        (tmp_path / name).mkdir()
-        (tmp_path / name / database).symlink_to(small_street / "database")
-        (tmp_path / name / queries).symlink_to(small_street / "queries")
-    assert {"histogram", "anchor", "sum", "count", "homography_8"} <= real.compared_scorers().keys()
-    monkeypatch.setattr(real, "extractors", lambda: {"SIFT": Sift(image_size=(160, 120), max_keypoints=100)})
-    monkeypatch.setattr(real, "compared_scorers", lambda: {"count": MatchCount()})
-    real.run(None, tmp_path / "out.json", tmp_path)
-    tables = json.loads((tmp_path / "out.json").read_text())["tables"]
-    assert [table["matches"] for table in tables] == ["grief_season, SIFT", "corridor, SIFT"]
-    for table in tables:
-        by_score = {row["score"]: row for row in table["rows"]}
-        assert by_score["retrieval"]["ms_per_query"] is None
-        assert by_score["count"]["ms_per_query"] > 0
-        for row in by_score.values():
-            recalls = [row["recall"][str(tolerance)]["recall"] for tolerance in real.TOLERANCES]
-            assert recalls == sorted(recalls)
-    assert "R@1 ±2" in capsys.readouterr().out

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.benchmark.real import SIZE
 from experiments.paper.systems import REAL
 from mfvpr.checkpoints import load_model
 from mfvpr.checkpoints.checkpoint import read_checkpoint
@@ -20,7 +19,7 @@ from mfvpr.features import AlikedFeatures
 from mfvpr.types import Features
 from tests.golden.make_lightglue import as_tensors, public
 
-KEYPOINTS = 160
+SIZE, KEYPOINTS = (336, 336), 160
 QUERIES = (20, 70)  # of each place, with their own database images
 PAIRS = [f"{place}/{query}" for place in REAL for query in QUERIES]
 

@@ -24,7 +24,7 @@ from mfvpr.localization import Map, Prediction
 from mfvpr.localization import matching as map_matching
 from mfvpr.localization.evidence import LEAST_MATCHES, MapStrength
 from mfvpr.localization.resident import Resident
-from mfvpr.retrieval import Retrieval
+from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import maps as map_store
 from mfvpr.storage.map_entries import DEEPEST, check_entry
@@ -32,7 +32,7 @@ from mfvpr.types import Features
 from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
-from tests.programs import ROOT
+from tests.programs import ROOT, snapshot
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
@@ -124,13 +124,30 @@ def test_the_newest_rows_can_be_left_out(dataset, folder):
     assert known.localize(dataset.database.paths[last], recent=last + 1).alternatives == ()
 
 
-def test_nothing_is_compiled_after_the_first_query(dataset, folder, compilations):
-    known = opened(folder)
-    known.localize(dataset.queries.paths[0])
+def test_nothing_is_compiled_after_the_warm_up(dataset, folder, compilations):
+    known, before = opened(folder), snapshot(folder)
+    known.warm_up()
+    assert compilations.count
     compilations.reset()
-    for path in dataset.queries.paths[1:]:
-        known.localize(path)
+    predictions = [known.localize(path) for path in dataset.queries.paths]
     assert compilations.count == 0
+    assert snapshot(folder) == before
+    assert predictions == [opened(folder).localize(path) for path in dataset.queries.paths]
+    with pytest.raises(InputError, match="expected a map with images"):
+        opened(folder.with_name("empty")).warm_up()
+
+
+def test_a_system_warms_up(compilations):
+    system = map_system(SIFT, VLAD, candidates=5)
+    system.warm_up((320, 240))
+    assert compilations.count
+    compilations.reset()
+    system.warm_up((320, 240))
+    replace(system, pipeline=replace(system.pipeline, candidates="all")).warm_up((20, 10))
+    assert compilations.count == 0
+    pipeline = replace(system.pipeline, extractor=FeatureFiles({}))
+    with pytest.raises(InputError, match=r"^FeatureFiles: expected an extractor of images, got a reader of features$"):
+        replace(system, pipeline=pipeline).warm_up((320, 240))
 
 
 def test_unsure_answers_are_no_place(dataset, folder):

@@ -79,8 +79,10 @@ def files(out):
 
 def test_it_names_what_is_left_out_prints_recalls_and_links_every_page(finished, data):
     out, process = finished
-    assert f"left out: gardens_point: needs {data}/gardens_point (http" in process.stderr
-    assert "left out: mix_hist_10: needs d2_tf (d2_tf.pth)" in process.stderr
+    assert process.stderr.splitlines()[1] == (
+        f"left out: 1 data sets that are not in {data}, see `mfvpr data list` (gardens_point); "
+        "1 evaluations without their weights, see `mfvpr weights list` (mix_hist_10)"
+    )
     assert "SIFT-hist 10" in process.stdout
     assert "Mix-hist 10" not in process.stdout
     assert process.stdout.endswith(f"tables and figures: {out}\nreport: {out}/report.html\n")
@@ -89,6 +91,8 @@ def test_it_names_what_is_left_out_prints_recalls_and_links_every_page(finished,
     ]  # fmt: skip
     assert {path.name for path in (out / "figures").iterdir()} >= {"averages.png", "speed.png"}
     page = (out / "report.html").read_text()
+    assert f"{data}/gardens_point (http" in page
+    assert "d2_tf (d2_tf.pth)" in page
     assert re.findall(r'<li><a href="([^"#]+)">', page) == [f"{RUN}/report.html"]
     assert (out / RUN / "report.html").is_file()
     assert "SIFT-hist 10" in page
@@ -141,8 +145,14 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], ["corridor: needs a folder"]))
-    monkeypatch.setattr(program, "evaluate_all", lambda *_: ({place.name: None}, []))
+    def evaluate_all(rows, places, settings, write_tables):
+        write_tables({place.name: None})
+        assert (tmp_path / "out" / "tables" / "recall.csv").exists()  # before the other data sets
+        return {place.name: None}, []
+
+    left_out = ["corridor: needs a folder", "nordland_1415: needs another", "street: expected another layout"]
+    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], left_out))
+    monkeypatch.setattr(program, "evaluate_all", evaluate_all)
     monkeypatch.setattr(program, "paper_tables", lambda _: [("recall", "heading", table)])
     monkeypatch.setattr(program, "measure_times", interrupt)
     with pytest.raises(KeyboardInterrupt):
@@ -150,9 +160,10 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
     assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
     stdout, stderr = capsys.readouterr()
     assert "SIFT" in stdout
-    first, second = stderr.splitlines()
+    first, *rest = stderr.splitlines()
     assert first.startswith("plan: 1 evaluations (sift_10) on each of 1 data sets (streets_seasons), 0 of 1 finished")
-    assert second == "left out: corridor: needs a folder"
+    absent = "2 data sets that are not in data=DIR, see `mfvpr data list` (corridor, nordland_1415)"
+    assert rest == [f"left out: {absent}", "left out: street: expected another layout"]
 
 
 def test_two_do_not_evaluate_into_one_folder(finished, paper):

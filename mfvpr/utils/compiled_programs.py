@@ -1,0 +1,60 @@
+"""Compiled programs that stay on disk between processes, by JAX's persistent compilation cache."""
+
+import math
+import os
+import platform
+import re
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+from mfvpr.utils.errors import require_word
+from mfvpr.utils.versions import versions
+
+VARIABLE = "MFVPR_COMPILED"
+_CPUINFO = Path("/proc/cpuinfo")
+_PROCESSOR = r"^(?:vendor_id|cpu family|model|flags|CPU implementer|CPU part|Features|cpu|isa)\s*:.*$"
+
+
+def keep_compiled_programs() -> None:
+    """Let JAX read compiled programs from disk, and write new ones there, for the rest of this process.
+
+    They lie in a subfolder of `$MFVPR_CACHE/compiled`, by default `~/.cache/mfvpr/compiled`, for each processor and
+    version: they hold machine code for one processor, and the folder may be shared or copied. Delete it at any time.
+    Where it cannot be written, it is only read.
+
+    Does nothing with `MFVPR_COMPILED=false`, or if JAX has a folder of its own (`jax_compilation_cache_dir`) or no
+    compilation cache.
+
+    Raises:
+        InputError: MFVPR_COMPILED is neither `true` nor `false`.
+    """
+    is_on, config = os.environ.get(VARIABLE) or "true", dict[str, Any](jax.config.values)
+    require_word(VARIABLE, is_on, Literal["true", "false"])
+    if is_on == "false" or config["jax_compilation_cache_dir"] or not config["jax_enable_compilation_cache"]:
+        return
+    folder = _folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    seconds = 0.0 if os.access(folder, os.W_OK) else math.inf  # of a compilation, from which on it is written
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
+    compilation_cache.reset_cache()  # JAX looks for a folder once, at the first compilation
+
+
+def _folder() -> Path:
+    """The folder of programs for this processor and these versions."""
+    root = os.path.expanduser(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")
+    packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
+    return Path(root, "compiled", "_".join([*packages, platform.machine(), _processor()]))
+
+
+def _processor() -> str:
+    """A hash of the processor's model and instruction sets; of the machine's name where the system does not say."""
+    lines = re.findall(_PROCESSOR, _CPUINFO.read_text(), re.MULTILINE) if _CPUINFO.exists() else []
+    return sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]

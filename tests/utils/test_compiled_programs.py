@@ -1,0 +1,75 @@
+"""Compiled programs stay on disk between processes, for one processor and version."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mfvpr.utils import InputError, compiled_programs
+from tests.programs import ROOT
+
+PROGRAM = """
+import jax, jax.numpy as jnp
+jnp.zeros(3).sum()  # a user's own program comes first
+from mfvpr.utils.compiled_programs import keep_compiled_programs
+events = []
+jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
+keep_compiled_programs()
+print(jax.jit(lambda x: jnp.cumsum(x) @ x)(jnp.arange(4.0)), events.count('/jax/compilation_cache/cache_hits') > 0)
+print(jax.config.jax_compilation_cache_dir)
+"""
+
+
+def run(cache, **variables):
+    """The printed result, whether programs were read, and JAX's folder, of a new process."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore:Error", "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, check=True,
+        env=environment | {"MFVPR_CACHE": str(cache), "JAX_PLATFORMS": "cpu"} | variables,
+    )  # fmt: skip
+    return done.stdout.split()
+
+
+def test_the_next_process_reads_what_one_has_compiled(tmp_path):
+    result, is_read, folder = run(tmp_path)
+    assert (result, is_read) == ("25.0", "False")
+    assert run(tmp_path) == ["25.0", "True", folder]
+    files = [path for path in (tmp_path / "compiled").rglob("*-cache") if str(path).startswith(folder)]
+    assert files
+    for path in files:
+        path.write_bytes(path.read_bytes()[:100])  # as a process that was killed leaves them
+    assert run(tmp_path) == ["25.0", "False", folder]
+
+
+def test_nothing_is_written_if_the_user_says_so(tmp_path):
+    assert run(tmp_path, MFVPR_COMPILED="false")[1:] == ["False", "None"]
+    assert run(tmp_path, JAX_ENABLE_COMPILATION_CACHE="false")[1:] == ["False", "None"]
+    own = str(tmp_path / "own")
+    assert run(tmp_path, JAX_COMPILATION_CACHE_DIR=own)[1:] == ["False", own]
+    assert not (tmp_path / "compiled").exists()
+
+
+def test_a_folder_that_cannot_be_made_costs_only_the_compilation(tmp_path):
+    (tmp_path / "file").touch()
+    assert run(tmp_path / "file") == ["25.0", "False", "None"]
+
+
+def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path):
+    cpuinfo, folders = tmp_path / "cpuinfo", []
+    monkeypatch.setattr(compiled_programs, "_CPUINFO", cpuinfo)
+    for flags in ("fpu avx2", "fpu avx2 avx512f", "fpu avx2"):
+        cpuinfo.write_text(f"processor: 0\nmodel : 85\ncpu MHz : {len(folders)}\nflags : {flags}\n" * 2)
+        folders.append(compiled_programs._folder())
+    monkeypatch.setattr(compiled_programs, "versions", lambda: dict.fromkeys(["mfvpr", "jax", "jaxlib"], "9.9"))
+    folders.append(compiled_programs._folder())
+    cpuinfo.unlink()  # not on Linux
+    folders.append(compiled_programs._folder())
+    assert folders[0] == folders[2]
+    assert len({*folders}) == 4
+
+
+def test_a_wrong_word_is_an_error(monkeypatch):
+    monkeypatch.setenv("MFVPR_COMPILED", "no")
+    with pytest.raises(InputError, match=r"^MFVPR_COMPILED='no': expected one of true, false$"):
+        compiled_programs.keep_compiled_programs()
