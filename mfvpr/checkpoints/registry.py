@@ -1,7 +1,9 @@
 """Registry of published weights: names, sources, sizes, hashes and licenses. It contains no weights."""
 
 import difflib
-from dataclasses import dataclass
+import re
+import shlex
+from dataclasses import dataclass, replace
 
 from mfvpr.utils.errors import InputError
 
@@ -20,6 +22,7 @@ class Entry:
     weights_license: str
     cite: str
     parameters: int  # without the running statistics of batch normalization
+    like: str | None = None  # weights of one's own: the published entry of the same network
 
     @property
     def license(self) -> str:
@@ -171,6 +174,25 @@ _ENTRIES = (
 # fmt: on
 
 REGISTRY: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
+
+
+OWN = "own/"  # names of weights of one's own begin with it, also in settings and run folders
+
+
+def own_entry(name: str, like: str) -> Entry:
+    """Entry of weights of one's own, for the network of the published weights `like`."""
+    if not re.fullmatch(rf"{OWN}[\w-]+", name):
+        raise InputError(f"{name.removeprefix(OWN)}: expected a name of letters, digits, - and _")
+    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-", "cite": "-"}
+    return replace(entry_of(like), name=name, file="FILE", like=like, **none)
+
+
+def how_to_install(entry: Entry) -> str:
+    """The first command that installs the weights of an entry."""
+    if entry.like is not None:
+        return f"mfvpr weights add FILE --own {entry.name.removeprefix(OWN)} --as {entry.like}"
+    command = f"add {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
+    return f"mfvpr weights {command}"
 
 
 def entry_of(name: str) -> Entry:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr import features
-from mfvpr.checkpoints import REGISTRY, load_model
+from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.cli import console
 from mfvpr.cli.settings import SettingsError
 from mfvpr.datasets import Dataset, folder_dataset, sequences_dataset
@@ -227,7 +227,7 @@ def fusion(settings: dict[str, Any]) -> Fusion:
 
 def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
     """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in REGISTRY.values() if entry.network in names]
+    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
     if weights not in known:
         raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)

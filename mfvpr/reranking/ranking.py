@@ -55,7 +55,7 @@ def check_candidates(matches: Matches) -> None:
 def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array, "*pairs1 2"]]:
     """Sizes of both images, without pairs that have no matches and arbitrary sizes."""
     sizes = matches.image_size0, matches.image_size1
-    if not is_concrete((matches.mask, sizes)):
+    if not is_concrete((matches.mask, sizes)) or any(size is None for size in sizes):
         return sizes
     has_matches = np.any(matches.mask, axis=-1)
     size0, size1 = (np.broadcast_to(size, (*has_matches.shape, 2))[has_matches] for size in sizes)
