@@ -15,7 +15,7 @@ from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
+from mfvpr.utils.numerics import as_array, as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
@@ -222,7 +222,7 @@ def rank(
     Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break`, such as the database
     index. NaN comes after all numbers, masked entries last.
     """
-    return _rank(_in_32_bits(scores), mask, _in_32_bits(tie_break))
+    return _rank(_in_32_bits(as_array(scores)), mask, _in_32_bits(as_array(tie_break)))
 
 
 def _in_32_bits(keys: Array | None) -> Array | None:
@@ -234,7 +234,7 @@ def _in_32_bits(keys: Array | None) -> Array | None:
 
 @compiled
 def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
-    present = jnp.ones(scores.shape, bool) if mask is None else mask
+    present = jnp.ones(scores.shape, bool) if mask is None else mask.astype(bool)
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
     scores = jnp.asarray(scores)
