@@ -141,10 +141,10 @@ class Features:
         Raises:
             InputError: the arrays have different lengths.
         """
-        keypoints = as_array(keypoints)
-        shape = np.shape(keypoints)[:-1]
+        shape = np.shape(keypoints := as_array(keypoints))[:-1]
         scores = np.ones(shape, np.float32) if scores is None else scores
-        return cls(keypoints, descriptors, scores, np.ones(shape, bool) if mask is None else mask, image_size)
+        mask = np.ones(shape, bool) if mask is None else mask
+        return cls(keypoints, *map(as_array, (descriptors, scores, mask, image_size)))
 
 
 def per_keypoint(features: Features) -> dict[str, Array]:

@@ -32,7 +32,8 @@ import numpy as np
 _PARSING = threading.Lock()  # of source: Python 3.11 raises a SystemError if several threads do
 _PLAIN = (bool, int, float, complex, str, bytes)
 _NAMED = (Enum, PurePath, range, slice, np.ufunc, np.dtype)  # known by their `repr`
-_CONSTANTS = (*_PLAIN, *_NAMED, re.Pattern, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
+_CODE = (re.Pattern, BuiltinFunctionType, ModuleType)
+_CONSTANTS = (*_PLAIN, *_NAMED, *_CODE, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
 _SLOTS = (MemberDescriptorType, GetSetDescriptorType)
 
 
