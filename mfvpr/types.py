@@ -77,11 +77,7 @@ def short_repr(self: Any) -> str:
 
 
 def _check_arrays(self: Any) -> None:
-    """Convert arrays of other libraries and masks of integers, and compare shapes: `__post_init__` of data.
-
-    Raises:
-        InputError: an array has not one entry for each of the mask's, or the mask has neither flags nor integers.
-    """
+    """Convert arrays of other libraries and masks of integers; an InputError if shapes do not fit the mask."""
     arrays = {f.name: as_array(getattr(self, f.name)) for f in fields(self)}
     if not hasattr(mask := arrays["mask"], "dtype"):  # no data, but for instance `in_axes` of `vmap`
         return
@@ -96,10 +92,8 @@ def _check_arrays(self: Any) -> None:
         if name.startswith("image_size"):
             expected = (*(mask.shape[:-1] if name == "image_size" else np.shape(values)[:-1]), 2)
         if np.shape(values) != expected:
-            raise InputError(
-                f"{type(self).__name__}.{name}: expected shape {list(expected)}, as the mask is "
-                f"{list(mask.shape)}, got {list(np.shape(values))}; all arrays start with the mask's axes"
-            )
+            raise InputError(f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask "
+                             f"{list(mask.shape)}, got {list(np.shape(values))}")  # fmt: skip
 
 
 @value

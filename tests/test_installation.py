@@ -1,4 +1,4 @@
-"""What users install: the wheel that the source distribution builds, in an environment without this clone."""
+"""Installation: the wheel that the source distribution builds, in an environment without this clone."""
 
 import email
 import json

@@ -172,13 +172,8 @@ def _parse(content: bytes, origin: str) -> dict[str, np.ndarray]:
 
 
 def installed_entry(name: str, folder: Path | None = None) -> Entry:
-    """The entry of published weights, or of installed weights of one's own (`own/<name>`).
-
-    Raises:
-        InputError: the name is unknown.
-    """
-    own = {entry.name: entry for entry in own_entries(folder)}
-    return own.get(name) or entry_of(name)
+    """`entry_of`, also for installed weights of one's own (`own/<name>`)."""
+    return {entry.name: entry for entry in own_entries(folder)}.get(name) or entry_of(name)
 
 
 def own_entries(folder: Path | None = None) -> list[Entry]:

@@ -9,18 +9,9 @@ from urllib.request import urlopen
 
 from tqdm import tqdm
 
-from mfvpr.checkpoints import (
-    REGISTRY,
-    entry_of,
-    how_to_install,
-    install,
-    is_installed,
-    load_model,
-    own_entries,
-    weights_folder,
-)
+from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
 from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, installed_entry, read_manifest
-from mfvpr.checkpoints.registry import Entry
+from mfvpr.checkpoints.registry import Entry, how_to_install
 from mfvpr.cli.launch import refuse
 from mfvpr.report import Table
 from mfvpr.utils import InputError

@@ -37,10 +37,7 @@ def match_and_score(
     Args:
         database: `[S, N, ...]` on the device.
         slots: of the candidates.
-        number: C; beyond n there are no matches.
-
-    Raises:
-        InputError: a scorer has no finite score for any pair.
+        number: C; beyond n there are no matches. If no score is finite, an InputError is raised.
     """
     padded_query = stack_features([query], database.mask.shape[1], total=1)
     size = min(number, _AT_ONCE) if device_bytes(database) is None else number

@@ -4,7 +4,7 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -154,7 +154,7 @@ def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tu
 
 
 def _join_candidates(
-    pairs: Sequence[Pair | None], no_matches: Row, count0: Int[np.ndarray, ""], count1: Int[np.ndarray, " candidates"]
+    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"]
 ) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
     """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]

@@ -18,14 +18,10 @@ from mfvpr.utils.numerics import as_array, compiled, is_concrete
 class Matcher(Protocol):
     """Function of the features of a query and of a candidate, one pair, that returns their Matches.
 
-        @mfvpr.value
-        class Near:
-            limit: float = 0.9
+        def near(features0, features1):
+            return mfvpr.filter_matches(mfvpr.match(features0, features1), max_distance=0.7)
 
-            def __call__(self, features0, features1):
-                return mfvpr.filter_matches(mfvpr.match(features0, features1), max_distance=self.limit)
-
-        pipeline = mfvpr.Pipeline(extractor, retriever, matcher=Near(0.7))
+        pipeline = mfvpr.Pipeline(extractor, retriever, matcher=near)
 
     It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
     included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache

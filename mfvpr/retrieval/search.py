@@ -212,9 +212,6 @@ def retrieve(
         Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor
         that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
         the scores of a query do not depend on the other queries, in any bit.
-
-    Raises:
-        InputError: the mask has another shape.
     """
     shapes = [(len(database_descriptors),), (len(query_descriptors), len(database_descriptors))]
     if mask is not None and mask.shape not in shapes:

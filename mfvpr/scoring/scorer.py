@@ -14,17 +14,13 @@ from mfvpr.utils.errors import InputError
 class Scorer(Protocol):
     """Function of the Matches of ONE pair, slots `[K]`, that returns a score `[]` float32.
 
-        @mfvpr.value
-        class Near:
-            radius: float = 20.0
+        def near(matches):
+            distances = jnp.linalg.norm(mfvpr.match_shifts(matches), axis=-1)
+            return jnp.sum(mfvpr.masked(distances < 20.0, matches.mask)).astype(jnp.float32)
 
-            def __call__(self, matches):
-                shift = jnp.linalg.norm(mfvpr.match_shifts(matches), axis=-1)
-                return jnp.sum(mfvpr.masked(shift < self.radius, matches.mask)).astype(jnp.float32)
-
-        Near()(matches)                               # [] of one pair [K, ...]
-        mfvpr.score_candidates(Near(), matches)       # [C] of pairs [C, K, ...]
-        mfvpr.System(pipeline, {"near": Near(10.0)})  # of a data set, or in a map
+        near(matches)                           # [] of one pair [K, ...]
+        mfvpr.score_candidates(near, matches)   # [C] of pairs [C, K, ...]
+        mfvpr.System(pipeline, {"near": near})  # of a data set, or in a map
 
     A larger score means that both images more likely show the same place. The score is exactly 0 without matches. It
     does not depend on the order of the matches, nor on the amount and content of padding.

@@ -49,10 +49,7 @@ def require_sizes(*image_sizes: Array | None) -> None:
 def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
     """Sizes (width, height) of query and candidate, px.
 
-    An invalid size of a pair without matches is replaced by 1.
-
-    Raises:
-        InputError: the matches have no image sizes.
+    An invalid size of a pair without matches is replaced by 1; unknown sizes raise an `InputError`.
     """
     require_sizes(matches.image_size0, matches.image_size1)
     has_matches = jnp.any(matches.mask)

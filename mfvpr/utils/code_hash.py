@@ -10,20 +10,11 @@ import functools
 import inspect
 import re
 import threading
+import types
 from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import PurePath
-from types import (
-    BuiltinFunctionType,
-    CellType,
-    CodeType,
-    FunctionType,
-    GetSetDescriptorType,
-    MemberDescriptorType,
-    MethodType,
-    ModuleType,
-)
 from typing import Any
 
 import jax
@@ -32,19 +23,13 @@ import numpy as np
 _PARSING = threading.Lock()  # of source: Python 3.11 raises a SystemError if several threads do
 _PLAIN = (bool, int, float, complex, str, bytes)
 _NAMED = (Enum, PurePath, range, slice, np.ufunc, np.dtype)  # known by their `repr`
-_CODE = (re.Pattern, BuiltinFunctionType, ModuleType)
+_CODE = (re.Pattern, types.BuiltinFunctionType, types.ModuleType)
 _CONSTANTS = (*_PLAIN, *_NAMED, *_CODE, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
-_SLOTS = (MemberDescriptorType, GetSetDescriptorType)
+_SLOTS = (types.MemberDescriptorType, types.GetSetDescriptorType)
 
 
 def behavior_of(kind: type, recipe_of: Callable[[Any], Any], seen: tuple[int, ...] = ()) -> list[Any]:
-    """The code of a class without its bases.
-
-    Args:
-        kind: class of a user.
-        recipe_of: returns the JSON values of arrays and of objects with a recipe; a TypeError for all others.
-        seen: ids of what encloses the class.
-    """
+    """The code of a class without its bases; `recipe_of` raises a TypeError for a part without a recipe."""
     attributes = [(name, part) for name, part in sorted(vars(kind).items()) if _counts(name, part)]
     parts = [[name, _part(part, recipe_of, (*seen, id(kind)))] for name, part in attributes]
     return [kind.__qualname__, _text(kind), parts]
@@ -77,7 +62,7 @@ def _functions(part: Any) -> list[Any]:
         return [function for function in (part.fget, part.fset, part.fdel) if function is not None]
     inner = getattr(part, "func", None) if isinstance(part, functools.cached_property) else None
     inner = inner or getattr(part, "__wrapped__", None) or getattr(part, "__func__", None)
-    return [part] if isinstance(part, FunctionType) and inner is None else [inner] if inner is not None else []
+    return [part] if isinstance(part, types.FunctionType) and inner is None else [inner] if inner is not None else []
 
 
 def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> Any:
@@ -87,14 +72,14 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
     def parts(values: Iterable[Any]) -> list[Any]:
         return [_part(value, recipe_of, (*seen, id(part))) for value in values]
 
-    if isinstance(part, FunctionType):
-        closure = [cell.cell_contents for cell in part.__closure__ or () if cell != CellType()]  # an empty cell
+    if isinstance(part, types.FunctionType):
+        closure = [cell.cell_contents for cell in part.__closure__ or () if cell != types.CellType()]  # an empty cell
         return parts([part.__code__, part.__defaults__ or (), part.__kwdefaults__ or {}, *closure])
-    if isinstance(part, CodeType):
+    if isinstance(part, types.CodeType):
         return [part.co_code.hex(), list(part.co_names), list(part.co_varnames), parts(part.co_consts)]
     if isinstance(part, functools.partial):
         return parts([part.func, part.args, part.keywords])
-    if isinstance(part, MethodType):
+    if isinstance(part, types.MethodType):
         return parts([part.__func__, part.__self__])
     if functions := _functions(part):
         return parts(functions)
@@ -110,9 +95,9 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
         return part.__qualname__
     if isinstance(part, re.Pattern):
         return ["Pattern", *parts([part.pattern, part.flags])]
-    if isinstance(part, ModuleType):
+    if isinstance(part, types.ModuleType):
         return ["module", part.__name__]
-    if isinstance(part, BuiltinFunctionType):
+    if isinstance(part, types.BuiltinFunctionType):
         return [part.__qualname__, *parts([part.__self__])]
     if isinstance(part, _SLOTS) or type(part).__module__ in ("typing", "types"):  # annotations, which compute nothing
         return type(part).__qualname__

@@ -82,7 +82,7 @@ def _code(kinds: Iterable[type], of_path: Callable[[PurePath], Any]) -> str:
 
 
 def _additions(value: Any, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
-    """What a user's subclass adds to the class that has the property `recipe`: its code and its fields."""
+    """Code and fields that a user's subclass adds to the class with the property `recipe`."""
     kinds = type(value).__mro__
     owner = next((kind for kind in kinds if "recipe" in vars(kind)), kinds[0])
     if owner is kinds[0] or is_ours(kinds[0]):

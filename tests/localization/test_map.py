@@ -338,7 +338,7 @@ def test_nothing_is_written_of_an_entry_that_is_refused(dataset, tmp_path, name,
 @pytest.mark.parametrize("scorer", [lambda matches: np.nan * matches.distance.sum(), mfvpr.GridAnchors()])
 def test_scores_that_are_never_finite_are_refused(dataset, folder, scorer):
     """The grid's anchors expect as many keypoints as the grid has cells."""
-    with pytest.raises(InputError, match="^it: every score of a pair that has matches is NaN or infinite"):
+    with pytest.raises(InputError, match=r"^it: every score of a pair that has matches is NaN or infinite"):
         opened(folder, scorer=scorer).localize(dataset.queries.paths[0])
 
 
