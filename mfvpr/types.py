@@ -2,7 +2,8 @@
 
 Axis letters: Q queries, C candidates, N keypoints, K match slots, D descriptor dimension. `0` = query, `1` = candidate.
 Points are (x, y) in pixels of the image that the detector saw. `mask` is True on real entries; what padding holds
-never matters, NaN included. Every field may carry leading batch axes. Arrays may be NumPy's or JAX's.
+never matters, NaN included. Every field may carry leading batch axes. Arrays may be NumPy's or JAX's. Features and
+Matches also take lists, arrays of torch and other libraries (DLPack) on any device, and masks of integers.
 """
 
 from collections.abc import Callable
@@ -13,10 +14,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import as_array
+
 if TYPE_CHECKING:
-    Array = Any  # pyright takes neither kind of array for the other
+    Array = Size = CandidateSize = Any  # pyright takes neither kind of array for the other
 else:
     Array = jax.Array | np.ndarray | np.generic  # the host prepares arrays with NumPy, devices compute with JAX
+    Size, CandidateSize = (Num[Array, f"*{axes} 2"] | None for axes in ("batch", "pairs"))
 Class = TypeVar("Class", bound=type)
 
 
@@ -64,22 +69,76 @@ def value(cls: Class) -> Class:
     return data
 
 
+def short_repr(self: Any) -> str:
+    """`__repr__` of a dataclass with types and shapes in place of arrays, without None."""
+    contents = {f.name: getattr(self, f.name) for f in fields(self)}
+    texts = {n: f"{c.dtype}{list(c.shape)}" if hasattr(c, "dtype") else repr(c) for n, c in contents.items()}
+    return f"{type(self).__name__}({', '.join(f'{n}={text}' for n, text in texts.items() if text != 'None')})"
+
+
+def _check_arrays(self: Any) -> None:
+    """Convert arrays of other libraries and masks of integers; an InputError if shapes do not fit the mask."""
+    arrays = {f.name: as_array(getattr(self, f.name)) for f in fields(self)}
+    if not hasattr(mask := arrays["mask"], "dtype"):  # no data, but for instance `in_axes` of `vmap`
+        return
+    if mask.dtype.kind not in "biu":
+        raise InputError(f"{type(self).__name__}.mask: expected True and False, got {mask.dtype}")
+    for name, values in (arrays | {"mask": mask if mask.dtype == bool else mask != 0}).items():
+        object.__setattr__(self, name, values)
+        if values is None or name.startswith("count"):
+            continue
+        last = np.shape(values)[-1:] if name == "descriptors" else (2,) if "points" in name else ()
+        expected = (*mask.shape, *last)
+        if name.startswith("image_size"):
+            expected = (*(mask.shape[:-1] if name == "image_size" else np.shape(values)[:-1]), 2)
+        if np.shape(values) != expected:
+            raise InputError(f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask "
+                             f"{list(mask.shape)}, got {list(np.shape(values))}")  # fmt: skip
+
+
 @value
 class Features:
     """Local features of one image.
+
+        features = Features.of(keypoints, descriptors, image_size=(640, 480))
 
     Attributes:
         keypoints: `[..., N, 2]` (x, y), px.
         descriptors: `[..., N, D]`; this library's networks and RootSIFT have unit length, others may differ.
         scores: `[..., N]` detection scores, larger = better.
-        image_size: `[..., 2]` (width, height), px.
+        mask: `[..., N]`, False on padding.
+        image_size: `[..., 2]` (width, height), px; None = unknown, which scorers that need it refuse.
     """
 
     keypoints: Num[Array, "*batch keypoints 2"]
     descriptors: Num[Array, "*batch keypoints dimensions"]
     scores: Num[Array, "*batch keypoints"]
     mask: Bool[Array, "*batch keypoints"]
-    image_size: Num[Array, "*batch 2"] = field(metadata={"per_image": True})
+    image_size: Size = field(metadata={"per_image": True})
+
+    __post_init__, __repr__ = _check_arrays, short_repr
+
+    @classmethod
+    def of(
+        cls, keypoints: Any, descriptors: Any, *, scores: Any = None, mask: Any = None, image_size: Any = None
+    ) -> "Features":
+        """Features of arrays or lists, NumPy's, JAX's, torch's or of any library with DLPack.
+
+        Args:
+            keypoints: `[..., N, 2]` (x, y), px.
+            descriptors: `[..., N, D]`; the weight 2 - distance expects unit length.
+            scores: `[..., N]`; None = 1 each.
+            mask: `[..., N]`; None = all are keypoints.
+            image_size: `[..., 2]` (width, height), px. None = unknown: the size of the bounding box would change
+                scores, so a scorer that needs the size raises an `InputError`, such as the histogram of shifts.
+
+        Raises:
+            InputError: the arrays have different lengths.
+        """
+        shape = np.shape(keypoints := as_array(keypoints))[:-1]
+        scores = np.ones(shape, np.float32) if scores is None else scores
+        mask = np.ones(shape, bool) if mask is None else mask
+        return cls(keypoints, *map(as_array, (descriptors, scores, mask, image_size)))
 
 
 def per_keypoint(features: Features) -> dict[str, Array]:
@@ -97,8 +156,8 @@ class Matches:
         distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] for unit length.
         scores0: `[..., K]` detection scores in the query.
         scores1: `[..., K]` detection scores in the candidate.
-        image_size0: `[..., 2]` (width, height) of the query, px.
-        image_size1: `[..., 2]` (width, height) of the candidate, px.
+        image_size0: `[..., 2]` (width, height) of the query, px; None = unknown.
+        image_size1: `[..., 2]` (width, height) of the candidate, px; None = unknown.
         ratio: `[..., K]` distance to the nearest descriptor of the candidate over the distance to the second nearest,
             in [0, 1]; None unless the matcher was asked for it (`with_ratio=True`).
         confidence: `[..., K]` in [0, 1], how certain a match is; multiplies its weight. None = 1.
@@ -117,14 +176,16 @@ class Matches:
     scores0: Num[Array, "*batch slots"]
     scores1: Num[Array, "*batch slots"]
     mask: Bool[Array, "*batch slots"]
-    image_size0: Num[Array, "*batch 2"] = field(metadata={"per_pair": True})
-    image_size1: Num[Array, "*pairs 2"] = field(metadata={"per_pair": True})
+    image_size0: Size = field(metadata={"per_pair": True})
+    image_size1: CandidateSize = field(metadata={"per_pair": True})
     ratio: Num[Array, "*batch slots"] | None = None
     confidence: Num[Array, "*batch slots"] | None = None
     index0: Int[Array, "*batch slots"] | None = None
     index1: Int[Array, "*batch slots"] | None = None
     count0: Int[Array, "*batch"] | None = field(default=None, metadata={"per_pair": True})
     count1: Int[Array, "*pairs"] | None = field(default=None, metadata={"per_pair": True})
+
+    __post_init__, __repr__ = _check_arrays, short_repr
 
 
 INDICES = ("index0", "index1")  # integer fields, which take part in no arithmetic
@@ -159,6 +220,8 @@ class Shortlist:
     scores: Float[Array, "queries candidates"]
     mask: Bool[Array, "queries candidates"]
 
+    __repr__ = short_repr
+
 
 @value
 class Ranking:
@@ -171,3 +234,5 @@ class Ranking:
 
     order: Int[Array, "*queries candidates"]
     scores: Float[Array, "*queries candidates"]
+
+    __repr__ = short_repr

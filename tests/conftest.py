@@ -110,7 +110,7 @@ def weights(tmp_path_factory) -> Path:
         source.write_text("not published")
         plan = blueprint(entry)
         arrays = convert(tensors, NETWORKS[name].table, plan.shapes)
-        save(name, arrays, source, parameters=plan.parameters, folder=root)
+        save(entry, arrays, source, parameters=plan.parameters, folder=root)
     return root
 
 

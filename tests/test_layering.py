@@ -9,8 +9,8 @@ import pytest
 ROOT = Path(__file__).parent.parent / "mfvpr"
 # Packages and modules at the root, each with all that it imports of those above it.
 PERMISSIONS = {
-    "types": set(),
     "utils": set(),
+    "types": {"utils"},
     "io": {"types", "utils"},
     "networks": {"types", "utils"},
     "scoring": {"types", "utils"},

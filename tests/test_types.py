@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import FrozenInstanceError, dataclass, field, fields, make_dataclass
+from dataclasses import FrozenInstanceError, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,8 +18,9 @@ from mfvpr.matching import MatchSet
 from mfvpr.tuning.sweeps.settings import group_by_program
 from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair
-from tests.builders import of_query, random_matches
+from tests.builders import make_features, of_query, random_matches
 from tests.programs import ROOT
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -170,3 +171,89 @@ def test_every_field_of_matches_is_of_a_match_or_of_the_pair():
     assert all(len(values) == 8 for values in per_match(matches).values())
     without = mfvpr.Matches(**{f.name: getattr(matches, f.name) for f in fields(matches) if f.name != "ratio"})
     assert "ratio" not in per_match(without)
+
+
+class Tensor:
+    """An array as torch has them: no NumPy with a gradient, no NumPy at all on an accelerator."""
+
+    def __init__(self, values, device=1, requires_grad=True):
+        self.values, self.device, self.requires_grad = np.asarray(values), device, requires_grad
+
+    def detach(self):
+        return Tensor(self.values, self.device, requires_grad=False)
+
+    def cpu(self):
+        return Tensor(self.values, requires_grad=self.requires_grad)
+
+    def __dlpack__(self, **options):
+        if self.requires_grad or self.device != 1:
+            raise BufferError("a gradient, or an accelerator that JAX does not use")
+        return self.values.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.device, 0
+
+
+KINDS = {"library": Tensor, "accelerator": lambda values: Tensor(values, device=2)}
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "torch"])
+def test_arrays_of_other_libraries_give_the_same_numbers(kind):
+    """Also those that require a gradient, are not contiguous, or whose masks are integers."""
+    convert = KINDS.get(kind)
+    if convert is None:
+        torch = pytest.importorskip("torch", reason="torch, of the extra `benchmark`, is not installed")
+        convert = lambda values: torch.tensor(values, requires_grad=values.dtype.kind == "f")  # noqa: E731
+    features = make_features(np.random.default_rng(0), 12, capacity=16)
+    candidates = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), features)
+    entries = [{f.name: getattr(image, f.name) for f in fields(image)} for image in (features, candidates)]
+    with unchecked_shapes():
+        images = [
+            mfvpr.Features.of(**{n: convert(2 * v.astype(np.uint8) if n == "mask" else v) for n, v in image.items()})
+            for image in entries
+        ]
+        matches = mfvpr.match_candidates(*images)
+        arrays = {f.name: getattr(matches, f.name) for f in fields(matches) if getattr(matches, f.name) is not None}
+        again = mfvpr.Matches(**{name: convert(np.asarray(values)) for name, values in arrays.items()})
+        scores = mfvpr.score_candidates(mfvpr.HistogramOfShifts(), again)
+        order = np.asarray(mfvpr.rank(convert(np.asarray(scores))))
+        vectors = convert(features.descriptors[:12])
+        shortlist = mfvpr.retrieve(vectors, vectors, num_candidates=2, mask=convert(np.full(12, 2)))
+        recall = mfvpr.recall_at_k(convert(np.asarray(shortlist.indices)), convert(np.eye(12, dtype=bool)), [1])
+    expected = mfvpr.match_candidates(features, candidates)
+    jax.tree.map(np.testing.assert_array_equal, matches, expected)
+    np.testing.assert_array_equal(scores, mfvpr.score_candidates(mfvpr.HistogramOfShifts(), expected))
+    assert (order.tolist(), recall.tolist()) == (np.argsort(-scores, stable=True).tolist(), [1.0])
+
+
+def test_features_have_defaults_but_no_image_size():
+    """Counts need none; a score that needs one says so, traced or not."""
+    rng = np.random.default_rng(0)
+    [image] = [make_features(rng, 9)]
+    features = mfvpr.Features.of(image.keypoints, image.descriptors)
+    lists = mfvpr.Features.of(image.keypoints.tolist(), image.descriptors.tolist(), image_size=(640, 480))
+    assert (lists.keypoints == features.keypoints).all()
+    assert (features.scores.tolist(), features.mask.all()) == ([1.0] * 9, True)
+    shapes = "keypoints=float32[9, 2], descriptors=float32[9, 16], scores=float32[9], mask=bool[9]"
+    assert repr(features) == f"Features({shapes})"
+    candidates = jax.tree.map(lambda leaf: leaf[None], features)
+    for match in (mfvpr.match_candidates, jax.jit(mfvpr.match_candidates)):
+        matches = match(features, candidates)
+        with unchecked_shapes():
+            assert mfvpr.score_candidates(mfvpr.MatchCount(), matches).tolist() == [9.0]
+        for scorer in (mfvpr.HistogramOfShifts(), mfvpr.AnchorPoints(), mfvpr.Homography()):
+            with unchecked_shapes(), pytest.raises(mfvpr.InputError, match=r"sizes of both images.*Features.of"):
+                mfvpr.score_candidates(scorer, matches)
+
+
+@pytest.mark.parametrize(("name", "shape"), [
+    ("keypoints", (8, 2)), ("keypoints", (2, 9)), ("descriptors", (8, 9)), ("scores", (9, 1)), ("scores", (1,)),
+    ("image_size", ()), ("image_size", (3,)), ("image_size", (1, 2)), ("points0", (1, 2)), ("points1", (9, 3)),
+    ("scores0", (1,)), ("distance", (1,)), ("confidence", (3,)), ("image_size1", (4,)),
+])  # fmt: skip
+def test_arrays_of_different_lengths_are_refused(name, shape):
+    rng = np.random.default_rng(0)
+    data = next(data for data in (make_features(rng, 9), random_matches(rng, 9)) if hasattr(data, name))
+    with unchecked_shapes(), pytest.raises(mfvpr.InputError, match=rf"\.{name}: expected shape .*, got \[") as error:
+        replace(data, **{name: np.ones(shape, np.float32)})
+    assert "\n" not in str(error.value)

@@ -11,9 +11,9 @@ from experiments.paper.figures import paper_figures
 from experiments.paper.pages import write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
+from mfvpr.checkpoints import how_to_install
 from mfvpr.cli import build, run_folder, truth
 from mfvpr.cli.console import tell
-from mfvpr.cli.launch import how_to_install
 from mfvpr.cli.stages import dataset_of
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences

@@ -2,11 +2,13 @@ __all__ = [
     "REGISTRY",
     "WeightsError",
     "entry_of",
+    "how_to_install",
     "install",
     "is_installed",
     "load_model",
+    "own_entries",
     "weights_folder",
 ]
 
-from .files import WeightsError, install, is_installed, load_model, weights_folder
-from .registry import REGISTRY, entry_of
+from .files import WeightsError, install, is_installed, load_model, own_entries, weights_folder
+from .registry import REGISTRY, entry_of, how_to_install

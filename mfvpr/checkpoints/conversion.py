@@ -84,33 +84,37 @@ def convert(
                     problems["of another shape"].append(f"{key}: expected {shape}, got {value.shape}")
             continue
         targets = _targets(key, table)
+        target, layout = targets[0] if targets else ("", Layout.COPY)
         if len(targets) > 1:
             problems["with several rules"].append(excerpt(key))
-            continue
-        if not targets or targets[0][0] not in shapes:
+        elif target not in shapes:
             problems["unknown"].append(excerpt(key))
-            continue
-        target, layout = targets[0]
-        if target in origin:
+        elif target in origin:
             problems["twice"].append(f"{key} and {origin[target]}")
-            continue
-        origin[target] = key
-        if layout.value.first_pixel and value.ndim:
-            value = value[(0,) * (value.ndim - 1)]
-        expected = _source_shape(shapes[target], layout)
-        if _significant_shape(value.shape, layout) != expected:
-            problems["of another shape"].append(f"{key}: expected {expected}, got {value.shape}")
-        elif value.dtype not in (np.float32, np.float64):
-            problems["of another type"].append(f"{key}: expected float32 or float64, got {value.dtype}")
         else:
-            parameters[target] = _to_layout(value.reshape(expected), layout).reshape(shapes[target])
-    for target in shapes:
-        if target not in origin:
-            problems["missing"].append(target)
+            origin[target] = key
+            parameters[target] = _convert_tensor(key, value, layout, shapes[target], problems)
+    problems |= {"missing": missing} if (missing := [target for target in shapes if target not in origin]) else {}
     if problems:
         kinds = (f"{len(examples)} {kind} ({examples[0]})" for kind, examples in problems.items())
         raise InputError(f"keys do not fit the network: {', '.join(kinds)}")
     return parameters
+
+
+def _convert_tensor(
+    key: str, value: np.ndarray, layout: Layout, shape: tuple[int, ...], problems: Mapping[str, list[str]]
+) -> np.ndarray:
+    """The parameter of this shape; a tensor that does not fit is added to the problems."""
+    if layout.value.first_pixel and value.ndim:
+        value = value[(0,) * (value.ndim - 1)]
+    expected = _source_shape(shape, layout)
+    if _significant_shape(value.shape, layout) != expected:
+        problems["of another shape"].append(f"{key}: expected {expected}, got {value.shape}")
+    elif value.dtype not in (np.float32, np.float64):
+        problems["of another type"].append(f"{key}: expected float32 or float64, got {value.dtype}")
+    else:
+        return _to_layout(value.reshape(expected), layout).reshape(shape)
+    return value
 
 
 def known_share(keys: Sequence[str], table: Table) -> float:

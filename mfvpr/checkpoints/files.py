@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,8 +14,8 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.checkpoints.conversion import convert, is_ignored
-from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
-from mfvpr.checkpoints.registry import REGISTRY, Entry, entry_of
+from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint, resemblance
+from mfvpr.checkpoints.registry import OWN, REGISTRY, Entry, entry_of, how_to_install, own_entry
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, write_text
 
@@ -37,17 +38,17 @@ class Manifest:
     source_sha256: str
     format: int = FORMAT
     rounded: int = 0  # tensors of the source that were rounded from float64 to float32
+    like: str = ""  # weights of one's own: the published weights of the same network
 
 
 class WeightsError(InputError):
-    """Weights are not installed, or their file has changed; `entry` is the one to install."""
+    """Weights are not installed, or their file has changed. The message ends with the command that installs them."""
 
     def __init__(self, message: str, entry: Entry) -> None:
         super().__init__(message, entry)
-        self.entry = entry
 
     def __str__(self) -> str:
-        return str(self.args[0])
+        return f"{self.args[0]}: {how_to_install(self.args[1])}"
 
 
 def weights_folder() -> Path:
@@ -55,26 +56,35 @@ def weights_folder() -> Path:
     return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
 
 
-def install(checkpoint: Path, name: str, folder: Path | None = None) -> Path:
-    """Convert an official checkpoint to the runtime file of this name; the checkpoint does not change.
+def install(checkpoint: Path, name: str, folder: Path | None = None, *, own: str | None = None) -> Path:
+    """Convert a checkpoint to a runtime file; the checkpoint does not change.
+
+    Args:
+        checkpoint: the official file, or one with its keys and shapes; a runtime file if the weights are your own.
+        name: of the published weights.
+        folder: `weights_folder()` by default.
+        own: name of weights of your own, for the network of `name`. They are installed as `own/<name>`.
 
     Raises:
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
-    entry = entry_of(name)
-    network = NETWORKS[name]
-    require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
-    check_published(checkpoint, entry)
-    tensors = read_checkpoint(checkpoint)
+    entry = entry_of(name) if own is None else own_entry(f"{OWN}{own}", name)
+    network, is_runtime_file = NETWORKS[name], own is not None and checkpoint.suffix == ".safetensors"
+    if is_runtime_file:
+        network, tensors = network._replace(table=RUNTIME), _parse(checkpoint.read_bytes(), f"{checkpoint}: ")
+    else:
+        require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
+        check_published(checkpoint, entry)
+        tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
     try:
         arrays = convert(tensors, network.table, plan.shapes)
     except InputError as error:
         reason = resemblance(list(tensors), network) or error
-        raise InputError(f"{checkpoint}: {reason}; use the official {entry.file}") from error
+        raise InputError(f"{checkpoint}: {reason}; use the official {entry_of(name).file}") from error
     needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
     rounded = sum(tensor.dtype == np.float64 for tensor in needed)
-    return save(name, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
+    return save(entry, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
@@ -93,11 +103,12 @@ def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
     if sha256 != entry.sha256:
         names = [other.name for other in REGISTRY.values() if other.sha256 == sha256]
         got = f"that of {names[0]}" if names else f"{sha256[:12]}...: damaged, or another file"
+        got += "" if names else "; weights of your own need a name: mfvpr weights add FILE --own NAME"
         raise InputError(f"{origin}: expected the sha256 of {entry.name}, {str(entry.sha256)[:12]}..., got {got}")
 
 
 def save(
-    name: str,
+    entry: Entry,
     arrays: Mapping[str, np.ndarray],
     source: Path,
     *,
@@ -108,16 +119,15 @@ def save(
     """Write the arrays, then the manifest; `load` raises an error for a file without a manifest.
 
     Args:
-        name: name of the registry's entry.
+        entry: of the weights.
         arrays: arrays by dotted path.
         source: the checkpoint of the arrays.
         parameters, rounded: see `Manifest`.
         folder: `weights_folder()` by default.
 
     Raises:
-        InputError: the name is unknown, or values are not finite.
+        InputError: values are not finite.
     """
-    entry = entry_of(name)
     for path, array in arrays.items():
         if not np.isfinite(array).all():
             raise InputError(f"{source}: expected finite values, got NaN or infinity in {path}; use the official file")
@@ -126,8 +136,10 @@ def save(
     with replacing(target) as temporary:
         temporary.write_bytes(content)
     sha256 = hashlib.sha256(content).hexdigest()
-    manifest = Manifest(name, sha256, len(content), parameters, source.name, file_sha256(source), rounded=rounded)
-    write_text(target.with_suffix(".json"), json.dumps(asdict(manifest), indent=1) + "\n")
+    origin = source.name, file_sha256(source)
+    manifest = Manifest(entry.name, sha256, len(content), parameters, *origin, rounded=rounded, like=entry.like or "")
+    values = {name: value for name, value in asdict(manifest).items() if value != ""}
+    write_text(target.with_suffix(".json"), json.dumps(values, indent=1) + "\n")
     return target
 
 
@@ -138,7 +150,7 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
         InputError: the name is unknown.
         WeightsError: the weights are not installed, the manifest is missing or of other weights, or a file is damaged.
     """
-    entry = entry_of(name)
+    entry = installed_entry(name, folder)
     manifest = read_manifest(name, folder)
     path = _path(entry, folder)
     if (size := path.stat().st_size) != manifest.size:
@@ -147,9 +159,30 @@ def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
     if hashlib.sha256(content).hexdigest() != manifest.sha256:
         raise WeightsError(f"{path}: the file has changed since it was written (sha256 differs); {_MEND}", entry)
     try:
+        return _parse(content, f"{path}: ")
+    except InputError as error:
+        raise WeightsError(f"{error}; {_MEND}", entry) from error
+
+
+def _parse(content: bytes, origin: str) -> dict[str, np.ndarray]:
+    try:
         return safetensors.numpy.load(content)
     except (safetensors.SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise WeightsError(f"{path}: expected a safetensors file, got: {error}; {_MEND}", entry) from error
+        raise InputError(f"{origin}expected a safetensors file, got: {error}") from error
+
+
+def installed_entry(name: str, folder: Path | None = None) -> Entry:
+    """`entry_of`, also for installed weights of one's own (`own/<name>`)."""
+    return {entry.name: entry for entry in own_entries(folder)}.get(name) or entry_of(name)
+
+
+def own_entries(folder: Path | None = None) -> list[Entry]:
+    """Entries of the weights of one's own that are installed."""
+    folder, entries = folder or weights_folder(), []
+    for path in sorted(folder.glob(f"{OWN}*.json")):
+        with suppress(OSError, ValueError, LookupError, TypeError):  # damaged: not installed
+            entries.append(own_entry(f"{OWN}{path.stem}", json.loads(path.read_text(encoding="utf-8"))["like"]))
+    return entries
 
 
 def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
@@ -159,7 +192,7 @@ def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
         InputError: the name is unknown.
         WeightsError: as `load`; or the arrays do not fit the network.
     """
-    entry = entry_of(name)
+    entry = installed_entry(name, folder)
     arrays = load(name, folder)
     try:
         return blueprint(entry).build(arrays)
@@ -173,7 +206,7 @@ def read_manifest(name: str, folder: Path | None = None) -> Manifest:
     Raises:
         WeightsError: the weights are not installed, or have no manifest of this name and format.
     """
-    entry = entry_of(name)
+    entry = installed_entry(name, folder)
     path = _path(entry, folder).with_suffix(".json")
     if not path.with_suffix(".safetensors").is_file():
         source = f"{entry.file} from {entry.source} ({entry.license})"

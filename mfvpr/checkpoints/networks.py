@@ -17,7 +17,7 @@ from mfvpr.io.formats.pickles import excerpt
 if TYPE_CHECKING:
     from flax import nnx
 
-_RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
+RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
 
 
 class Network(NamedTuple):
@@ -89,7 +89,7 @@ class Blueprint:
         from flax import nnx
         from flax.traverse_util import unflatten_dict
 
-        arrays = convert(arrays, _RUNTIME, self.shapes)
+        arrays = convert(arrays, RUNTIME, self.shapes)
         values = {_keys(path): jax.device_put(array) for path, array in arrays.items()}
         state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, which the next line changes
         nnx.replace_by_pure_dict(state, unflatten_dict(values))
@@ -114,7 +114,9 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
 
 def blueprint(entry: Entry) -> Blueprint:
     """Blueprint of the entry's network."""
-    return plan_network(NETWORKS[entry.name].builder())  # imports first: tracing would trace the module's constants
+    return plan_network(
+        NETWORKS[entry.like or entry.name].builder()
+    )  # imports first: tracing would trace the module's constants
 
 
 def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:

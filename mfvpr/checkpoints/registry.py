@@ -1,7 +1,9 @@
 """Registry of published weights: names, sources, sizes, hashes and licenses. It contains no weights."""
 
 import difflib
-from dataclasses import dataclass
+import re
+import shlex
+from dataclasses import dataclass, replace
 
 from mfvpr.utils.errors import InputError
 
@@ -20,6 +22,7 @@ class Entry:
     weights_license: str
     cite: str
     parameters: int  # without the running statistics of batch normalization
+    like: str | None = None  # weights of one's own: the published entry of the same network
 
     @property
     def license(self) -> str:
@@ -67,14 +70,13 @@ def _entry(
     source: str,
     parameters: int,
     *,
-    size: int | None = None,
-    sha256: str | None = None,
+    published: tuple[int | None, str | None] = (None, None),
     license: str | None = None,
 ) -> Entry:
-    """Entry with the paper's licenses, or with `license` for both."""
+    """Entry with the paper's licenses, or with `license` for both; size and sha256 if they are published."""
     code_license, weights_license, cite = _PAPERS[network]
     licenses = (license or code_license, license or weights_license)
-    return Entry(name, network, file, source, size, sha256, *licenses, cite, parameters)
+    return Entry(name, network, file, source, *published, *licenses, cite, parameters)
 
 
 def _d2net(name: str) -> Entry:
@@ -90,7 +92,7 @@ def _mixvpr(channels: int, rows: int, drive_id: str, parameters: int) -> Entry:
 def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
     file = f"aliked-{variant}.pth"
     source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{file}"
-    return _entry("aliked", f"aliked-{variant}", file, source, parameters, size=size, sha256=sha256)
+    return _entry("aliked", f"aliked-{variant}", file, source, parameters, published=(size, sha256))
 
 
 def _netvlad(name: str, file: str, source: str, outputs: int | None, license: str | None = None) -> Entry:
@@ -103,7 +105,7 @@ def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) ->
     source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{file}"
     parameters = _netvlad_parameters(16 if training == "mapillary" else 64, outputs)
     name = f"patchnetvlad_{training}_{outputs}"
-    return _entry("patch_netvlad", name, file, source, parameters, size=size, sha256=sha256)
+    return _entry("patch_netvlad", name, file, source, parameters, published=(size, sha256))
 
 
 def _netvlad_parameters(clusters: int, outputs: int | None) -> int:
@@ -146,7 +148,7 @@ _ENTRIES = (
     _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
     _entry("lightglue", "aliked_lightglue", "aliked_lightglue.pth",
            "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth", 11_884_625,
-           size=47_632_827, sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
+           published=(47_632_827, "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503")),
     _entry("ssm", "vgg16_places365", "vgg16_places365.npy", _PLACES365, 12_354_880),
     _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", 4096),
     _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", 4096),
@@ -171,6 +173,25 @@ _ENTRIES = (
 # fmt: on
 
 REGISTRY: dict[str, Entry] = {entry.name: entry for entry in _ENTRIES}
+
+
+OWN = "own/"  # names of weights of one's own begin with it, also in settings and run folders
+
+
+def own_entry(name: str, like: str) -> Entry:
+    """Entry of weights of one's own, for the network of the published weights `like`."""
+    if not re.fullmatch(rf"{OWN}[\w-]+", name):
+        raise InputError(f"{name.removeprefix(OWN)}: expected a name of letters, digits, - and _")
+    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-", "cite": "-"}
+    return replace(entry_of(like), name=name, file="FILE", like=like, **none)
+
+
+def how_to_install(entry: Entry) -> str:
+    """The first command that installs the weights of an entry."""
+    if entry.like is not None:
+        return f"mfvpr weights add FILE --own {entry.name.removeprefix(OWN)} --as {entry.like}"
+    command = f"add {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
+    return f"mfvpr weights {command}"
 
 
 def entry_of(name: str) -> Entry:

@@ -7,11 +7,11 @@ from http.client import HTTPException
 from pathlib import Path
 from urllib.request import urlopen
 
-from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, weights_folder
-from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, read_manifest
-from mfvpr.checkpoints.registry import Entry
+from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
+from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, installed_entry, read_manifest
+from mfvpr.checkpoints.registry import Entry, how_to_install
 from mfvpr.cli.console import Progress
-from mfvpr.cli.launch import WEIGHTS, how_to_install, refuse, with_command
+from mfvpr.cli.launch import refuse
 from mfvpr.report import Table
 from mfvpr.utils import InputError
 from mfvpr.utils.files import replacing
@@ -24,29 +24,32 @@ def list_weights() -> None:
     """Print all checkpoints with licenses and whether they are installed."""
     header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
     rows = []
-    for entry in REGISTRY.values():
+    for entry in (*REGISTRY.values(), *own_entries()):
         installed = "yes" if is_installed(entry) else "no"
         size = f"{entry.size / 1e6:.1f}" if entry.size else "-"
         licenses = (entry.code_license, entry.weights_license)
-        rows.append([entry.name, entry.network, entry.file, *licenses, installed, size])
+        file = f"yours, as {entry.like}" if entry.like else entry.file
+        rows.append([entry.name, entry.network, file, *licenses, installed, size])
     print(Table(header, rows, text_columns=6).text(), end="")
 
 
-def convert(file: Path, name: str | None) -> None:
-    """Install an official checkpoint."""
+def add(file: Path, name: str | None, own: str | None) -> None:
+    """Install an official checkpoint, or weights of one's own."""
     entry = _entry_of(file, name)
     if file.is_file() and (megabytes := file.stat().st_size >> 20) > _LARGE:
         print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
-    path = install(file, entry.name)
-    manifest = read_manifest(entry.name)
+    path = install(file, entry.name, own=own)
+    manifest = read_manifest(entry.name if own is None else f"own/{own}")
     rounded = f", {manifest.rounded} of its tensors rounded from float64 to float32" if manifest.rounded else ""
-    print(f"{path}: {entry.name}, {manifest.parameters:,} parameters{rounded}")
+    origin = "" if entry.sha256 else f", from a file of sha256 {manifest.source_sha256[:12]}..., which nobody published"
+    origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={manifest.name}"
+    print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{rounded}{origin}")
 
 
 def verify(names: Iterable[str]) -> None:
     """Check runtime files against their manifests, and downloaded checkpoints against the published hashes."""
-    entries = [entry_of(name) for name in names]
-    entries = entries or [entry for entry in REGISTRY.values() if any(_present_files(entry))]
+    entries = [installed_entry(name) for name in names]
+    entries = entries or [entry for entry in (*REGISTRY.values(), *own_entries()) if any(_present_files(entry))]
     if not entries:
         print(f"nothing is installed in {weights_folder()}")
     bad = 0
@@ -54,7 +57,7 @@ def verify(names: Iterable[str]) -> None:
         try:
             print(f"{entry.name}: {_verify(entry)}")
         except InputError as error:
-            print(f"{entry.name}: BAD, {with_command(error).removeprefix(f'{entry.name}: ')}")
+            print(f"{entry.name}: BAD, {str(error).removeprefix(f'{entry.name}: ')}")
             bad += 1
     if bad:
         refuse(f"{bad} of {len(entries)} could not be verified")
@@ -74,7 +77,7 @@ def download(name: str) -> None:
     else:
         _fetch(entry, target)
         print(f"{target}: downloaded, with the published hash")
-    print(f"to install it: {WEIGHTS} convert {shlex.quote(str(target))}")
+    print(f"to install it: mfvpr weights add {shlex.quote(str(target))}")
 
 
 def _fetch(entry: Entry, target: Path) -> None:
@@ -127,5 +130,6 @@ def _verify(entry: Entry) -> str:
             raise InputError(f"expected {entry.parameters:,} parameters, got {manifest.parameters:,}")
         checks.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
-            checks.append(f"from a {entry.file} of sha256 {manifest.source_sha256[:12]}..., which nobody published")
+            origin = "is your own" if entry.like else "nobody published"
+            checks.append(f"from a {manifest.source_file} of sha256 {manifest.source_sha256[:12]}..., which {origin}")
     return "good, " + ", ".join(checks)

@@ -8,7 +8,6 @@ import atexit
 import io
 import os
 import pkgutil
-import shlex
 import signal
 import sys
 import threading
@@ -16,14 +15,10 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from mfvpr.systems.settings import SettingsError
 
-if TYPE_CHECKING:  # it imports JAX
-    from mfvpr.checkpoints.registry import Entry
-
-WEIGHTS = "mfvpr weights"
 _INTERRUPTED = "\ninterrupted; nothing half-written was left, and what was finished is kept\n"
 
 
@@ -101,20 +96,7 @@ def one_line() -> Iterator[None]:
 
         if not isinstance(error, InputError):
             raise
-        refuse(with_command(error))
-
-
-def with_command(error: Exception) -> str:
-    """The message; for missing weights also the command that installs them."""
-    from mfvpr.checkpoints import WeightsError
-
-    return f"{error}: {how_to_install(error.entry)}" if isinstance(error, WeightsError) else str(error)
-
-
-def how_to_install(entry: "Entry") -> str:
-    """The first command that installs a checkpoint."""
-    command = f"convert {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
-    return f"{WEIGHTS} {command}"
+        refuse(str(error))
 
 
 def refuse(reason: str) -> NoReturn:

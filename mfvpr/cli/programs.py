@@ -12,7 +12,7 @@ COMMANDS = {
     "learn": "learn match weights and parameters, and compare them with searched ones",
     "map": "build a map for localization, add images to it",
     "localize": "localize images in a map",
-    "weights": "list, download, convert and verify published weights",
+    "weights": "list, download, add and verify weights of networks",
     "data": "list data sets, and check what a folder holds",
     "report": "write the page of a run folder, or of several compared",
 }
@@ -66,10 +66,13 @@ def _add_weights_commands(parser: Parser) -> None:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     command = commands.add_parser("list", help="all known weights, their licenses, and whether they are installed")
     command.set_defaults(run="mfvpr.cli.checkpoints:list_weights")
-    command = commands.add_parser("convert", help="install an official checkpoint")
+    command = commands.add_parser("add", help="install an official checkpoint, or weights of your own")
     command.add_argument("file", metavar="FILE", type=Path, help="a checkpoint under its official name")
     command.add_argument("--as", dest="name", metavar="NAME", help="what FILE is, where it has another name")
-    command.set_defaults(run="mfvpr.cli.checkpoints:convert")
+    command.add_argument(
+        "--own", metavar="NAME", help="your own weights with the official file's keys: weights=own/NAME"
+    )
+    command.set_defaults(run="mfvpr.cli.checkpoints:add")
     command = commands.add_parser("verify", help="check what is installed, byte by byte")
     command.add_argument("names", metavar="NAME", nargs="*", help="by default all that are there")
     command.set_defaults(run="mfvpr.cli.checkpoints:verify")

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.types import Array
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import as_array
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,13 @@ class Tally:
     @classmethod
     def of(cls, order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]) -> "Tally":
         """Count the queries of a ranking; for the arguments see `recall_at_k`."""
-        order = np.asarray(order)
+        order = np.asarray(as_array(order))
+        if order.ndim != 2:
+            raise InputError(f"order: expected database rows [Q, C] of the queries, got shape {list(order.shape)}")
         if order.size == 0:
             return cls(np.zeros(len(ks), int), len(order))
-        correct = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
+        sets = positives if isinstance(positives, Positives) else Positives.from_matrix(np.asarray(as_array(positives)))
+        correct = sets.contains(order)
         return cls(np.array([correct[:, :k].any(axis=1).sum() for k in ks], int), len(order))
 
     def merge(self, other: "Tally") -> "Tally":

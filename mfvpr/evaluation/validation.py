@@ -59,6 +59,13 @@ def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, 
                "scores are 0")  # fmt: skip
 
 
+def require_finite(name: str, scores: np.ndarray) -> None:
+    """Raise an InputError if every score of a scorer is NaN, infinite, or 0, the score of pairs without matches."""
+    if not np.isfinite(scores).all() and not scores[np.isfinite(scores)].any():
+        raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; check what the scorer "
+                         "expects of features and sizes")  # fmt: skip
+
+
 def score_warnings(
     matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
@@ -69,9 +76,7 @@ def score_warnings(
     """
     for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
-        if not np.isfinite(values).all() and not values[np.isfinite(values)].any():
-            raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; check what the "
-                             "scorer expects of features and sizes")  # fmt: skip
+        require_finite(name, values)
     for sequence, systems in zip(matched, ranked, strict=True):
         for name, system in systems.items():
             values = system.scores[system.rows >= 0]

@@ -271,18 +271,15 @@ def without_padding(image: Features) -> Features:
 
 
 def check_features(image: Features, name: str, *, unit_length: bool) -> None:
-    """Check Features `[N, ...]` that come from user code; errors begin with `name`.
+    """Check Features of one image that come from user code; errors begin with `name`.
 
     Raises:
-        InputError: arrays of wrong shapes, or descriptors that are not of unit length if `unit_length`.
+        InputError: arrays of several images, no image size, or descriptors not of unit length if `unit_length`.
     """
-    count, shapes = len(image.mask), [np.shape(values) for values in per_keypoint(image).values()]
-    expected = [(count, 2), (count, *shapes[1][1:]), (count,), (count,)]
-    if shapes != expected or len(shapes[1]) != 2 or np.asarray(image.mask).dtype != bool:
-        raise InputError(
-            f"{name}: expected keypoints [N, 2], descriptors [N, D], scores [N] and mask [N] bool, "
-            f"got shapes {', '.join(map(str, shapes))}; transpose descriptors that are [D, N]"
-        )
+    shapes = np.shape(image.mask), np.shape(image.image_size)
+    if len(shapes[0]) != 1 or shapes[1] != (2,):
+        raise InputError(f"{name}: expected a mask [N] and an image_size [2] of one image, got shapes {shapes[0]} and "
+                         f"{shapes[1]}; see Features.of")  # fmt: skip
     if not unit_length:
         return
     lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)

@@ -18,6 +18,7 @@ from mfvpr.storage.features import round_as_stored
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.numerics import as_array
 from mfvpr.utils.progress import Track, no_progress
 
 Image = Path | str | ArrayLike
@@ -100,7 +101,7 @@ def is_file(image: Image) -> TypeGuard[Path | str]:
 
 def _pixels(image: Any) -> np.ndarray:
     try:
-        pixels = np.asarray(image)
+        pixels = np.asarray(as_array(image))
     except Exception as error:  # other libraries raise any error, torch for tensors with gradients
         reason = " ".join(str(error).split())
         raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {type(image).__name__} ({reason}). "

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mfvpr.evaluation.stages import pair_shifts
+from mfvpr.evaluation.validation import require_finite
 from mfvpr.features.feature_set import stack_features
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import BIN_STEP, score_candidates
@@ -36,7 +37,7 @@ def match_and_score(
     Args:
         database: `[S, N, ...]` on the device.
         slots: of the candidates.
-        number: C; beyond n there are no matches.
+        number: C; beyond n there are no matches. If no score is finite, an InputError is raised.
     """
     padded_query = stack_features([query], database.mask.shape[1], total=1)
     size = min(number, _AT_ONCE) if device_bytes(database) is None else number
@@ -52,7 +53,10 @@ def match_and_score(
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
     parts = list(map_parts(match_part, range(0, len(pairs), size)))
     matches, scores = jax.tree.map(lambda *fields: np.concatenate(fields)[:number], *parts)
-    return matches, {name: values[: len(slots)] for name, values in scores.items()}
+    scores = {name: values[: len(slots)] for name, values in scores.items()}
+    for name, values in scores.items():
+        require_finite(name, values)
+    return matches, scores
 
 
 def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:

@@ -1,7 +1,7 @@
 """Results of localizing an image in a map."""
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 from mfvpr.evaluation.results import Reason
@@ -43,7 +43,7 @@ class Prediction:
     """
 
     place: Any
-    alternatives: tuple[Alternative, ...]
+    alternatives: tuple[Alternative, ...] = field(repr=False)
     score: float
     confidence: float | None
     shift: tuple[float, float] | None

@@ -3,8 +3,8 @@
 import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -89,8 +89,7 @@ def match_queries(
     A thread reads features while the devices work.
 
     Args:
-        queries: Q images.
-        database: M images.
+        queries, database: Q and M images.
         candidates: `[Q, C]` rows of the database.
         todo: rows of the queries to match.
         matcher: of one pair.
@@ -123,9 +122,7 @@ def match_queries(
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
-                matches = _join_candidates(of_query, no_matches)
-                matches = replace(matches, count0=counts0[query].astype(np.int32), count1=keypoints)
-                counts = np.array([0 if pair is None else len(pair.matches["points0"]) for pair in of_query], np.int32)
+                matches, counts = _join_candidates(of_query, no_matches, counts0[query].astype(np.int32), keypoints)
                 yield query, QueryMatches(matches, counts, indices[query], scores[query])
 
 
@@ -156,17 +153,22 @@ def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tu
         yield (query, place), Pair(row, *sizes)
 
 
-def _join_candidates(pairs: Sequence[Pair | None], no_matches: Row) -> Matches:
-    """Matches of all candidates, one after the other; images without a pair have 1 x 1 px."""
+def _join_candidates(
+    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"]
+) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
+    """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]
     rows = ragged.join_rows([pair.matches for pair in matched_pairs] or [no_matches])
     unknown = np.ones(2, np.float32)
-    return Matches(
+    matches = Matches(
         **rows,
         mask=np.ones(len(rows["points0"]), bool),
         image_size0=matched_pairs[0].image_size0 if matched_pairs else unknown,
         image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
+        count0=count0,
+        count1=count1,
     )
+    return matches, np.array([0 if pair is None else len(pair.matches["points0"]) for pair in pairs], np.int32)
 
 
 def _no_matches(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:

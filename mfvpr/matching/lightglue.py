@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mfvpr.matching.nearest_neighbors import at_least_one, distance_ratio, make_matches, ready, slot_numbers
 from mfvpr.matching.similarity import nearest
 from mfvpr.networks.lightglue_assignment import Packed, assignment
-from mfvpr.types import Features, Matches, value
+from mfvpr.types import Features, Matches, short_repr, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
@@ -45,6 +45,8 @@ class LightGlueMatcher:
     filter_threshold: float = 0.1
     depth_confidence: float | None = None
     chunk_size: int | None = field(default=None, metadata={"static": True})
+
+    __repr__ = short_repr
 
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatcher":

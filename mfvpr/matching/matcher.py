@@ -1,26 +1,35 @@
 """Matchers of one pair of images as values, and compiled matching of many pairs."""
 
-from collections.abc import Callable
 from dataclasses import field, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Int
 
-from mfvpr.matching.nearest_neighbors import CrossCheck, filter_matches, match, pairs_at_once
+from mfvpr.matching.nearest_neighbors import CrossCheck, filter_matches, match, pairs_at_once, with_concrete_sizes
 from mfvpr.types import Array, Features, Matches, value
-from mfvpr.utils.numerics import compiled
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import as_array, compiled, is_concrete
 
-Matcher = Callable[[Features, Features], Matches]
-"""Pure function of the features of a query and of a candidate that returns their Matches.
 
-It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
-included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache needs
-its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs that are
-matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
-"""
+class Matcher(Protocol):
+    """Function of the features of a query and of a candidate, one pair, that returns their Matches.
+
+        def near(features0, features1):
+            return mfvpr.filter_matches(mfvpr.match(features0, features1), max_distance=0.7)
+
+        pipeline = mfvpr.Pipeline(extractor, retriever, matcher=near)
+
+    It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
+    included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
+    needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs
+    that are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
+    """
+
+    def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
 
 
 @value
@@ -70,9 +79,28 @@ def match_pairs(
 
     Returns:
         Matches with leading axis P and the slots of the matcher; pairs beyond `count` have no matches.
+
+    Raises:
+        InputError: there are no pairs, or no images in these rows.
     """
+    pairs = as_array(pairs)
+    _require_rows(pairs, queries, candidates)
     chunk_size = pairs_at_once(getattr(matcher, "chunk_size", None), queries, candidates)
-    return _match_pairs(queries, candidates, pairs, count, matcher, chunk_size=min(chunk_size, len(pairs)))
+    matches = _match_pairs(queries, candidates, pairs, count, matcher, chunk_size=min(chunk_size, len(pairs)))
+    if is_concrete(matches.image_size0) or not is_concrete((pairs, queries.image_size, candidates.image_size)):
+        return matches
+    sizes = (np.asarray(side.image_size)[pairs[:, place]] for place, side in enumerate((queries, candidates)))
+    return with_concrete_sizes(matches, *sizes)
+
+
+def _require_rows(pairs: Int[Array, "pairs 2"], queries: Features, candidates: Features) -> None:
+    """Raise an InputError unless the rows of pairs exist; JAX would take the nearest row."""
+    images = len(queries.mask), len(candidates.mask)
+    if np.ndim(pairs) != 2 or not len(pairs) or np.shape(pairs)[1] != 2:
+        raise InputError(f"pairs: expected rows of queries and candidates [P, 2], got shape {np.shape(pairs)}")
+    if is_concrete(pairs) and ((np.asarray(pairs) < 0) | (np.asarray(pairs) >= images)).any():
+        raise InputError(f"pairs: expected rows of {images[0]} queries and {images[1]} candidates, got rows from "
+                         f"{np.min(pairs)} to {np.max(pairs)}")  # fmt: skip
 
 
 @partial(compiled, static_argnames="chunk_size")

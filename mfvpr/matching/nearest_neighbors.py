@@ -17,7 +17,7 @@ from mfvpr.matching.similarity import even_size, nearest, nearest_two
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, masked, safe_sqrt
+from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, is_concrete, masked, safe_sqrt
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
 MEMORY_SHARE = 1 / 256  # of a device's memory, for the similarity matrices that exist at the same time
@@ -85,7 +85,18 @@ def match_candidates(
     chunk_size = pairs_at_once(chunk_size, query, candidates)
     if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # `lax.map` cannot make chunks of them
         chunk_size = 1
-    return _match_candidates(query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size)
+    matches = _match_candidates(
+        query, candidates, cross_check=cross_check, with_ratio=with_ratio, chunk_size=chunk_size
+    )
+    return with_concrete_sizes(matches, query.image_size, candidates.image_size)
+
+
+def with_concrete_sizes(matches: Matches, image_size0: Array, image_size1: Array) -> Matches:
+    """Matches `[P, ...]` with concrete image sizes where a caller's `jit` traces those of the compiled program."""
+    if is_concrete(matches.image_size0) or not is_concrete((image_size0, image_size1)):
+        return matches
+    sizes = (np.broadcast_to(single_size(size), (len(matches.mask), 2)) for size in (image_size0, image_size1))
+    return replace(matches, **dict(zip(("image_size0", "image_size1"), sizes, strict=True)))
 
 
 @partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size"))
@@ -137,7 +148,15 @@ def ready(features: Features) -> Features:
     In half precision, products would decide near-ties in another way, and sums of points would overflow.
     """
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
-    return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=at_least_single(features.image_size))
+    return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=single_size(features.image_size))
+
+
+def single_size(image_size: Array) -> Array:
+    """An image size in at least single precision; a size that is concrete stays so under a caller's `jit`."""
+    if image_size is None or not is_concrete(image_size):
+        return None if image_size is None else at_least_single(image_size)
+    with jax.ensure_compile_time_eval():  # scorers derive their capacities from it
+        return at_least_single(image_size)
 
 
 def make_matches(

@@ -15,7 +15,7 @@ from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
+from mfvpr.utils.numerics import as_array, as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
@@ -55,7 +55,7 @@ def check_candidates(matches: Matches) -> None:
 def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array, "*pairs1 2"]]:
     """Sizes of both images, without pairs that have no matches and arbitrary sizes."""
     sizes = matches.image_size0, matches.image_size1
-    if not is_concrete((matches.mask, sizes)):
+    if not is_concrete((matches.mask, sizes)) or any(size is None for size in sizes):
         return sizes
     has_matches = np.any(matches.mask, axis=-1)
     size0, size1 = (np.broadcast_to(size, (*has_matches.shape, 2))[has_matches] for size in sizes)
@@ -222,7 +222,7 @@ def rank(
     Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break`, such as the database
     index. NaN comes after all numbers, masked entries last.
     """
-    return _rank(_in_32_bits(scores), mask, _in_32_bits(tie_break))
+    return _rank(_in_32_bits(as_array(scores)), mask, _in_32_bits(as_array(tie_break)))
 
 
 def _in_32_bits(keys: Array | None) -> Array | None:
@@ -234,7 +234,7 @@ def _in_32_bits(keys: Array | None) -> Array | None:
 
 @compiled
 def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
-    present = jnp.ones(scores.shape, bool) if mask is None else mask
+    present = jnp.ones(scores.shape, bool) if mask is None else mask.astype(bool)
     number = present & ~jnp.isnan(scores)
     group = jnp.where(present, jnp.where(number, 0, 1), 2)
     scores = jnp.asarray(scores)

@@ -213,10 +213,13 @@ def retrieve(
         that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
         the scores of a query do not depend on the other queries, in any bit.
     """
+    shapes = [(len(database_descriptors),), (len(query_descriptors), len(database_descriptors))]
+    if mask is not None and mask.shape not in shapes:
+        raise InputError(f"mask: expected shape {shapes[0]} or {shapes[1]}, got {mask.shape}")
     queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
     similarity = jnp.matmul(_at_least_two(queries), _at_least_two(database).T, precision=jax.lax.Precision.HIGHEST)
     similarity = similarity[: len(queries), : len(database)]
-    usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask)
+    usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask.astype(bool))
     depth = min(num_candidates, database_descriptors.shape[0])
     scores, indices = jax.lax.top_k(masked(similarity, usable, -jnp.inf), depth)
     padding = ((0, 0), (0, num_candidates - depth))

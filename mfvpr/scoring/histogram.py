@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Num
 
 from mfvpr.scoring.fields import ANY, SCORE, check_choices, choice, flag, integer, number, numbers, table_value
 from mfvpr.scoring.lattice import Lattice, bin_scores, climb, map_rows, pool_bins, smooth_tallest, tallest, votes
-from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, where_usable
+from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, require_sizes, where_usable
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_weights
@@ -199,6 +199,7 @@ class HistogramOfShifts:
         Raises:
             InputError: see `with_capacity`, or `max_bins` is too small.
         """
+        require_sizes(image_size0, image_size1)
         if not is_concrete((self.bin_size, self.shift_range, image_size0, image_size1)):
             return self
         if self.max_bins is None:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring import planes, quads
 from mfvpr.scoring.fields import check_choices, choice, flag, integer, number
-from mfvpr.scoring.shifts import query_features
+from mfvpr.scoring.shifts import query_features, require_sizes
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
@@ -86,6 +86,7 @@ class Homography:
         real = counts > 0
         if len(real) == 0:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
+        require_sizes(matches.image_size0, matches.image_size1)
         frame = planes.Frame.of(
             *(jnp.asarray(size, points.dtype) for size in (matches.image_size1, matches.image_size0))
         )

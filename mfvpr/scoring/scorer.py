@@ -1,7 +1,6 @@
 """The contract of a scorer: matches of one pair -> a score."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +10,31 @@ from jaxtyping import Float
 from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
 
-Scorer = Callable[[Matches], Array]
-"""Function of the Matches of ONE pair, slots `[K]`, that returns a score `[]` float32.
 
-A larger score means that both images more likely show the same place. The score is exactly 0 without matches. It does
-not depend on the order of the matches, nor on the amount and content of padding.
+class Scorer(Protocol):
+    """Function of the Matches of ONE pair, slots `[K]`, that returns a score `[]` float32.
 
-Any callable is a scorer. A class decorated with `mfvpr.value` can do more than a plain function: its numbers may be
-swept, traced and learned, and its compiled programs are reused. A class registered with
-`jax.tree_util.register_dataclass` can do the same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer`
-checks this contract.
+        def near(matches):
+            distances = jnp.linalg.norm(mfvpr.match_shifts(matches), axis=-1)
+            return jnp.sum(mfvpr.masked(distances < 20.0, matches.mask)).astype(jnp.float32)
 
-A scorer that JAX cannot compile, for instance of another library, also has a method `score_pairs(matches) -> [P]` that
-takes pairs `[P, K, ...]` and returns NumPy; it is called outside of `jit`. The class of such a scorer is a value.
-"""
+        near(matches)                           # [] of one pair [K, ...]
+        mfvpr.score_candidates(near, matches)   # [C] of pairs [C, K, ...]
+        mfvpr.System(pipeline, {"near": near})  # of a data set, or in a map
+
+    A larger score means that both images more likely show the same place. The score is exactly 0 without matches. It
+    does not depend on the order of the matches, nor on the amount and content of padding.
+
+    Any callable is a scorer. A class decorated with `mfvpr.value` can do more than a plain function: its numbers may be
+    swept, traced and learned, and its compiled programs are reused. A class registered with
+    `jax.tree_util.register_dataclass` can do the same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer`
+    checks this contract.
+
+    A scorer that JAX cannot compile, for instance of another library, also has a method `score_pairs(matches) -> [P]`
+    that takes pairs `[P, K, ...]` and returns NumPy; it is called outside of `jit`. Its class is a value.
+    """
+
+    def __call__(self, matches: Matches, /) -> Array: ...
 
 
 def on_host(scorer: Any) -> bool:

@@ -27,6 +27,7 @@ def compensate_scale(matches: Matches, scale: float) -> Matches:
     """
     if scale == 1:
         return matches
+    require_sizes(matches.image_size0, matches.image_size1)
     root = math.sqrt(scale)
     points0 = _scale_about_center(matches.points0, matches.image_size0, root)
     points1 = _scale_about_center(matches.points1, matches.image_size1, 1 / root)
@@ -38,11 +39,19 @@ def _scale_about_center(points: Array, image_size: Array, factor: float) -> Floa
     return center + factor * (at_least_single(points) - center)
 
 
+def require_sizes(*image_sizes: Array | None) -> None:
+    """Raise an InputError if the sizes of images are not known."""
+    if any(size is None for size in image_sizes):
+        raise InputError("image_size: expected the sizes of both images, which this score needs, got None; give "
+                         "Features.of(..., image_size=(width, height))")  # fmt: skip
+
+
 def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
     """Sizes (width, height) of query and candidate, px.
 
-    An invalid size of a pair without matches is replaced by 1.
+    An invalid size of a pair without matches is replaced by 1; unknown sizes raise an `InputError`.
     """
+    require_sizes(matches.image_size0, matches.image_size1)
     has_matches = jnp.any(matches.mask)
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
     usable = lambda size: has_matches | ((size > 0) & jnp.isfinite(size))  # noqa: E731

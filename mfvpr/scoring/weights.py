@@ -3,8 +3,8 @@
 Weights of padding are arbitrary; scorers use `match_weights`, where they are 0.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,20 @@ from mfvpr.types import INDICES, Array, Matches, per_match, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float, at_least_single, masked
 
-Weight = Callable[[Matches], Array]
+
+class Weight(Protocol):
+    """Function of the Matches of ONE pair, slots `[K]`, that returns the weights `[K]` of its matches.
+
+        def near(matches):
+            return 1 / (1 + matches.distance)
+
+        mfvpr.HistogramOfShifts(weight=near)
+        mfvpr.match_weights(near, matches)  # times the matches' confidence, and 0 on padding, as scorers use it
+
+    Weights of padding are arbitrary. A class decorated with `mfvpr.value` can be swept and learned, as a scorer can.
+    """
+
+    def __call__(self, matches: Matches, /) -> Array: ...
 
 
 @value

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr import features
-from mfvpr.checkpoints import REGISTRY, load_model
+from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
@@ -163,7 +163,7 @@ def fusion(settings: dict[str, Any]) -> Fusion:
 
 def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
     """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in REGISTRY.values() if entry.network in names]
+    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
     if weights not in known:
         raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)

@@ -9,7 +9,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import PurePath
 from typing import Any
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.utils.code_hash import behavior_of
+from mfvpr.utils.code_hash import behavior_of, is_ours
 
 _ABSENT = object()
 _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions: another one in every process
@@ -42,8 +42,8 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     value = value.item() if isinstance(value, np.number) else value
     if value is None or isinstance(value, bool | int | float | str):
         return value if not isinstance(value, float) or math.isfinite(value) else str(value)
-    if not isinstance(value, type) and hasattr(value, "recipe"):
-        return {"class": _name(type(value)), "recipe": recipe_of(value.recipe, of_path)}
+    if not isinstance(value, type) and hasattr(value, "recipe") and "recipe" not in _field_names(type(value)):
+        return {"class": _name(type(value)), "recipe": recipe_of(value.recipe, of_path)} | _additions(value, of_path)
     if is_dataclass(value) and not isinstance(value, type):
         parts = {f.name: getattr(value, f.name) for f in fields(value) if f.metadata.get("recipe", True)}
         return _class(type(value), of_path) | recipe_of(parts, of_path)
@@ -63,22 +63,37 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
 
 def _name(kind: type) -> str:
     """The name of a class; of ours without the module, which may change, and as it was first in a recipe."""
-    if _is_ours(kind):
+    if is_ours(kind):
         return getattr(kind, "recipe_name", kind.__qualname__)
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _class(kind: type, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
     """The recipe of a class: its name, and its code unless the class is ours."""
-    if _is_ours(kind):
+    if is_ours(kind):
         return {"class": _name(kind)}
-    bases = [base for base in kind.__mro__ if not _is_ours(base) and base is not object]
-    code = [behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases]
-    return {"class": _name(kind), "code": fingerprint(code)}
+    return {"class": _name(kind), "code": _code(kind.__mro__, of_path)}
 
 
-def _is_ours(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+def _code(kinds: Iterable[type], of_path: Callable[[PurePath], Any]) -> str:
+    """Fingerprint of the code of users' classes; ours are left out."""
+    bases = [base for base in kinds if not is_ours(base) and base is not object]
+    return fingerprint([behavior_of(base, lambda part: recipe_of(part, of_path)) for base in bases])
+
+
+def _additions(value: Any, of_path: Callable[[PurePath], Any]) -> dict[str, Any]:
+    """Code and fields that a user's subclass adds to the class with the property `recipe`."""
+    kinds = type(value).__mro__
+    owner = next((kind for kind in kinds if "recipe" in vars(kind)), kinds[0])
+    if owner is kinds[0] or is_ours(kinds[0]):
+        return {}
+    own_fields = _field_names(kinds[0]) - _field_names(owner)
+    parts = recipe_of({name: getattr(value, name) for name in sorted(own_fields)}, of_path)
+    return {"code": _code(kinds[: kinds.index(owner)], of_path), "fields": parts}
+
+
+def _field_names(kind: type) -> set[str]:
+    return {field.name for field in fields(kind)} if is_dataclass(kind) else set()
 
 
 def fingerprint(recipe: Any) -> str:

@@ -26,6 +26,8 @@ else:
     Device = jax.Device
     Array = jax.Array | np.ndarray | np.generic
 
+_HOST = 1  # DLPack's number of the processor
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 Tree = TypeVar("Tree")
 
@@ -47,6 +49,27 @@ def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.
     if is_concrete((values, mask)):
         return jax.device_put(np.where(mask, values, np.nan))
     return jnp.where(mask, values, jnp.nan)
+
+
+def as_array(values: Any) -> Any:
+    """`values`; lists as NumPy's arrays, arrays of other libraries (DLPack) as NumPy's, or JAX's on an accelerator.
+
+    Gradients of the other library end here. NumPy and JAX may share the memory.
+    """
+    if isinstance(values, list | tuple):
+        return np.asarray(values)
+    if not _is_foreign(values):
+        return values
+    values = values.detach() if hasattr(values, "detach") else values  # torch exports no tensor that needs a gradient
+    on_host = values.__dlpack_device__()[0] == _HOST
+    try:
+        return np.from_dlpack(values) if on_host else jnp.from_dlpack(values)
+    except (BufferError, RuntimeError, TypeError, ValueError):  # bfloat16, or an accelerator that JAX does not use
+        return jnp.from_dlpack(values) if on_host else np.from_dlpack(values.cpu())
+
+
+def _is_foreign(values: Any) -> bool:
+    return hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray | jax.Array)
 
 
 def as_float(values: ArrayLike) -> Float[jax.Array, "..."]:
@@ -139,6 +162,8 @@ def compiled(function: Function, **options: Any) -> Function:
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         leaves, classes = leaves_and_classes((arguments, named))
+        if any(map(_is_foreign, leaves)):
+            arguments, named = jax.tree.map(as_array, (arguments, named))
         if any(map(callable, leaves)):
             return function(*arguments, **named)
         if classes not in programs:  # `jit` shares programs between equal functions, and a `partial` equals no other

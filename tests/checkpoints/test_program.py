@@ -12,7 +12,9 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
+from mfvpr.cli import build
 from mfvpr.cli.launch import one_line
+from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 from tests.programs import ROOT, typed
 from tests.random_checkpoints import random_checkpoint, write_zip
@@ -62,7 +64,7 @@ except SystemExit:
     assert done.stderr == ""
     *text, loaded = done.stdout.splitlines()
     assert loaded == "[]"
-    assert all(any(command in line for line in text) for command in ("list", "convert", "verify", "download"))
+    assert all(any(command in line for line in text) for command in ("list", "add", "verify", "download"))
 
 
 @pytest.mark.parametrize(
@@ -70,9 +72,9 @@ except SystemExit:
     [
         ([], "arguments are required: COMMAND"),
         (["lst"], "invalid choice: 'lst'"),
-        (["convert", "some.pth"], "some.pth: no such file"),
-        (["convert", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
-        (["convert", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
+        (["add", "some.pth"], "some.pth: no such file"),
+        (["add", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
+        (["add", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
         (["verify", "d2"], "expected one of d2_tf, "),
         (["download", "d2_tf"], "d2_tf: no hash is published"),
         (["download", "vgg16_places365"], "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/"),
@@ -96,9 +98,10 @@ def test_list(program, folder):
 
 def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
     assert program("verify") == (0, f"nothing is installed in {folder}\n", "")
-    code, stdout, stderr = program("convert", tiny_checkpoint)
+    code, stdout, stderr = program("add", tiny_checkpoint)
     assert (code, stderr) == (0, "")
-    assert stdout == f"{folder}/tiny.safetensors: tiny, {PARAMETERS} parameters\n"
+    unknown = f"from a file of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
+    assert stdout == f"{folder}/tiny.safetensors: tiny, {PARAMETERS} parameters, {unknown}\n"
     assert program("list")[1].splitlines()[-1].split()[-2:] == ["yes", "-"]
     for arguments in ([], ["tiny"]):
         code, stdout, stderr = program("verify", *arguments)
@@ -107,16 +110,16 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
         assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
     tensors = random_checkpoint(SOURCE_SHAPES)
     tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
-    code, stdout, _ = program("convert", write_zip(tiny_checkpoint, tensors))
+    code, stdout, _ = program("add", write_zip(tiny_checkpoint, tensors))
     assert code == 0
-    assert stdout.endswith(f"tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32\n")
+    assert f": tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32, from a file" in stdout
     monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=file_sha256(tiny_checkpoint)))
     assert program("verify") == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
 
 
 def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
-    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "convert d2_tf.pth"),
-                          ("mixvpr_512", "convert 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
+    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "add d2_tf.pth"),
+                          ("mixvpr_512", "add 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
         with pytest.raises(SystemExit) as caught, one_line():
             load_model(name)
         assert caught.value.code == 2
@@ -128,15 +131,43 @@ def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
 
 def test_convert_under_another_name(program, refused, folder, tiny_checkpoint):
     other = tiny_checkpoint.rename(tiny_checkpoint.with_name("it's (1).pth"))
-    refused("--as NAME, one of d2_tf", "convert", other)
-    refused("expected the sha256 of aliked-t16", "convert", other, "--as", "aliked-t16")
+    refused("--as NAME, one of d2_tf", "add", other)
+    refused("expected the sha256 of aliked-t16", "add", other, "--as", "aliked-t16")
     assert not folder.exists()
-    assert program("convert", other, "--as", "tiny")[0] == 0
+    assert program("add", other, "--as", "tiny")[0] == 0
+
+
+def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
+    program, refused, folder, tiny_checkpoint, monkeypatch
+):
+    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=SHA256))
+    refused("expected the sha256 of tiny, ", "add", tiny_checkpoint)
+    refused("of your own need a name: mfvpr weights add FILE --own NAME", "add", tiny_checkpoint)
+    refused("letters, digits", "add", tiny_checkpoint, "--own", "a/b")
+    assert not folder.exists()
+    code, stdout, stderr = program("add", tiny_checkpoint, "--own", "mine")
+    assert (code, stderr) == (0, "")
+    own = f"own/mine, {PARAMETERS} parameters, your own for the network of tiny; use it as weights=own/mine\n"
+    assert stdout == f"{folder}/own/mine.safetensors: {own}"
+    converted = tiny_checkpoint.with_name("converted.safetensors")
+    (folder / "own" / "mine.safetensors").rename(converted)
+    assert program("verify", "own/mine")[1].endswith("install it: mfvpr weights add FILE --own mine --as tiny\n")
+    assert program("add", converted, "--own", "mine", "--as", "tiny")[0] == 0
+    for arguments in ([], ["own/mine"]):
+        source = f"from a converted.safetensors of sha256 {file_sha256(converted)[:12]}..., which is your own"
+        assert program("verify", *arguments)[1] == f"own/mine: good, {PARAMETERS} parameters as converted, {source}\n"
+    published, listed = (line.split() for line in program("list")[1].splitlines()[-2:])
+    assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (
+        "tiny", "no", "own/mine", ["yours,", "as", "tiny"], "yes"
+    )  # fmt: skip
+    assert build._network("features", ("tiny",), "own/mine").conv is not None
+    with pytest.raises(InputError, match=r"features.weights=tiny\b.*|tiny: not installed"):
+        build._network("features", ("tiny",), "tiny")
 
 
 def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypatch):
     (tmp_path / "tiny.pth").write_bytes(b"the source")
-    save("tiny", arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
+    save(REGISTRY["tiny"], arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
     assert program("verify", "tiny")[0] == 0
     monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(parameters=1))
     code, stdout, _ = program("verify")
@@ -218,7 +249,7 @@ def test_download(program, folder, site):
     assert stdout.splitlines() == [
         f"tiny.pth: {source}, {len(CONTENT):,} bytes, code MIT, weights none stated",
         f"{target}: downloaded, with the published hash",
-        f"to install it: mfvpr weights convert {target}",
+        f"to install it: mfvpr weights add {target}",
     ]
     assert target.read_bytes() == CONTENT
     site("nowhere")

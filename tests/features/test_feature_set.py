@@ -14,7 +14,6 @@ from mfvpr.features import FeatureSet, InMemory
 from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
 from mfvpr.storage.features import open_store
 from tests.builders import make_features
-from tests.shapes import unchecked_shapes
 
 DEVICE = jax.devices()[0]
 KEYPOINT = 4 * (16 + 2 + 1) + 1  # bytes of one keypoint of `make_features`
@@ -86,23 +85,21 @@ def test_own_features_of_any_type_are_matched_in_single_precision():
     assert_are(on_device(Slots(feature_set, np.arange(2), 10**6, DEVICE), [1]), [integers, image], [1])
 
 
-def spoiled(**changes):
-    [image] = images_of([5])
-    with unchecked_shapes():
-        return replace(image, **changes)
+AXES = {"keypoints": (2, 5, 2), "descriptors": (2, 5, 16), "scores": (2, 5), "mask": (2, 5), "image_size": (2, 2)}
+STACKED = {name: np.ones(shape, bool if name == "mask" else float) for name, shape in AXES.items()}
 
 
-@pytest.mark.parametrize(("images", "message"), [
+@pytest.mark.parametrize(("changes", "message"), [
     ([], "at least one image, got none"),
-    ([spoiled(descriptors=np.zeros((16, 5), np.float32))], r"image 0: .*\[N, D\].*\(16, 5\).*transpose"),
-    ([spoiled(scores=np.zeros((5, 1), np.float32))], r"image 0: .*scores \[N\]"),
-    ([spoiled(mask=np.ones(5))], "mask .* bool"),
-    ([*images_of([3]), spoiled(descriptors=2 * images_of([5])[0].descriptors)], "image 1: .*unit length, got 2;"),
-    ([*images_of([3]), make_features(np.random.default_rng(0), 3, dimension=8)], "image 1: .*16 .*, got 8;"),
+    ([{}, {"image_size": None}], r"image 1: .*image_size \[2\].* got shapes \(5,\) and \(\)"),
+    ([STACKED], r"mask \[N\]"),
+    ([{}, {"descriptors": np.full((5, 16), 2.0)}], "image 1: .*unit length, got 8;"),
+    ([{}, {"descriptors": np.ones((5, 8)) / np.sqrt(8)}], "image 1: .*16 .*, got 8;"),
 ])  # fmt: skip
-def test_own_features_that_do_not_fit_are_refused(images, message):
+def test_own_features_that_do_not_fit_are_refused(changes, message):
+    [image] = images_of([5])
     with pytest.raises(InputError, match=message) as error:
-        FeatureSet.of(images)
+        FeatureSet.of([replace(image, **change) for change in changes])
     assert "\n" not in str(error.value)
 
 

@@ -34,6 +34,7 @@ from tests import scorers
 from tests.builders import evaluate_parts, map_system
 from tests.programs import ROOT, snapshot
 from tests.shapes import unchecked_shapes
+from tests.test_types import Tensor as TensorWithGradient
 
 pytestmark = pytest.mark.thorough
 
@@ -351,11 +352,11 @@ def test_nothing_is_written_of_an_entry_that_is_refused(dataset, tmp_path, name,
     assert not (tmp_path / "map").exists()
 
 
-def test_of_a_score_that_is_not_finite_nothing_is_sure(dataset, folder):
-    known = opened(folder, scorer=lambda matches: np.nan * matches.distance.sum(), confidence=SURE, threshold=0.5)
-    prediction = known.localize(dataset.queries.paths[0])
-    assert (prediction.place, prediction.confidence, prediction.as_json()["score"]) == (None, None, None)
-    assert prediction.is_refused
+@pytest.mark.parametrize("scorer", [lambda matches: np.nan * matches.distance.sum(), mfvpr.GridAnchors()])
+def test_scores_that_are_never_finite_are_refused(dataset, folder, scorer):
+    """The grid's anchors expect as many keypoints as the grid has cells."""
+    with pytest.raises(InputError, match=r"^it: every score of a pair that has matches is NaN or infinite"):
+        opened(folder, scorer=scorer).localize(dataset.queries.paths[0])
 
 
 def test_scores_are_floats_whatever_the_scorer_returns(dataset, folder):
@@ -405,7 +406,7 @@ def test_arrays_are_images(folder, image):
 def test_images_may_be_what_numpy_converts(dataset, folder):
     known, pixels = opened(folder), dataset.database.read(3)
     expected = known.describing.image(dataset.database.paths[3])[1]
-    for image in (pixels, jax.numpy.asarray(pixels), Image.fromarray(pixels)):
+    for image in (pixels, jax.numpy.asarray(pixels), Image.fromarray(pixels), TensorWithGradient(pixels)):
         np.testing.assert_array_equal(known.describing.image(image)[1], expected)
 
 

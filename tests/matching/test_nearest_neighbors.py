@@ -10,11 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import mfvpr
 from mfvpr import compact, filter_matches, match, match_candidates, retrieve
 from mfvpr.matching import NearestNeighborMatcher, match_pairs, nearest_neighbors
 from mfvpr.types import per_keypoint, per_match, per_pair
 from tests import oracles
 from tests.builders import make_features, random_matches, stack, unit
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -271,3 +273,29 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
     with pytest.raises(ValueError, match=r"query \[N0\] .*candidates \[C, N1\]"):
         match_candidates(make_features(rng, 20), make_features(rng, 20))
+
+
+def test_image_sizes_stay_known_under_a_callers_jit():
+    """So that capacities that follow from them need not be set."""
+    rng = np.random.default_rng(0)
+    query, candidates = make_features(rng, 9), stack([make_features(rng, 9) for _ in range(3)])
+    scorer, pairs = mfvpr.HistogramOfShifts(), np.array([[0, 0], [0, 1], [0, 2]], np.int32)
+    several = jax.tree.map(lambda leaf: leaf[None], query)
+
+    def score(keypoints):
+        moved = replace(query, keypoints=keypoints)
+        in_pairs = mfvpr.match_pairs(replace(several, keypoints=keypoints[None]), candidates, pairs, 3)
+        first = jax.tree.map(lambda leaf: leaf[0], candidates)
+        batches = mfvpr.match_candidates(moved, candidates), in_pairs
+        return *(mfvpr.score_candidates(scorer, matches) for matches in batches), scorer(match(moved, first))
+
+    for got, expected in zip(jax.jit(score)(query.keypoints), score(query.keypoints), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pairs", [[[0, 3]], [[0, -1]], [[1, 0]], [[0, 1, 2]], [0, 1], np.zeros((0, 2), int)])
+def test_pairs_of_images_that_are_not_there_are_refused(pairs):
+    rng = np.random.default_rng(0)
+    queries, candidates = (stack([make_features(rng, 5) for _ in range(count)]) for count in (1, 3))
+    with unchecked_shapes(), pytest.raises(mfvpr.InputError, match=r"^pairs: expected rows of [^\n]*$"):
+        mfvpr.match_pairs(queries, candidates, np.array(pairs), 1)

@@ -110,6 +110,11 @@ def test_unsigned_frame_numbers_do_not_wrap():
     np.testing.assert_array_equal(np.flatnonzero(got[0]), [3, 4, 5, 6, 7])
 
 
+def test_rankings_of_several_systems_are_refused():
+    with pytest.raises(InputError, match=r"^order: expected database rows \[Q, C\] .* got shape \[1, 2, 2\]"):
+        recall_at_k(np.zeros((1, 2, 2), int), np.eye(2, dtype=bool), [1])
+
+
 def test_no_database_and_no_queries_recall_nothing():
     np.testing.assert_array_equal(recall_at_k(np.full((2, 1), -1), np.zeros((2, 0), bool), [1, 5]), [0, 0])
     np.testing.assert_array_equal(recall_at_k(np.zeros((0, 3), int), np.zeros((0, 4), bool), [1]), [0])
@@ -142,3 +147,10 @@ def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
 def test_sides_that_do_not_fit_are_refused(queries, database, excluded, words):
     with unchecked_shapes(), pytest.raises(InputError, match=words):
         EXACT.shortlist(np.ones(queries, np.float32), np.ones(database, np.float32), 2, excluded=excluded)
+
+
+@pytest.mark.parametrize("shape", [(1,), (4, 1), (5, 4)])
+def test_a_mask_of_another_shape_is_refused(shape):
+    vectors = np.eye(5, dtype=np.float32)
+    with unchecked_shapes(), pytest.raises(InputError, match=r"^mask: expected shape \(5,\) or \(4, 5\), got"):
+        retrieve(vectors[:4], vectors, num_candidates=2, mask=np.ones(shape, bool))

@@ -15,6 +15,7 @@ from tests.builders import make_matches, per_match
 from tests.scoring.batches import pair_of
 from tests.scoring.test_homography import plane_points
 from tests.scoring.test_host import BATCH, CANDIDATES, MATCHES, POINTS
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.optimized
 
@@ -80,5 +81,8 @@ def test_few_matches_and_broken_ones():
     assert float(OpenCvHomography(few="zero")(make_matches(points0, points1))) == 4
     assert float(OpenCvHomography()(make_matches(np.full((20, 2), 3.0), np.full((20, 2), 5.0)))) == 0
     assert np.isnan(OpenCvHomography()(make_matches(points0 * np.nan, points1)))
+    with unchecked_shapes():
+        matches = make_matches(points0, points1)
+        assert float(OpenCvHomography()(replace(matches, mask=2 * matches.mask.astype(np.uint8)))) == 4
     assert float(OpenCvHomography()(make_matches(points0, points1, confidence=[1, 1, 0.5, 0]))) == 3
     assert np.isnan(OpenCvHomography()(make_matches(points0, points1, confidence=np.full(4, np.nan))))

@@ -3,19 +3,27 @@
 import importlib
 import json
 import linecache
+import math
+import re
 import sys
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from flax import nnx
 
+from mfvpr import LightGlueMatcher, value
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.networks import blueprint
-from mfvpr.features import AlikedFeatures, Sift, Vlad, VladFitting
+from mfvpr.features import Aggregated, AlikedFeatures, Sift, Vlad, VladFitting
 from mfvpr.matching import NearestNeighborMatcher
+from mfvpr.retrieval import ExactSearch, Retrieval
+from mfvpr.scoring.registry import SCORERS
+from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -110,6 +118,78 @@ def test_private_constants_are_part_of_the_recipe():
     recipes = [fingerprint(recipe_of(with_private_gain(value)())) for value in values]
     assert len({*recipes}) == len(values)
     assert recipes[0] == fingerprint(recipe_of(with_private_gain(1)()))
+
+
+@dataclass(frozen=True)
+class Limit:
+    limit: float
+    recipe: str = "a field, which says nothing of the others"
+
+    def __call__(self, value):
+        return value < self.limit
+
+
+SEASON = Enum("SEASON", ["DAY", "NIGHT"])
+CONSTANTS = [
+    (Limit(1.0), Limit(2.0)), ([Limit(1.0)], [Limit(2.0)]), (Path("a"), Path("b")), (SEASON.DAY, SEASON.NIGHT),
+    (np.sin, np.cos), (math.sin, math.cos), (range(2), range(3)), (slice(2), slice(3)), (np, math),
+    (frozenset({(1, 2)}), frozenset({(1, 3)})), (re.compile("a"), re.compile("b")),
+    (Limit(1.0).__call__, Limit(2.0).__call__),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "second"), CONSTANTS)
+def test_what_a_class_closes_over_is_part_of_its_recipe(first, second):
+    def closing_over(value):
+        @dataclass
+        class Mine:
+            def __call__(self, images):
+                return value, images
+
+        return Mine
+
+    for make in (closing_over, with_private_gain):
+        names = [fingerprint(recipe_of(make(value)())) for value in (first, first, second)]
+        assert names[0] == names[1] != names[2]
+
+
+def test_a_class_that_closes_over_anything_else_has_no_recipe():
+    class Mine(Sift):
+        detector = object()
+
+    with pytest.raises(TypeError, match="object: expected a dataclass"):
+        recipe_of(Mine())
+
+
+def test_a_subclass_adds_its_fields_and_its_code_to_a_recipe():
+    def adding(gain):
+        @value
+        class Mine(LightGlueMatcher):
+            least: float = 0.5
+
+            def __call__(self, features0, features1):
+                return gain * self.least
+
+        return Mine
+
+    arguments = np.ones(1), "network"
+    matchers = [adding(1)(*arguments), adding(1)(*arguments, least=0.9), adding(2)(*arguments)]
+    assert len({fingerprint(recipe_of(matcher)) for matcher in [*matchers, adding(1)(*arguments)]}) == 3
+    assert len({fingerprint(recipe_of(Limit(limit))) for limit in (1.0, 2.0)}) == 2  # a field called `recipe`
+
+
+def test_the_recipes_of_the_library_are_those_of_stored_features():
+    """Other recipes would make stores of all users anew."""
+    sift = Sift()
+    parts = [sift, VladFitting(), Vlad(np.ones((2, 3), np.float32)), NearestNeighborMatcher(), WEIGHTS, ExactSearch(),
+             Retrieval(Aggregated(sift, VladFitting())), {n: scorer() for n, scorer in SCORERS.items()}]  # fmt: skip
+    pinned = ["e844b5c04fa19ee0", "addef6222ae3f0e4", "08a68e20048ddb13", "26525b65982a6c3e", "7efc3c4cb5c3bcf7",
+              "95685df458da8465", "463ddce214f26858", "2f3388bd37aa805f"]  # fmt: skip
+    assert [fingerprint(recipe_of(part)) for part in parts] == pinned
+    assert recipe_of(LightGlueMatcher(np.ones(1), "network")) == {
+        "class": "LightGlueMatching",
+        "recipe": {"network": "network", "filter_threshold": 0.1, "depth_confidence": None},
+    }
 
 
 def test_a_recipe_of_ones_own_belongs_to_its_class():
