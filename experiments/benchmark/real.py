@@ -10,11 +10,11 @@ from omegaconf import OmegaConf
 
 from experiments.benchmark.harness import duration, write_report
 from experiments.paper.systems import REAL
+from mfvpr import datasets
 from mfvpr.checkpoints import load_model
 from mfvpr.cli import build
 from mfvpr.cli.console import tell, track
 from mfvpr.cli.overrides import compose_program
-from mfvpr.datasets import folder_dataset
 from mfvpr.evaluation import Pipeline, estimate, hits, match_sequence, stages
 from mfvpr.features import Aggregated, AlikedFeatures, Extractor, Sift, VladFitting
 from mfvpr.report import Table
@@ -38,7 +38,7 @@ def run(rounds: int | None, out: Path, data: Path | None = None) -> None:
     cache, scorers = FeatureCache(folder / "features", runtime=Runtime(progress=track, log=tell)), compared_scorers()
     parts, tables = [], []
     for name, folders in REAL.items():
-        dataset = folder_dataset(*(data / name / folder for folder in folders), name=name, ground_truth="order")
+        dataset = datasets.folder(*(data / name / folder for folder in folders), name=name, ground_truth="order")
         for features, extractor in extractors().items():
             retrieval = Retrieval(Aggregated(extractor, VladFitting()))
             pipeline = Pipeline(extractor, retrieval, candidates="all")

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.types import Array
+from mfvpr.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,9 @@ class Tally:
     def of(cls, order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]) -> "Tally":
         """Count the queries of a ranking; for the arguments see `recall_at_k`."""
         order = np.asarray(order)
+        if order.ndim != 2:
+            raise InputError(f"order: expected database rows [Q, C], best first, got {list(order.shape)}; count each "
+                             "ranking of several by itself")  # fmt: skip
         if order.size == 0:
             return cls(np.zeros(len(ks), int), len(order))
         correct = (positives if isinstance(positives, Positives) else Positives.from_matrix(positives)).contains(order)
@@ -60,5 +64,8 @@ def recall_at_k(
         order: `[Q, C]` database rows, best first; -1 = none.
         positives: a query without positives counts as a failure.
         ks: depths; beyond C all C candidates count.
+
+    Raises:
+        InputError: `order` has other axes.
     """
     return Tally.of(order, positives, ks).recall

@@ -19,7 +19,7 @@ from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
-from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
@@ -135,7 +135,8 @@ class Map(MapImages):
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        rankings = rank_by_systems(shortlist, padded_scores, self.system.fused, {}, self.system.ties)
+        final_scores, ties = self.system.final_scores.values(), self.system.ties
+        rankings = rank_by_scores(shortlist, padded_scores, final_scores, ties)
         cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mfvpr
-from mfvpr.datasets import folder_dataset, sequences_dataset
+from mfvpr import datasets
+from mfvpr.datasets import IndexFile
 from mfvpr.features import Aggregated, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval, RetrievalResult
@@ -116,9 +117,7 @@ def test_local_features_are_those_of_candidates_only(dataset, tmp_path):
 @pytest.mark.slow
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
     """On matches that memory does not hold."""
-    several = sequences_dataset(
-        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
-    )
+    several = datasets.folder(small_street / "database", split, ground_truth=IndexFile("truth.csv", is_widened=True))
     extractor = TwoScales()
     run = run_of(several, extractor, Retrieval(extractor), candidates=3, runtime=mfvpr.Runtime(memory=1e-4))
     expected = run(FeatureCache(tmp_path / "s"))
@@ -203,7 +202,7 @@ def test_a_bad_image_of_one_shard_is_known_to_all(small_street, tmp_path):
         for path in sorted((small_street / side).glob("*.png"))[:6]:
             (tmp_path / side / path.name).write_bytes(path.read_bytes())
     (tmp_path / "database" / "0002.png").write_bytes(b"no image")
-    dataset = folder_dataset(tmp_path / "database", tmp_path / "queries", ground_truth="order")
+    dataset = datasets.folder(tmp_path / "database", tmp_path / "queries", ground_truth="order")
 
     run = run_of(dataset, skip_bad=True, candidates=3)
     expected = run(FeatureCache(tmp_path / "plain"))
