@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -16,7 +16,6 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.evaluation.results import KS, RankedDataset, Recall
 from mfvpr.evaluation.stages import explain
-from mfvpr.report.figures import Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
 from mfvpr.report.runs import Figure
@@ -24,6 +23,9 @@ from mfvpr.report.tables import Table
 from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.files import clip_middle, printable, write_text
+
+if TYPE_CHECKING:
+    from mfvpr.report.figures import Candidate
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _THRESHOLD_NAMES: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # in results
@@ -248,6 +250,8 @@ class SequenceFigures:
 
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """Draw the prediction, and below an incorrect one a correct one."""
+        from mfvpr.report.figures import histogram_figure, pixel_aspect_of  # here: matplotlib takes half a second
+
         candidates = [self._candidate(query, 0, verdict)]
         candidates += self.correct_candidates(query) if verdict == "incorrect" else []
         values = self.evaluation.headline, self._sequence.name, verdict, self._sequence.images.names[query]
@@ -260,16 +264,16 @@ class SequenceFigures:
     def _prediction(self, query: int) -> str:
         return self._database.names[self._ranked.rows[query, 0]]
 
-    def _candidate(self, query: int, rank: int, verdict: str) -> Candidate:
+    def _candidate(self, query: int, rank: int, verdict: str) -> "Candidate":
         """The candidate at a rank from 0."""
         row, score = int(self._ranked.rows[query, rank]), self._ranked.scores[query, rank]
         place = int(np.flatnonzero(self._matched.candidates.indices[query] == row)[0])
         pair = jax.tree.map(lambda values: values[place], self._matched.matches[0][query])
         caption = f"{verdict}: {_short(self._database.names[row])}, rank {rank + 1}, score {score:.5g}"
         histogram = self.evaluation.histogram or HistogramOfShifts()
-        return Candidate(self._resize(self._database.read(row)), caption, pair, explain(histogram, pair))
+        return self._shown(row, caption, pair, explain(histogram, pair))
 
-    def correct_candidates(self, query: int) -> list[Candidate]:
+    def correct_candidates(self, query: int) -> list["Candidate"]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
         correct = self.evaluation.is_correct(self.evaluation.headline, self.place)
         positives, truth = self.evaluation.positives[self.place], self._sequence.truth
@@ -281,7 +285,12 @@ class SequenceFigures:
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         num_candidates = self._matched.candidates.indices.shape[1]
         caption = f"correct: {_short(self._database.names[row])}, not among the {num_candidates} candidates"
-        return [Candidate(self._resize(self._database.read(row)), caption)]
+        return [self._shown(row, caption)]
+
+    def _shown(self, row: int, caption: str, *matched: Any) -> "Candidate":
+        from mfvpr.report.figures import Candidate
+
+        return Candidate(self._resize(self._database.read(row)), caption, *matched)
 
     def _resize(self, image: np.ndarray) -> np.ndarray:
         extractor = self.evaluation.ranked.system.pipeline.extractor
