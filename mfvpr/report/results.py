@@ -110,16 +110,19 @@ class Result:
 
     def table(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> Table:
         """Recall in %: of every final score of a single system, or of those that decide of several systems."""
-        rows, several = list[dict[str, str]](), [len(self._names(place)) > 1 for place in (0, 1)]
+        several_data, several_systems = (len(self._names(place)) > 1 for place in (0, 1))
+        rows: list[dict[str, str]] = []
         for (dataset, system), report in self._reports(thresholds, ks):
             table = recall_table(report)
             for line in table.rows:
-                row = dict(zip(("data set", *table.header), (dataset, *line), strict=True))
-                if not several[1] or row["system"] == report.headline:
-                    rows.append(row | {"system": system} if several[1] else row)
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        texts = [name for name in ("data set", "system", "sequence") if name in names][not several[0] :]
-        header = texts + [name for name in names if name.startswith("R@")]
+                row = ({"data set": dataset} if several_data else {}) | dict(zip(table.header, line, strict=True))
+                if not several_systems:
+                    rows.append(row)
+                elif row["system"] == report.headline:
+                    rows.append(row | {"system": system})
+        names = dict.fromkeys(name for row in rows for name in row)
+        texts = [name for name in ("data set", "system", "sequence") if name in names]
+        header = texts + [name for name in names if name not in texts]
         return Table(header, [[row.get(name, "") for name in header] for row in rows], len(texts))
 
     def to_latex(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> str:
