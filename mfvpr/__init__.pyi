@@ -39,7 +39,8 @@ from .scoring.rapid import RapidSpatialScore
 from .reranking.grids import score_grid
 from .reranking.ranking import balancing_c, combine, rank, rerank, score_candidates
 
-# what is correct, and recall
+# data sets, what is correct, and recall
+from . import datasets
 from .datasets.positives import frame_positives, radius_positives
 from .evaluation.recall import recall_at_k
 
@@ -47,7 +48,7 @@ from .evaluation.recall import recall_at_k
 from .cli.systems import load_system
 from .evaluation.system import Pipeline, System
 from .utils.runtime import Runtime
-from .evaluation.evaluation import evaluate
+from .report.results import Result, evaluate
 from .localization.map import Map
 
 # tools for a scorer of your own; see mfvpr.testing.check_scorer
@@ -98,6 +99,7 @@ __all__ = [
     "rank",
     "rerank",
     "score_candidates",
+    "datasets",
     "frame_positives",
     "radius_positives",
     "recall_at_k",
@@ -105,6 +107,7 @@ __all__ = [
     "Pipeline",
     "System",
     "Runtime",
+    "Result",
     "evaluate",
     "Map",
     "Scorer",

@@ -10,6 +10,7 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import Features, Matches, Pipeline, Shortlist, System, types
+from mfvpr.evaluation import rank_dataset
 from mfvpr.features import Aggregated, Extractor
 from mfvpr.matching import MatchSet
 from mfvpr.retrieval import Retrieval
@@ -21,7 +22,7 @@ def evaluate_parts(dataset, extractor, retriever, scorers, *, cache=None, runtim
     """Evaluate a system of these parts; options are fields of `Pipeline` and `System`."""
     of_pipeline = {name: options.pop(name) for name in ("matcher", "candidates") if name in options}
     system = System(Pipeline(extractor, retriever, **of_pipeline), scorers, **options)
-    return mfvpr.evaluate(dataset, system, cache=cache, runtime=runtime)
+    return rank_dataset(dataset, system, cache=cache, runtime=runtime)
 
 
 def map_system(extractor, describer, scorer=None, candidates=50):

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from mfvpr import datasets
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
 from mfvpr.checkpoints.networks import NETWORKS, blueprint
-from mfvpr.datasets import Dataset, folder_dataset
+from mfvpr.datasets import Dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
 from tests.builders import read_golden
@@ -123,7 +124,7 @@ def small_street(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def dataset(small_street) -> Dataset:
     """The small street's ten queries, each with its database image."""
-    return folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    return datasets.folder(small_street / "database", small_street / "queries", ground_truth="order")
 
 
 @pytest.fixture(scope="session")

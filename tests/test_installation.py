@@ -20,11 +20,10 @@ SMALL = (*QUICK, "features.image_size=[160,120]", "candidates=5")
 EXAMPLE = """
 import numpy as np
 import mfvpr
-from mfvpr.datasets import folder_dataset
 
 small = {{"features": {{"image_size": [160, 120]}}, "retrieval": {{"num_words": 8}}, "candidates": 5}}
 system = mfvpr.load_system("steering", **small)
-result = mfvpr.evaluate(folder_dataset("{street}/database", "{street}/queries", ground_truth="order"), system)
+result = mfvpr.evaluate(mfvpr.datasets.folder("{street}/database", "{street}/queries", ground_truth="order"), system)
 points = np.random.default_rng(0).uniform(0, 100, (9, 2))
 features = mfvpr.Features.of(points, np.eye(9), image_size=(100, 100))
 print(mfvpr.__file__, repr(result), mfvpr.HistogramOfShifts(weight=mfvpr.UnitWeight())(mfvpr.match(features, features)))

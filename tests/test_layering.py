@@ -35,7 +35,8 @@ PERMISSIONS = {
     },
     "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {
-        "datasets", "evaluation", "features", "localization", "reranking", "scoring", "tuning", "types", "utils",
+        "datasets", "evaluation", "features", "localization", "reranking", "scoring", "storage", "tuning", "types",
+        "utils",
     },
     "cli": {
         "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "report", "reranking",

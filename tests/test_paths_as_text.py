@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
-from mfvpr.datasets import ImageFolder, datasets, folder_dataset, sequences_dataset, truth_files, videos
+from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, truth_files, videos
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
 from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
@@ -61,15 +61,12 @@ def test_data_sets(tmp_path):
     index.write_text("query,database\n0,0\n1,1\n")
     labels = tmp_path / "labels.csv"
     labels.write_text("name,label\n0.png,a\n1.png,b\n")
-    files = {"database_labels": str(labels), "query_labels": str(labels)}
-    for options in ({"ground_truth": "index", "index_file": str(index)}, {"ground_truth": "label"} | files):
-        dataset = folder_dataset(database, queries, **options)
+    for truth in (IndexFile(str(index)), LabelFiles(str(labels), str(labels))):
+        dataset = datasets.folder(database, queries, ground_truth=truth)
         assert dataset.truth.positives(0).counts.tolist() == [1, 1]
-    dataset = sequences_dataset(database, [queries], ground_truth="index", index_file="pairs.csv")
+    dataset = datasets.folder(database, [queries], ground_truth=IndexFile("pairs.csv"))
     assert dataset.only.name == "q"
-    assert folder_dataset(database, queries, ground_truth="none").truth is None
-    with pytest.raises(InputError, match="ground_truth=None: expected one of order "):
-        folder_dataset(database, queries, ground_truth=None)  # type: ignore[arg-type]
+    assert datasets.folder(database, queries, ground_truth=dataset.only.truth).truth is dataset.only.truth
 
 
 def test_confidences_and_weights(tmp_path):

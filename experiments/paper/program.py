@@ -137,7 +137,7 @@ def evaluate_all(
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}
-            correct = truth.positives_fingerprint(dataset, truth.thresholds(chosen, dataset.sequences[0].truth))
+            correct = dataset.positives_fingerprint(truth.thresholds(chosen, dataset.sequences[0].truth))
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue

@@ -14,6 +14,7 @@ from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder
 from mfvpr.cli.overrides import compose_program
+from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import write_json
 from mfvpr.systems.settings import SettingsError, check
 from mfvpr.utils.files import remove_leftovers
@@ -107,12 +108,12 @@ def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
-            evaluation.write_run_folder(new, outcome)
+            write_run_folder(new, outcome.calibrated, outcome.description)
             write_json(new / INPUTS, dict(inputs))
-            write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.images.dataset.database))
+            write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.report.ranked.dataset.database))
             run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
 
-        run_folder.write_files(folder, settings, evaluation.ground_truth(outcome), write)
+        run_folder.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 

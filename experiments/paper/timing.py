@@ -51,7 +51,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
         for turn in ("first", "second"):
             images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
             part = replace(sequence, images=images, truth=None, excluded=None)
-            seconds = evaluation.evaluate(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
+            seconds = evaluation.rank_dataset(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
     return {step: seconds.get(step, 0.0) / number for step in STEPS}
 
 

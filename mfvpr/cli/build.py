@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
+from mfvpr import datasets
 from mfvpr.cli import console
-from mfvpr.datasets import Dataset, folder_dataset, sequences_dataset
+from mfvpr.datasets import Dataset, IndexFile, LabelFiles
 from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import seasons_folder, streets_folder
@@ -19,16 +20,12 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
     """The data set; `streets` is drawn first if the cache does not have it."""
     if settings["name"] == "streets_seasons":
         root = seasons_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
-        return sequences_dataset(
-            root / "database", [root / name for name in CONDITIONS], name="streets_seasons", ground_truth="index",
-            index_file=TRUTH, widen_index=True,
-        )  # fmt: skip
+        queries, truth = [root / name for name in CONDITIONS], IndexFile(TRUTH, is_widened=True)
+        return datasets.folder(root / "database", queries, ground_truth=truth, name="streets_seasons")
     if "cache" in settings:
         root = streets_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
-        return folder_dataset(
-            root / "database", root / "queries", name="streets", ground_truth="index",
-            index_file=root / "ground_truth.csv", widen_index=True,
-        )  # fmt: skip
+        truth = IndexFile(root / "ground_truth.csv", is_widened=True)
+        return datasets.folder(root / "database", root / "queries", ground_truth=truth, name="streets")
     if "ground_truth" not in settings:
         return published_dataset(
             settings["name"],
@@ -37,17 +34,30 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
         )
     if settings["ground_truth"] is None:
         raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
-    options = {name: value for name, value in settings.items() if name not in ("root", "exclude_neighbors")}
-    several = isinstance(options["queries"], list)
-    if several == ("database_labels" in options):  # only a single sequence has labels
+    database, queries, several = settings["database"], settings["queries"], isinstance(settings["queries"], list)
+    if several == ("database_labels" in settings):  # only a single sequence has labels
         expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
-        raise SettingsError(f"dataset.queries: expected {expected}, got {settings['queries']}")
-    if several:
-        queries, images = [expand_user(path) for path in options.pop("queries")], expand_user(options.pop("database"))
-        return sequences_dataset(images, queries, **options)
-    for name in ("database", "queries", "index_file", "database_labels", "query_labels"):
-        options[name] = expand_user(options[name]) if options[name] else None
-    return folder_dataset(**options)
+        raise SettingsError(f"dataset.queries: expected {expected}, got {queries}")
+    queries = [expand_user(path) for path in queries] if several else expand_user(queries)
+    options = {name: settings[name] for name in ("name", "orient", "bits")}
+    return datasets.folder(expand_user(database), queries, ground_truth=_ground_truth(settings), **options)
+
+
+def _ground_truth(settings: dict[str, Any]) -> IndexFile | LabelFiles | str:
+    """The ground truth of folders of images, whose files must be those that it needs."""
+    kind = settings["ground_truth"]
+    for option, reader in {"index_file": "index", "database_labels": "label", "query_labels": "label"}.items():
+        path = settings.get(option)
+        if path is not None and kind != reader:
+            raise SettingsError(f"{path}: given as dataset.{option}, but dataset.ground_truth={kind}; "
+                                f"set it to {reader}")  # fmt: skip
+        if path is None and kind == reader:
+            raise SettingsError(f"dataset.ground_truth={kind}: expected a file; give dataset.{option}=FILE as well")
+    if kind == "index":
+        return IndexFile(expand_user(settings["index_file"]), settings["widen_index"])
+    if kind == "label":
+        return LabelFiles(expand_user(settings["query_labels"]), expand_user(settings["database_labels"]))
+    return kind
 
 
 def cache(settings: dict[str, Any]) -> FeatureCache:

@@ -1,19 +1,17 @@
-"""The confidence file of a run: read and check an earlier one, and describe the origin of a new one."""
+"""The confidence file of an earlier run: read it, and check that it fits this one."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 from mfvpr.cli import truth
 from mfvpr.cli.console import tell
 from mfvpr.cli.stages import Images
 from mfvpr.datasets.truth import middle
-from mfvpr.evaluation import Confidence, read_confidences
+from mfvpr.evaluation import Confidence, System, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
-from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils.files import expand_user
-from mfvpr.utils.versions import versions
 
 # Confidences depend on these settings.
 _NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
@@ -34,14 +32,15 @@ def read_file(settings: Mapping[str, Any]) -> ConfidenceFile | None:
 
 
 def check_confidence(
-    file: ConfidenceFile | None, headline: str, settings: Mapping[str, Any], images: Images
+    file: ConfidenceFile | None, system: System, settings: Mapping[str, Any], images: Images
 ) -> ConfidenceFile | None:
-    """Keep the systems of a file whose settings fit this run at least as well as those of the headline system.
+    """Keep the final scores of a file whose settings fit this run at least as well as those of the one that decides.
 
-    Warns if the file was fitted on the same images, or with other settings. The headline system must be in the file.
+    Warns if the file was fitted on the same images, or with other settings. The score that decides must be in the file.
     """
     if file is None:
         return None
+    headline = system.headline
     if not file.systems:
         raise SettingsError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
                             "none, as where there is but one candidate")  # fmt: skip
@@ -55,20 +54,24 @@ def check_confidence(
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
     recall = [] if _threshold(settings, images) in (None, file.origin.get("correct_within")) else ["recall"]
     candidates = num_candidates(settings["candidates"], images.dataset.database)
-    other = {name: other_settings(file.origin, name, settings, candidates) + recall for name in file.systems}
+    scores = system.final_scores
+    other = {name: other_settings(file.origin, scores[name].scorers, settings, candidates) + recall
+             for name in file.systems if name in scores}  # fmt: skip
     if other[headline]:
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: "
              "it may mean nothing here")  # fmt: skip
-    usable = {name: system for name, system in file.systems.items() if {*other[name]} <= {*other[headline]}}
-    if unusable := [name for name in file.systems if name not in usable]:
+    usable = {name: file.systems[name] for name in other if {*other[name]} <= {*other[headline]}}
+    if unusable := [name for name in other if name not in usable]:
         tell(f"confidence={file.path}: nothing is said of {', '.join(unusable)}, which had other settings there")
     return file._replace(systems=usable)
 
 
-def other_settings(origin: Mapping[str, Any], system: str, settings: Mapping[str, Any], candidates: int) -> list[str]:
-    """The settings of a run or of a map that were others when a confidence was fitted."""
-    before = _system_settings(origin.get("settings"), system)
-    now = _system_settings({**settings, "scorer": assembly.describe_settings(settings["scorer"])}, system)
+def other_settings(
+    origin: Mapping[str, Any], scorers: Collection[str], settings: Mapping[str, Any], candidates: int
+) -> list[str]:
+    """The settings of a run or of a map that were others when the confidence of these scorers was fitted."""
+    before = _settings_of(scorers, origin.get("settings"))
+    now = _settings_of(scorers, {**settings, "scorer": assembly.describe_settings(settings["scorer"])})
     names = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
     return names + ["candidates"] * (origin.get("candidates") != candidates)
 
@@ -87,30 +90,18 @@ def _query_fingerprints(fingerprints: Any) -> set[str]:
     return {folder for side, folder in sides if side != "database" and isinstance(folder, str)}
 
 
-def _system_settings(settings: Any, system: str) -> dict[str, Any]:
-    """The settings that a system's scores depend on; files of match weights are compared by content, not by name."""
+def _settings_of(names: Collection[str], settings: Any) -> dict[str, Any]:
+    """The settings that scores depend on; files of match weights are compared by content, not by name."""
     scorers = settings.get("scorer") if isinstance(settings, Mapping) else None
     if not isinstance(scorers, Mapping) or not isinstance(scorers.get("method", ""), str):
         return {}
-    members = system.split(" + ")
-    parts = {name: values for name, values in assembly.by_scorer(scorers).items() if name in members}
+    parts = {name: values for name, values in assembly.by_scorer(scorers).items() if name in names}
     for name, values in parts.items():
         if isinstance(values, Mapping) and "weight_content" in values:
             parts[name] = {**values, "weight": None}
     return {**settings, "scorer": parts}
 
 
-def provenance(settings: Mapping[str, Any], images: Images, evaluation: EvaluationReport) -> dict[str, Any]:
-    """The data and settings that the confidence of a run was fitted with, for its file."""
-    return {
-        "dataset": images.dataset.name,
-        "data_fingerprint": images.fingerprints,
-        "queries": sum(len(sequence.images) for sequence in evaluation.sequences),
-        "correct_within": _threshold(settings, images),
-        "candidates": num_candidates(settings["candidates"], images.dataset.database),
-        "ground_truth": truth.describe(settings, images.dataset),
-        "settings": {name: settings[name] for name in _NAMES}
-        | {"scorer": assembly.describe_settings(settings["scorer"])},
-        "command": settings.get("command"),
-        "versions": versions(),
-    }
+def scoring_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that confidences depend on, for the file of those that are fitted."""
+    return {name: settings[name] for name in _NAMES} | {"scorer": assembly.describe_settings(settings["scorer"])}

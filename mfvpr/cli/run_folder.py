@@ -12,7 +12,6 @@ from mfvpr.report.runs import Figure
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from mfvpr.utils.files import expand_user
-from mfvpr.utils.versions import versions
 
 _NO_SETTINGS = ("multirun", "command")  # added by `command_line`
 
@@ -53,13 +52,8 @@ def write_files(
     try:
         with runs.writing(folder) as new:
             write(new)
-            runs.write_json(new / "run.json", {
-                "command": settings.get("command"),
-                "settings": {name: value for name, value in settings.items() if name not in _NO_SETTINGS},
-                "ground_truth": ground_truth,
-                "commit": runs.commit(Path()),
-                "versions": versions(),
-            })  # fmt: skip
+            about = {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
+            runs.write_about(new, about, ground_truth, settings.get("command"))
     except OSError as error:
         raise SettingsError(
             f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "

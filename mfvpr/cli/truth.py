@@ -1,13 +1,12 @@
 """Ground truth of a recall: its source, its thresholds, and their words in results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from mfvpr import evaluation
 from mfvpr.datasets import Dataset, Truth
 from mfvpr.evaluation import EvaluationProtocol
 from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import fingerprints
 
 _FILES = ("index_file", "query_labels", "database_labels")
 _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images",
@@ -38,16 +37,6 @@ def describe(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
         "exclude_neighbors": choice.get("exclude_neighbors"),
     }
     return entries if truth is None else entries | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
-
-
-def positives_fingerprint(dataset: Dataset, thresholds: Sequence[float]) -> str | None:
-    """Fingerprint of the positives of all sequences, independent of their file; None without ground truth."""
-    content = []
-    for sequence in dataset.sequences:
-        if sequence.truth is not None:
-            positives = [sequence.truth.positives(threshold) for threshold in thresholds]
-            content.append([sequence.name, *({"rows": each.rows, "offsets": each.offsets} for each in positives)])
-    return fingerprints.fingerprint(fingerprints.recipe_of(content)) if content else None
 
 
 def in_words(*descriptions: Mapping[str, Any]) -> str:

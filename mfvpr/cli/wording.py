@@ -7,12 +7,9 @@ from typing import Any
 
 from mfvpr.systems.settings import SettingsError
 
-_FILES = "(index_file|database_labels|query_labels)"
 # Pattern in a message of the library -> words of the settings. GROUP stands for `features` or `retrieval`.
 _WORDS = {
     r"or skip bad images$": "or set on_bad_image=skip",
-    rf"give {_FILES} as well": r"give dataset.\1=FILE as well",
-    rf"given as {_FILES}, but ground_truth=": r"given as dataset.\1, but dataset.ground_truth=",
     r"^(ground_truth|exclude_neighbors|queries)(=|:)": r"dataset.\1\2",
     r"(expected one query sequence, got \d+); choose one of ": r"\1; give one folder as dataset.queries=[DIR], of ",
     r"give names with their folders as the file has them": "say what stands before the names in the file with "

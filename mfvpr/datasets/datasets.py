@@ -2,26 +2,50 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.ground_truth import CHOICES, KINDS, truth_by_order, truth_from_names
+from mfvpr.datasets.ground_truth import CHOICES, truth_by_order, truth_from_names
 from mfvpr.datasets.images import read_image
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth
 from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
-FILES = {"index_file": "index", "database_labels": "label", "query_labels": "label"}  # and their ground truth
 MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
 @dataclass(frozen=True)
+class IndexFile:
+    """Ground truth of a file of pairs or positions, see `mfvpr.datasets.truth_files.truth_from_file`.
+
+    Attributes:
+        path: of the file; for several sequences, in the folder of each.
+        is_widened: whether database images within a tolerance in frames are correct as well.
+    """
+
+    path: Path | str
+    is_widened: bool = False
+
+
+@dataclass(frozen=True)
+class LabelFiles:
+    """Ground truth of two files of labels, see `mfvpr.datasets.truth_files.truth_from_labels`."""
+
+    queries: Path | str
+    database: Path | str
+
+
+GroundTruth = IndexFile | LabelFiles | Truth
+
+
+@dataclass(frozen=True, repr=False)
 class ImageFolder:
     """Images below `root`, by relative POSIX path in natural order (image2 before image10).
 
@@ -36,6 +60,9 @@ class ImageFolder:
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))
 
+    def __repr__(self) -> str:
+        return f"ImageFolder({self.root}: {len(self)} images)"
+
     @property
     def paths(self) -> list[Path]:
         """Full paths of the images, in order."""
@@ -49,7 +76,7 @@ class ImageFolder:
         return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class QuerySequence:
     """Query images of one drive or walk, with their ground truth; `name` stands in results.
 
@@ -63,14 +90,22 @@ class QuerySequence:
     truth: Truth | None
     excluded: Positives | None = None
 
+    def __repr__(self) -> str:
+        truth = type(self.truth).__name__ if self.truth else "no ground truth"
+        return f"QuerySequence({self.name}: {len(self.images)} queries, {truth})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Dataset:
     """One database and at least one sequence of queries; `name` stands in results."""
 
     name: str
     database: ImageFolder
     sequences: tuple[QuerySequence, ...]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{sequence.name} ({len(sequence.images)} queries)" for sequence in self.sequences)
+        return f"Dataset({self.name}: {len(self.database)} database images; {sizes})"
 
     @property
     def only(self) -> QuerySequence:
@@ -89,6 +124,15 @@ class Dataset:
     def truth(self) -> Truth | None:
         """Ground truth of the only sequence."""
         return self.only.truth
+
+    def positives_fingerprint(self, thresholds: Sequence[float]) -> str | None:
+        """Fingerprint of the positives of all sequences, independent of their file; None without ground truth."""
+        content = []
+        for sequence in self.sequences:
+            if sequence.truth is not None:
+                positives = [sequence.truth.positives(threshold) for threshold in thresholds]
+                content.append([sequence.name, *({"rows": each.rows, "offsets": each.offsets} for each in positives)])
+        return fingerprint(recipe_of(content)) if content else None
 
 
 def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
@@ -114,62 +158,37 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
     return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
 
 
-def folder_dataset(
+def folder(
     database: Path | str,
-    queries: Path | str,
+    queries: Path | str | Sequence[Path | str],
     *,
-    ground_truth: str,
+    ground_truth: GroundTruth | str | None,
     name: str = "folder",
-    index_file: Path | str | None = None,
-    widen_index: bool = False,
-    database_labels: Path | str | None = None,
-    query_labels: Path | str | None = None,
     orient: bool = True,
     bits: int | None = 16,
 ) -> Dataset:
-    """Two folders of images as a data set.
+    """Folders of images as a data set: one of database images, and one or several of queries.
+
+        data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
+        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth=IndexFile("pairs.csv"))
 
     Args:
         database: folder of database images.
-        queries: folder of query images.
-        ground_truth: kind of ground truth, one of `ground_truth.KINDS`; "none" = rankings only.
+        queries: folder of query images; or several, each a sequence with the name of its folder. The names differ, and
+            none is in `MEANS`.
+        ground_truth: of every sequence. "order" = query i shows database image i; "utm" = positions in the names;
+            "none" or None = rankings only; or files; or a ground truth of your own.
         name: in results.
-        index_file: for `index`, see `truth_files.truth_from_file`.
-        widen_index: for `index`, whether database images within a tolerance in frames count as well.
-        database_labels, query_labels: for `label`, see `truth_files.truth_from_labels`.
         orient, bits: see `mfvpr.datasets.images.read_image`.
-    """
-    images = image_folder(database, orient=orient, bits=bits)
-    files = {"index_file": index_file, "database_labels": database_labels, "query_labels": query_labels}
-    return Dataset(name, images, (_sequence(name, images, queries, ground_truth, files, widen_index),))
-
-
-def sequences_dataset(
-    database: Path | str,
-    queries: Sequence[Path | str],
-    *,
-    ground_truth: str,
-    name: str = "sequences",
-    index_file: str | None = None,
-    widen_index: bool = False,
-    orient: bool = True,
-    bits: int | None = 16,
-) -> Dataset:
-    """One folder of database images and several folders of queries, each a sequence with the name of its folder.
-
-    Args:
-        database: folder of database images.
-        queries: folders of query images, with different names that are not in `MEANS`.
-        ground_truth: kind of ground truth of every sequence, one of `ground_truth.KINDS` except `label`.
-        name: in results.
-        index_file: for `index`, the file's name in the folder of each sequence.
-        widen_index, orient, bits: see `folder_dataset`.
 
     Raises:
-        InputError: no sequence, two sequences of one name, or a sequence with the name of a mean.
+        InputError: a folder or a file that cannot be used, no sequence, or a name that sequences cannot have.
     """
-    folders = [Path(folder) for folder in queries]
-    names = [(folder.resolve() if folder.name in ("", "..") else folder).name for folder in folders]
+    images = image_folder(database, orient=orient, bits=bits)
+    if isinstance(queries, Path | str):
+        return Dataset(name, images, (_sequence(name, images, queries, ground_truth),))
+    folders = [Path(path) for path in queries]
+    names = [(path.resolve() if path.name in ("", "..") else path).name for path in folders]
     if not names:
         raise InputError("queries: expected the folder of at least one sequence, got none")
     if len({*names}) < len(names):
@@ -177,46 +196,31 @@ def sequences_dataset(
         raise InputError(f"queries: expected sequences of different names, got {duplicate} twice; rename a folder")
     for mean in {*names} & {*MEANS}:
         raise InputError(f"queries: expected no sequence called {mean}, the name of a mean in results; rename it")
-    images, sequences = image_folder(database, orient=orient, bits=bits), []
-    for folder_name, folder in zip(names, folders, strict=True):
-        files = {"index_file": folder / index_file if index_file else None}
-        sequences.append(_sequence(folder_name, images, folder, ground_truth, files, widen_index))
+    sequences = [_sequence(part, images, path, ground_truth, path) for part, path in zip(names, folders, strict=True)]
     return Dataset(name, images, tuple(sequences))
 
 
 def _sequence(
-    name: str,
-    database: ImageFolder,
-    queries: Path | str,
-    ground_truth: str,
-    files: Mapping[str, Path | str | None],
-    widen_index: bool,
+    name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path = Path()
 ) -> QuerySequence:
-    """The queries of a folder with their ground truth; `orient` and `bits` are those of the database."""
+    """The queries of a folder with their ground truth; files of a ground truth are below `root`."""
     images = image_folder(queries, orient=database.orient, bits=database.bits)
-    _check_files(ground_truth, files)
     names = images.names, database.names
-    truth: Truth | None = None
-    if ground_truth == "order":
-        truth = truth_by_order(len(images), len(database))
-    elif ground_truth == "utm":
-        truth = truth_from_names(*names)
-    elif index_file := files["index_file"]:
-        truth = truth_from_file(index_file, *names, widened=widen_index)
-    elif (query_labels := files.get("query_labels")) and (database_labels := files.get("database_labels")):
-        truth = truth_from_labels(query_labels, database_labels, *names)
+    match ground_truth:
+        case None | "none" | Truth():
+            truth = ground_truth if isinstance(ground_truth, Truth) else None
+        case "order":
+            truth = truth_by_order(len(images), len(database))
+        case "utm":
+            truth = truth_from_names(*names)
+        case IndexFile(path, is_widened):
+            truth = truth_from_file(root / path, *names, widened=is_widened)
+        case LabelFiles(query_file, database_file):
+            truth = truth_from_labels(root / query_file, root / database_file, *names)
+        case _:
+            raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; files are given as "
+                             "mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)")  # fmt: skip
     return QuerySequence(name, images, truth)
-
-
-def _check_files(ground_truth: str, files: Mapping[str, Path | str | None]) -> None:
-    if ground_truth not in KINDS:
-        raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}")
-    for option, kind in FILES.items():
-        path = files.get(option)
-        if path is not None and kind != ground_truth:
-            raise InputError(f"{path}: given as {option}, but ground_truth={ground_truth}; set it to {kind}")
-        if path is None and kind == ground_truth:
-            raise InputError(f"ground_truth={kind}: expected a file; give {option} as well")
 
 
 def _images_below(root: Path) -> Iterator[Path]:

@@ -10,6 +10,8 @@ from jaxtyping import Float
 from mfvpr.datasets.positives import Positives
 
 Unit = Literal["frames", "m", "exact"]
+TOLERANCES = (1, 2, 5)  # frames
+RADIUS = 25.0  # meters
 
 
 class Truth(ABC):
@@ -38,7 +40,7 @@ class Truth(ABC):
         nearest = int(np.argmin(distance)) if distance.size else None
         return nearest if nearest is not None and np.isfinite(distance[nearest]) else None
 
-    def thresholds(self, *, tolerances: Iterable[int], radius: float) -> list[float]:
+    def thresholds(self, *, tolerances: Iterable[int] = TOLERANCES, radius: float = RADIUS) -> list[float]:
         """Thresholds in the unit, ascending: tolerances in frames, the radius in meters, or 0 if exact."""
         return {"frames": sorted(set(tolerances)), "m": [radius], "exact": [0]}[self.unit]
 

@@ -1,6 +1,6 @@
 """Evaluation of all stages in one call: recall, precision, calibration, statistics.
 
-Read first: evaluation (`evaluate`: all stages), sequence_matching and stages (its steps), results, recall, protocol
+Read first: evaluation (`rank_dataset`: all stages), sequence_matching and stages (its steps), results, recall, protocol
 and selection (choose settings on one half, report on the other), precision, calibration, statistics.
 
 Imports datasets, features, matching, reranking, retrieval, scoring, storage, types, utils.

@@ -3,8 +3,8 @@ __all__ = [
     "EvaluationProtocol",
     "Half",
     "Pipeline",
+    "RankedDataset",
     "Recall",
-    "Result",
     "Shard",
     "Split",
     "System",
@@ -12,7 +12,6 @@ __all__ = [
     "best_setting",
     "confidence_inputs",
     "estimate",
-    "evaluate",
     "evaluation_protocol",
     "fill_shard",
     "fit_confidence",
@@ -22,6 +21,7 @@ __all__ = [
     "mcnemar",
     "neighboring_settings",
     "precision_recall",
+    "rank_dataset",
     "read_confidences",
     "recall_at_k",
     "reliability",
@@ -30,11 +30,11 @@ __all__ = [
 ]
 
 from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
-from .evaluation import evaluate
+from .evaluation import rank_dataset
 from .precision import precision_recall, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .recall import Tally, hits, recall_at_k
-from .results import Recall, Result
+from .results import RankedDataset, Recall
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .shards import Shard, fill_shard

@@ -2,8 +2,10 @@
 
     sift = Sift()
     pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())), candidates=50)
-    result = mfvpr.evaluate(dataset, System(pipeline, {"histogram": mfvpr.HistogramOfShifts()}))
-    print(result.recall([0.0])["histogram"].pooled)
+    ranked = rank_dataset(dataset, System(pipeline, {"histogram": mfvpr.HistogramOfShifts()}))
+    print(ranked.recall([0.0])["histogram"].pooled)
+
+`mfvpr.evaluate` does this for several data sets and systems, and reports.
 
 Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
@@ -14,12 +16,12 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.results import Result
+from mfvpr.evaluation.results import RankedDataset
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
 from mfvpr.evaluation.validation import score_warnings
 from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
-from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import COHORT, Matched
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
@@ -29,9 +31,9 @@ from mfvpr.utils.runtime import Runtime
 Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer
 
 
-def evaluate(
+def rank_dataset(
     dataset: Dataset, system: System, *, cache: FeatureCache | None = None, runtime: Runtime | None = None
-) -> Result:
+) -> RankedDataset:
     """Rank every query's candidates by the retrieval, by every scorer, and by combined scores.
 
     Args:
@@ -58,13 +60,13 @@ def evaluate(
         cohort, values = _score_cohort(dataset, system, system.cohort, cache, watch)
         strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
     scored = [_score(dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
-    ways = system.fused, system.correlated, system.ties
-    ranked = [rank_by_systems(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
+    ways = system.final_scores.values(), system.ties
+    ranked = [rank_by_scores(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
     matched = [sequence for sequence, _ in scored]
     for line in score_warnings(matched, ranked, system.scorers):
         cache.warn(line)
     systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
-    return Result(dataset, matched, systems, watch.seconds)
+    return RankedDataset(dataset, system, matched, systems, watch.seconds)
 
 
 def _score(dataset: Dataset, sequence: QuerySequence, system: System, cache: FeatureCache, watch: Stopwatch) -> Scored:

@@ -30,7 +30,8 @@ class Tally:
         """Count the queries of a ranking; for the arguments see `recall_at_k`."""
         order = np.asarray(as_array(order))
         if order.ndim != 2:
-            raise InputError(f"order: expected database rows [Q, C] of the queries, got shape {list(order.shape)}")
+            raise InputError(f"order: expected database rows [Q, C], best first, got {list(order.shape)}; count each "
+                             "ranking of several by itself")  # fmt: skip
         if order.size == 0:
             return cls(np.zeros(len(ks), int), len(order))
         sets = positives if isinstance(positives, Positives) else Positives.from_matrix(np.asarray(as_array(positives)))
@@ -65,5 +66,8 @@ def recall_at_k(
         order: `[Q, C]` database rows, best first; -1 = none.
         positives: a query without positives counts as a failure.
         ks: depths; beyond C all C candidates count.
+
+    Raises:
+        InputError: `order` has other axes.
     """
     return Tally.of(order, positives, ks).recall

@@ -1,4 +1,4 @@
-"""Results of an evaluation: candidates, matches and rankings of every sequence, and their recall."""
+"""Rankings of a data set: candidates, matches and rankings of every sequence, and their recall."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,20 +11,30 @@ from jaxtyping import Float
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.recall import Tally
+from mfvpr.evaluation.system import System
 from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.utils.errors import InputError
 
+KS = (1, 5, 10)  # depths of recall, by default
 Reason = Literal["no candidates", "too few features", "too few matches", "low confidence"]  # why there is no place
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recall:
-    """Recall of one system: counts for each sequence, and in it for each threshold."""
+    """Recall of one system.
+
+    Attributes:
+        tallies: counts `[S][T]` for each sequence, and in it for each threshold.
+    """
 
     tallies: Sequence[Sequence[Tally]]
 
+    def __repr__(self) -> str:
+        return f"Recall({np.round(self.pooled, 3).tolist()} over all queries, by threshold and k)"
+
     @property
     def by_sequence(self) -> Float[np.ndarray, "sequences tolerances ks"]:
+        """Recall of each sequence."""
         return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
 
     @property
@@ -39,25 +49,25 @@ class Recall:
 
 
 @dataclass(frozen=True, repr=False)
-class Result:
-    """The result of `mfvpr.evaluate`.
+class RankedDataset:
+    """Rankings of one data set by one system.
 
     Attributes:
-        dataset: that was evaluated.
-        matched: candidates and matches by sequence.
-        systems: rankings by name of the system and sequence: retrieval alone, each scorer, and combined scores.
+        dataset: of S sequences.
+        system: that ranks.
+        matched: candidates and matches of each sequence.
+        systems: rankings of each sequence, by name of the final score: retrieval alone, each scorer, combined scores.
         seconds: by stage.
     """
 
     dataset: Dataset
+    system: System
     matched: Sequence[Matched]
     systems: Mapping[str, Sequence[Ranked]]
     seconds: Mapping[str, float]
 
     def __repr__(self) -> str:
-        sequences = [matched.sequence for matched in self.matched]
-        sizes = ", ".join(f"{sequence.name} ({len(sequence.images)} queries)" for sequence in sequences)
-        return f"Result({self.dataset.name}: {sizes}; {', '.join(self.systems)})"
+        return f"RankedDataset({self.dataset!r} by {', '.join(self.systems)})"
 
     def positives(self, threshold: float) -> list[Positives]:
         """Positives at a threshold, by sequence.
@@ -78,7 +88,7 @@ class Result:
                                  f"database images, got one of {got[0]} and {got[1]}")  # fmt: skip
         return positives
 
-    def recall(self, thresholds: Sequence[float], ks: Sequence[int] = (1, 5, 10)) -> dict[str, Recall]:
+    def recall(self, thresholds: Sequence[float], ks: Sequence[int] = KS) -> dict[str, Recall]:
         """Recall@K of every system; a query without positives counts as a failure.
 
         Args:

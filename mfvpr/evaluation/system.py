@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +18,9 @@ from mfvpr.matching.match_set import Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher, NearestNeighborMatcher
 from mfvpr.matching.nearest_neighbors import CrossCheck
 from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import Fusion
+from mfvpr.reranking.fusion import FinalScore, Fusion, final_scores
 from mfvpr.reranking.ranking import Ties
-from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL
+from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval.retriever import Retriever
 from mfvpr.scoring.fields import check_bounds
 from mfvpr.scoring.registry import SCORERS
@@ -107,22 +108,15 @@ class System:
             InputError: a scorer is not callable or out of its bounds, a name is taken, or a combination has no scorer.
         """
         require_word("ties", self.ties, Ties)
-        with_cohort = [] if self.cohort is None else [f"{name} + {COHORT}" for name in self.scorers]
-        alone = [*self.scorers, *with_cohort]
-        for name, fusion in self.fused.items():
-            fusion.check(name, alone)
-        combined = [fusion.system(name) for name, fusion in self.fused.items()]
-        several = {*alone, *combined}
-        if unknown := [name for name in self.correlated if name not in several]:
-            raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), got "
-                             f"{unknown[0]}")  # fmt: skip
-        reserved = {RETRIEVAL, *with_cohort, *combined, *(f"{name} + {FRAMES}" for name in self.correlated)}
+        if self.headline not in self.final_scores:
+            raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
         for name, scorer in self.scorers.items():
-            if name in reserved:
-                raise InputError(f"scorers: {name} is the name of another system; choose another one")
             _check_scorer(name, scorer)
-        if self.headline not in {*alone, *reserved}:
-            raise InputError(f"final={self.final!r}: expected one of {', '.join([*alone, *reserved])}")
+
+    @cached_property
+    def final_scores(self) -> dict[str, FinalScore]:
+        """Scores that candidates are ranked by, by name: of retrieval, of each scorer, and combined ones."""
+        return final_scores(self.scorers, self.cohort, self.fused, self.correlated)
 
     @property
     def headline(self) -> str:

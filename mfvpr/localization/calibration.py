@@ -11,7 +11,7 @@ from mfvpr.evaluation.calibration import (
     read_confidences,
     write_confidences,
 )
-from mfvpr.evaluation.evaluation import evaluate
+from mfvpr.evaluation.evaluation import rank_dataset
 from mfvpr.evaluation.system import System
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.storage.feature_cache import FeatureCache
@@ -26,7 +26,7 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     sequence = dataset.only
     if sequence.truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
-    result = evaluate(dataset, system, cache=cache)
+    result = rank_dataset(dataset, system, cache=cache)
     threshold = middle(sequence.truth.thresholds(tolerances=TOLERANCES, radius=RADIUS))
     [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
     [positives] = result.positives(threshold)

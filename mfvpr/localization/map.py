@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.datasets.datasets import ImageFolder, folder_dataset, image_folder
+from mfvpr.datasets.datasets import ImageFolder, image_folder
+from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.calibration import Confidence
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
@@ -22,7 +23,7 @@ from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
-from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
@@ -218,9 +219,8 @@ class Map(MapImages):
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        fused = {name: fusion for name, fusion in self.system.fused.items()
-                 if fusion.system(name) == self.system.headline}  # fmt: skip
-        rankings = rank_by_systems(shortlist, padded_scores, fused, {}, self.system.ties)
+        final_scores = [self.system.final_scores[name] for name in dict.fromkeys((RETRIEVAL, self.system.headline))]
+        rankings = rank_by_scores(shortlist, padded_scores, final_scores, self.system.ties)
         cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 

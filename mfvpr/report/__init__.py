@@ -1,9 +1,9 @@
 """Results for people: tables, figures, pages, and the files of a run folder.
 
-Read first: runs (run folders), tables, evaluations (files of an evaluation), sweeps, comparisons (of learning),
-figures, then pages/ (HTML).
+Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations and run_files (files of an evaluation),
+sweeps, comparisons (of learning), figures, then pages/ (HTML).
 
-Imports datasets, evaluation, features, localization, reranking, scoring, tuning, types, utils.
+Imports datasets, evaluation, features, localization, reranking, scoring, storage, tuning, types, utils.
 """
 
 import lazy_loader

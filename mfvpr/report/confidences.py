@@ -42,7 +42,7 @@ class CalibratedPredictions:
     @cached_property
     def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
         """Confidence by system, NaN without a prediction, or without anything to fit on."""
-        systems = self.evaluation.result.systems
+        systems = self.evaluation.ranked.systems
         if self.confidences is not None:
             return {name: confidence.probability(self._inputs(name, confidence))
                     for name, confidence in self.confidences.items() if name in systems}  # fmt: skip
@@ -51,14 +51,14 @@ class CalibratedPredictions:
     @cached_property
     def fitted(self) -> dict[str, Confidence]:
         """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
-        systems = self.evaluation.result.systems if self.evaluation.thresholds else ()
+        systems = self.evaluation.ranked.systems if self.evaluation.thresholds else ()
         inputs = {name: self._inputs(name) for name in systems}
         return {name: fit_confidence(values, self.evaluation.hits(name)) for name, values in inputs.items()
                 if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
-        parts = self.evaluation.result.systems[system]
+        parts = self.evaluation.ranked.systems[system]
         return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
 
     @cached_property
@@ -85,7 +85,7 @@ class CalibratedPredictions:
 
     def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
-        pairs = zip(self.evaluation.result.systems[system], self.evaluation.result.systems[RETRIEVAL], strict=True)
+        pairs = zip(self.evaluation.ranked.systems[system], self.evaluation.ranked.systems[RETRIEVAL], strict=True)
         return np.concatenate([confidence_inputs(*pair, **options) for pair in pairs])
 
     def _cross_fitted_probability(self, system: str) -> np.ndarray:
@@ -134,7 +134,7 @@ def _confidence_row(calibrated: CalibratedPredictions, system: str) -> list[str]
 def share_table(calibrated: CalibratedPredictions) -> Table:
     """Recall at 1 of all queries, by the share of them that is re-ranked, see `recall_by_share`."""
     recalls = _recalls_by_share(calibrated)
-    names = [name for name in calibrated.evaluation.result.systems if name != RETRIEVAL]
+    names = [name for name in calibrated.evaluation.ranked.systems if name != RETRIEVAL]
     rows = [[f"{share:.2f}", *(f"{100 * recall[place]:.1f}" for recall in recalls.values())]
             for place, share in enumerate(SHARES) if RETRIEVAL in calibrated.probabilities]  # fmt: skip
     return Table(["re-ranked", *names], rows, text_columns=0)
@@ -142,7 +142,7 @@ def share_table(calibrated: CalibratedPredictions) -> Table:
 
 def _recalls_by_share(calibrated: CalibratedPredictions) -> dict[str, np.ndarray]:
     """`recall_by_share` of all systems but retrieval; none where the confidence of retrieval is not known."""
-    systems = calibrated.evaluation.result.systems if RETRIEVAL in calibrated.probabilities else ()
+    systems = calibrated.evaluation.ranked.systems if RETRIEVAL in calibrated.probabilities else ()
     return {name: recall_by_share(calibrated, name) for name in systems if name != RETRIEVAL}
 
 
@@ -167,7 +167,7 @@ def write_confidence(folder: Path, calibrated: CalibratedPredictions, provenance
         return
     for name, table in (("confidence", confidence_table(calibrated)), ("rerank_share", share_table(calibrated))):
         write_csv(folder / f"{name}.csv", table.header, table.rows)
-    points = [[name, by, *map(format_number, point)] for name in evaluation.result.systems
+    points = [[name, by, *map(format_number, point)] for name in evaluation.ranked.systems
               for by, curve in calibrated.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
     write_confidences(folder / "confidence.json", calibrated.fitted, provenance)
@@ -182,9 +182,9 @@ def _write_top_predictions(folder: Path, calibrated: CalibratedPredictions) -> N
     `in_database` are empty.
     """
     evaluation, name = calibrated.evaluation, calibrated.evaluation.headline
-    database = evaluation.result.dataset.database.names
+    database = evaluation.ranked.dataset.database.names
     refused, probabilities = calibrated.refused_of_headline, evaluation.by_sequence(calibrated.probabilities[name])
-    for place, ranked in enumerate(evaluation.result.systems[name]):
+    for place, ranked in enumerate(evaluation.ranked.systems[name]):
         is_correct, positives = evaluation.is_correct(name, place), evaluation.positives[place]
         lines = []
         for query, image in enumerate(evaluation.sequences[place].images.names):
@@ -203,7 +203,7 @@ def confidence_figures(calibrated: CalibratedPredictions) -> list[Figure]:
     """Precision against recall, reliability, and recall over the share that is re-ranked; with ground truth."""
     if not calibrated.evaluation.thresholds:
         return []
-    curves = {name: calibrated.curves(name) for name in calibrated.evaluation.result.systems}
+    curves = {name: calibrated.curves(name) for name in calibrated.evaluation.ranked.systems}
     figures: list[Figure] = [("precision_recall.png", partial(precision_recall_figure, curves=curves))]
     if calibrated.probabilities:
         reliabilities = {name: reliability(values, calibrated.evaluation.hits(name))

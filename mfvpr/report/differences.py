@@ -36,7 +36,7 @@ def differences(evaluation: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order; none without ground truth."""
     if not evaluation.thresholds:
         return []
-    hits, places = {name: evaluation.hits(name) for name in evaluation.result.systems}, _places(evaluation)
+    hits, places = {name: evaluation.hits(name) for name in evaluation.ranked.systems}, _places(evaluation)
     return [
         Difference(first, second, mcnemar(hits[first], hits[second]),
                    block_sign_flips(hits[first], hits[second], places=places))
@@ -75,7 +75,7 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
     """
     if not evaluation.thresholds:
         return
-    systems, places = [*evaluation.result.systems], _places(evaluation)
+    systems, places = [*evaluation.ranked.systems], _places(evaluation)
     places = np.arange(sum(len(sequence.images) for sequence in evaluation.sequences)) if places is None else places
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
     places_by_sequence = evaluation.by_sequence(places)

@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +16,7 @@ from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.locks import lock_folder
+from mfvpr.utils.versions import versions
 
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # the file of a run that appears last
@@ -114,6 +115,16 @@ def commit(place: Path) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return output.strip() or None
+
+
+def write_about(
+    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], command: str | None = None
+) -> None:
+    """Write `run.json`: how a run was made."""
+    write_json(folder / "run.json", {
+        "command": command, "settings": settings, "ground_truth": ground_truth, "commit": commit(Path()),
+        "versions": versions(),
+    })  # fmt: skip
 
 
 def write_json(path: Path, value: Any) -> None:

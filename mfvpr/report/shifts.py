@@ -26,8 +26,8 @@ def write_shifts(
     and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
     `refused` are queries of each sequence, which have no line; None = no query is refused.
     """
-    names = evaluation.result.dataset.database.names
-    sequences = zip(evaluation.result.matched, evaluation.result.systems[evaluation.headline], strict=True)
+    names = evaluation.ranked.dataset.database.names
+    sequences = zip(evaluation.ranked.matched, evaluation.ranked.systems[evaluation.headline], strict=True)
     for place, (matched, ranked) in enumerate(sequences):
         match_set = matched.by_scale
         if isinstance(match_set, Scales):

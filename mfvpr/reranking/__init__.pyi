@@ -1,4 +1,5 @@
 __all__ = [
+    "FinalScore",
     "FrameCorrelation",
     "Fusion",
     "Matched",
@@ -13,7 +14,7 @@ __all__ = [
 ]
 
 from .frame_correlation import FrameCorrelation
-from .fusion import Fusion
+from .fusion import FinalScore, Fusion
 from .grids import score_grid
 from .ranking import balancing_c, combine, fuse_scales, rank, rerank, score_candidates
 from .results import Matched, Ranked

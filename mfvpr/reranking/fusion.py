@@ -1,6 +1,6 @@
-"""Rankings by every system: retrieval alone, each scorer, and fusions of several scores."""
+"""Final scores of a system, which candidates are ranked by: of retrieval, of each scorer, and combined ones."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -90,26 +90,89 @@ class Fusion:
         return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
 
 
-def rank_by_systems(
-    candidates: Shortlist, scores: Mapping[str, Scores], fused: Mapping[str, Fusion],
-    correlated: Mapping[str, FrameCorrelation], ties: Ties, *,
+@dataclass(frozen=True)
+class Cohort:
+    """Normalization of a score with a cohort; `cohort` is that of `mfvpr.System`."""
+
+    cohort: int
+
+
+@dataclass(frozen=True)
+class FinalScore:
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores.
+
+    Attributes:
+        name: of the score and its ranking.
+        scorers: names of those that take part, the main one first; none = retrieval alone.
+        base: name of the final score that this one is made of, by `step`; "" = as retrieval or the scorer gives it.
+        step: how it is made.
+    """
+
+    name: str
+    scorers: tuple[str, ...] = ()
+    base: str = ""
+    step: Cohort | Fusion | FrameCorrelation | None = None
+
+
+def final_scores(
+    scorers: Iterable[str], cohort: int | None, fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation],
+) -> dict[str, FinalScore]:  # fmt: skip
+    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`.
+
+    Raises:
+        InputError: a name is taken, or a combination is not one of known scores.
+    """
+    known = {RETRIEVAL: FinalScore(RETRIEVAL)}
+
+    def add(name: str, *of: Any) -> None:
+        if name in known:
+            raise InputError(f"scorers: {name} is the name of another system; choose another one")
+        known[name] = FinalScore(name, *of)
+
+    for name in scorers:
+        add(name, (name,))
+    if cohort is not None:
+        for name in scorers:
+            add(f"{name} + {COHORT}", (name,), name, Cohort(cohort))
+    alone = [*known][1:]
+    for name, fusion in fused.items():
+        fusion.check(name, alone)
+        members = [scorer for member in fusion.members(name) for scorer in known[member].scorers]
+        add(fusion.system(name), tuple(members), name, fusion)
+    several = [*known][1:]
+    for name, correlation in correlated.items():
+        if name not in several:
+            raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), "
+                             f"got {name}")  # fmt: skip
+        add(f"{name} + {FRAMES}", known[name].scorers, name, correlation)
+    return known
+
+
+def rank_by_scores(
+    candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of queries by name of the system.
+    """Rankings of queries by name of the final score.
 
     Args:
         candidates: of the queries, which are a sequence if scores are correlated.
-        scores: by name of the scorer.
-        fused, correlated, ties: see `mfvpr.System`.
-        hubness: by name of the scorer; None = no score normalization with a cohort.
+        scores: `[Q, C]` by name of the scorer.
+        final_scores: those that are made of other ones come behind them.
+        ties: see `mfvpr.System`.
+        hubness: by name of the scorer, for score normalization with a cohort.
     """
-    scores = {**scores}
-    for name, strengths in (hubness or {}).items():
-        scores[f"{name} + {COHORT}"] = by_hubness(candidates, scores[name], strengths, name=name)
-    scores |= {fusion.system(name): fusion(name, candidates, scores) for name, fusion in fused.items()}
-    scores |= {f"{name} + {FRAMES}": correlate(candidates, scores[name]) for name, correlate in correlated.items()}
-    scores = {RETRIEVAL: candidates.scores} | scores
-    return {name: _rank(candidates, values, ties) for name, values in scores.items()}
+    known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
+    for score in final_scores:
+        base = score.base
+        match score.step:
+            case Cohort():
+                known[score.name] = by_hubness(candidates, known[base], hubness[base], name=base)
+            case Fusion() as fusion:
+                known[score.name] = fusion(base, candidates, known)
+            case FrameCorrelation() as correlation:
+                known[score.name] = correlation(candidates, known[base])
+    return {score.name: _rank(candidates, known[score.name], ties) for score in final_scores}
 
 
 def _between(value: Any, low: float, high: float) -> bool:

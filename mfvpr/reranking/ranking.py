@@ -15,7 +15,16 @@ from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, check_host, on_host, score_pairs
 from mfvpr.types import Array, Matches, Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import as_array, as_float, compiled, is_concrete, masked, masked_mean, masked_std, or_nan
+from mfvpr.utils.numerics import (
+    as_array,
+    at_least_single,
+    compiled,
+    is_concrete,
+    masked,
+    masked_mean,
+    masked_std,
+    or_nan,
+)
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
@@ -75,7 +84,14 @@ def combine(
         rerank_scores: s_r, re-ranking scores.
         c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
+    filter_scores, rerank_scores = map(_wide, (filter_scores, rerank_scores))
     return c * filter_scores + rerank_scores
+
+
+def _wide(scores: Array) -> Array:
+    """Scores of at least 32 bits: products of whole numbers or of float16 overflow."""
+    is_wide = jnp.issubdtype(scores.dtype, jnp.floating) and jnp.finfo(scores.dtype).bits >= 32
+    return scores if is_wide else scores.astype(jnp.float32)
 
 
 def balancing_c(
@@ -89,7 +105,7 @@ def balancing_c(
     """
 
     def deviation(scores: Array) -> Array:
-        return masked_std(scores, mask & jnp.isfinite(scores))
+        return masked_std(_wide(scores), mask & jnp.isfinite(scores))
 
     retrieval_deviation = deviation(retrieval_scores)
     c = deviation(rerank_scores) / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
@@ -166,7 +182,7 @@ def fuse_scales(
 @partial(compiled, static_argnames="normalize")
 def _fuse_scales(scores: Array, mask: Array, weights: Array | None, *, normalize: str) -> Array:
     """`fuse_scales`, 0 without a candidate."""
-    scores = as_float(scores)
+    scores = at_least_single(scores)
     weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
     mask = jnp.broadcast_to(mask, scores.shape[:-1])
     if normalize == "zscore":

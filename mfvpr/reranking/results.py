@@ -16,9 +16,17 @@ FRAMES = "frames"  # in names of rankings by frame correlation, which uses the q
 COHORT = "cohort"  # in names of rankings by scores that are normalized with a cohort
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Matched:
-    """Candidates of a sequence, and their matches by scale; `weights` of the scales, None = 1 each."""
+    """Candidates of Q queries and their matches.
+
+    Attributes:
+        sequence: of the queries.
+        candidates: `[Q, C]` database rows.
+        matches: of each scale.
+        bad_queries, bad_database: row -> reason, of images that could not be used.
+        weights: of the scales; None = 1 each.
+    """
 
     sequence: QuerySequence
     candidates: Shortlist
@@ -27,18 +35,29 @@ class Matched:
     bad_database: Mapping[int, str]
     weights: tuple[float, ...] | None = None
 
+    def __repr__(self) -> str:
+        return f"Matched({self.sequence!r}, {self.candidates.indices.shape[1]} candidates each)"
+
     @property
     def by_scale(self) -> MatchSet | Scales:
         """Input of scoring; several scales are fused, each standardized over a query's candidates."""
         return self.matches[0] if len(self.matches) == 1 else Scales(self.matches, self.weights)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Ranked:
-    """Ranking of a sequence: database rows, best first, and scores in this order."""
+    """Ranking of the candidates of a sequence.
+
+    Attributes:
+        rows: `[Q, C]` database rows, best first; -1 = none.
+        scores: `[Q, C]` in this order.
+    """
 
     rows: Int[np.ndarray, "queries candidates"]
     scores: Scores
+
+    def __repr__(self) -> str:
+        return "Ranked({} queries, {} candidates each)".format(*self.rows.shape)
 
     @property
     def shortlist(self) -> Shortlist:

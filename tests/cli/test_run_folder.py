@@ -25,7 +25,6 @@ from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.report import runs
 from mfvpr.report.evaluations import SequenceFigures
-from mfvpr.scoring import HistogramOfShifts
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
@@ -172,9 +171,9 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     assert max(height for name, height in heights.items() if name.startswith("correct")) < 600
 
     page = page_of(outcome)
-    [ranked], correct = outcome.report.result.systems["histogram"], outcome.report.is_correct("histogram", 0)
+    [ranked], correct = outcome.report.ranked.systems["histogram"], outcome.report.is_correct("histogram", 0)
     query_by_case = {bool(correct[query].any()): query for query in np.flatnonzero(~correct[:, 0])}
-    names = outcome.images.dataset.database.names
+    names = outcome.report.ranked.dataset.database.names
     query = query_by_case[True]
     rank = int(np.argmax(correct[query]))
     [prediction] = page.correct_candidates(query)
@@ -182,24 +181,24 @@ def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     assert prediction.caption == f"correct: {names[ranked.rows[query, rank]]}, rank {rank + 1}, score {score}"
     assert float(prediction.explanation.score) == pytest.approx(float(score), rel=1e-3)
     [prediction] = page.correct_candidates(query_by_case[False])
-    place = outcome.images.dataset.truth.place(query_by_case[False])
+    place = outcome.report.ranked.dataset.truth.place(query_by_case[False])
     assert prediction.caption == f"correct: {names[place]}, not among the 3 candidates"
     assert prediction.matches is None
 
 
 def page_of(outcome, **changes):
-    result = outcome.report.result
-    dataset = replace(result.dataset, sequences=(replace(result.dataset.only, **changes),))
-    evaluation = replace(outcome.report, result=replace(result, dataset=dataset))
-    return SequenceFigures(evaluation, 0, outcome.tools.pipeline.extractor, HistogramOfShifts(), np.zeros(24, bool))
+    ranked = outcome.report.ranked
+    dataset = replace(ranked.dataset, sequences=(replace(ranked.dataset.only, **changes),))
+    report = replace(outcome.report, ranked=replace(ranked, dataset=dataset))
+    return SequenceFigures(report, 0, np.zeros(24, bool))
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
     """If the nearest image is excluded, the page shows another correct image, or none."""
     correct = outcome.report.is_correct("histogram", 0)
     query = int(np.flatnonzero(~correct.any(axis=1))[0])
-    names, truth = outcome.images.dataset.database.names, outcome.images.dataset.truth
-    excluded = np.zeros((len(outcome.images.dataset.queries), len(names)), bool)
+    names, truth = outcome.report.ranked.dataset.database.names, outcome.report.ranked.dataset.truth
+    excluded = np.zeros((len(outcome.report.ranked.dataset.queries), len(names)), bool)
     excluded[query, truth.place(query)] = True
 
     def predictions(excluded):
@@ -212,7 +211,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
 
 
 def test_figures_of_chosen_queries(outcome):
-    query_rows, dataset = evaluation.query_rows, outcome.images.dataset
+    query_rows, dataset = evaluation.query_rows, outcome.report.ranked.dataset
     assert query_rows([5, "0002.png", 5], dataset) == [5, 2]
     assert query_rows(7, dataset) == 7
     for incorrect in (24, -1, "nope.png"):
@@ -350,9 +349,7 @@ def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
-    monkeypatch.setattr(
-        "mfvpr.report.evaluations.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
-    )
+    monkeypatch.setattr("mfvpr.report.figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + retrieval " in stdout

@@ -51,9 +51,14 @@ def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path)
     assert recipe_of(again.pipeline) == recipe_of(system.pipeline)
     data = build.dataset(composed(*small(tmp_path))["dataset"], lambda done, total: None)
     result = mfvpr.evaluate(data, system, cache=FeatureCache(tmp_path / "features"))
-    names = np.array(data.database.names)[result.systems["histogram"][0].rows[:, 0]]
+    names = np.array(data.database.names)[result.only.systems["histogram"][0].rows[:, 0]]
     rows = [row for row in csv_rows(tmp_path / "run" / "predictions.csv") if row["rank"] == "1"]
     assert [row["database"] for row in rows] == names.tolist()
+    result.save(tmp_path / "saved", thresholds=[0, 1], ks=[1, 5])
+    files = {path.relative_to(tmp_path / "run") for path in (tmp_path / "run").rglob("*.csv")}
+    assert len(files) > 10
+    for file in files:
+        assert (tmp_path / "saved" / file).read_bytes() == (tmp_path / "run" / file).read_bytes()
     street = mfvpr.Map(tmp_path / "map", system)
     street.build(data.database)
     assert [street.localize(path).place for path in data.queries.paths] == names.tolist()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mfvpr import InputError
-from mfvpr.datasets import folder_dataset, image_folder
+from mfvpr import InputError, datasets
+from mfvpr.datasets import IndexFile, image_folder
 from mfvpr.utils.files import printable, write_text
 from tests.builders import fill
 from tests.io.checks import one_line_error
@@ -108,5 +108,5 @@ def test_names_that_are_not_utf8(tmp_path):
     write_text(tmp_path / "a.json", json.dumps([name], ensure_ascii=False))
     assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == [name]  # the very name
     (tmp_path / "gt.csv").write_bytes(b"query,database\ncaf\xe9.png,0\n")  # as a shell writes it
-    truth = folder_dataset(folder, folder, ground_truth="index", index_file=tmp_path / "gt.csv").truth
+    truth = datasets.folder(folder, folder, ground_truth=IndexFile(tmp_path / "gt.csv")).truth
     assert truth.place(0) == 0

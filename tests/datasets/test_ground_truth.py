@@ -10,8 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import InputError, frame_positives
-from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth, folder_dataset
+from mfvpr import InputError, datasets, frame_positives
+from mfvpr.datasets import (
+    AllowedTruth,
+    FrameTruth,
+    IndexFile,
+    LabelFiles,
+    LabelTruth,
+    Positives,
+    RadiusTruth,
+)  # fmt: skip
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.datasets.truth_files import truth_from_labels
 from mfvpr.evaluation import evaluation_protocol
@@ -29,11 +37,12 @@ def folders(tmp_path):
 def test_order(folders):
     database, queries = folders
     with pytest.raises(InputError, match=r"ground_truth=order: .*queries .*database images, got 2 and 3"):
-        folder_dataset(database, queries, ground_truth="order")
-    truth = folder_dataset(database, database, ground_truth="order").truth
+        datasets.folder(database, queries, ground_truth="order")
+    truth = datasets.folder(database, database, ground_truth="order").truth
     np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(3, dtype=bool))
     assert truth.positives(1).counts.sum() == 7
-    assert folder_dataset(database, queries, ground_truth="none").truth is None
+    for unknown in ("none", None):
+        assert datasets.folder(database, queries, ground_truth=unknown).truth is None
 
 
 @pytest.mark.parametrize(("suffix", "content"), [
@@ -48,30 +57,31 @@ def test_order(folders):
 def test_pairs_or_positions_of_a_file(folders, tmp_path, suffix, content):
     path = tmp_path / f"gt.{suffix}"
     np.savez(path, **content) if suffix == "npz" else write_text(path, content)
-    truth = folder_dataset(*folders, ground_truth="index", index_file=path).truth
+    truth = datasets.folder(*folders, ground_truth=IndexFile(path)).truth
     np.testing.assert_array_equal(truth.positives(25).dense(), [[True, False, True], [False, False, False]])
 
 
 def test_utm_reads_the_file_name_only(tmp_path):
     database = fill(tmp_path / "at@home@1@" / "db", ["@0500000.00@4400000.00@.png", "x/@0500030.00@4400000.00@y@.png"])
     queries = fill(tmp_path / "at@home@1@" / "q", ["@0500010.00@4400000.00@@@@.png"])
-    truth = folder_dataset(database, queries, ground_truth="utm").truth
+    truth = datasets.folder(database, queries, ground_truth="utm").truth
     assert truth.unit == "m"
     np.testing.assert_array_equal(truth.positives(15).dense(), [[True, False]])
     np.testing.assert_array_equal(truth.positives(25).dense(), [[True, True]])
 
 
-@pytest.mark.parametrize("kind", [None, "names"])
+@pytest.mark.parametrize("kind", ["names", "index", 5])
 def test_ground_truth_must_be_chosen_even_if_counts_agree(folders, kind):
     with one_line_error(r"order \(.*index \(.*utm \(.*label \(.*none \("):
-        folder_dataset(folders[0], folders[0], ground_truth=kind)
+        datasets.folder(folders[0], folders[0], ground_truth=kind)
 
 
 def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tmp_path):
     write_text(tmp_path / "gt.csv", "query,database\na.png,2.png\nb.png,\n")
-    index = {"ground_truth": "index", "index_file": tmp_path / "gt.csv"}
-    exact = folder_dataset(*folders, **index).truth
-    widened = folder_dataset(*folders, **index, widen_index=True).truth
+    exact, widened = (
+        datasets.folder(*folders, ground_truth=IndexFile(tmp_path / "gt.csv", is_widened)).truth
+        for is_widened in (False, True)
+    )
     for tolerance in (0, 1, 5):
         np.testing.assert_array_equal(exact.positives(tolerance).dense(), [[False, False, True], [False] * 3])
     np.testing.assert_array_equal(widened.positives(1).dense(), [[False, True, True], [False] * 3])
@@ -84,16 +94,18 @@ def test_an_index_file_says_all_that_is_right_unless_neighbors_count(folders, tm
 def labels(tmp_path, database, queries):
     write_text(tmp_path / "db.csv", "name,label\n" + database)
     write_text(tmp_path / "q.csv", "name,label\n" + queries)
-    return {"ground_truth": "label", "database_labels": tmp_path / "db.csv", "query_labels": tmp_path / "q.csv"}
+    return LabelFiles(tmp_path / "q.csv", tmp_path / "db.csv")
 
 
 def test_labels(folders, tmp_path):
     files = labels(tmp_path, "2.png, hall\n0.png,kitchen\n1.png,hall \n", "b.png,attic\na.png,hall\n")
-    truth = folder_dataset(*folders, **files).truth
+    truth = datasets.folder(*folders, ground_truth=files).truth
     np.testing.assert_array_equal(truth.positives(5).dense(), [[False, True, True], [False, False, False]])
     assert (truth.place(0), truth.place(1)) == (1, None)
     assert truth.thresholds(tolerances=[1, 2], radius=25.0) == [0]
-    truth = folder_dataset(*folders, **labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")).truth
+    truth = datasets.folder(
+        *folders, ground_truth=labels(tmp_path, "0.png,\n1.png,\n2.png,x\n", "a.png,\nb.png,x\n")
+    ).truth
     np.testing.assert_array_equal(truth.positives(0).dense(), [[False, False, False], [False, False, True]])
 
 
@@ -106,29 +118,16 @@ def test_labels(folders, tmp_path):
 def test_wrong_labels_are_errors_of_one_line(folders, tmp_path, database, words):
     files = labels(tmp_path, database, "a.png,x\nb.png,x\n")
     with one_line_error(None, words, str(tmp_path / "db.csv")):
-        folder_dataset(*folders, **files)
+        datasets.folder(*folders, ground_truth=files)
 
 
 def test_a_name_in_two_folders_needs_its_path(tmp_path):
     both = fill(tmp_path / "both", ["left/0.png", "right/0.png"])
     with pytest.raises(InputError, match=r"got '0\.png'; several .*paths"):
-        folder_dataset(both, both, **labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
+        datasets.folder(both, both, ground_truth=labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
     full = "left/0.png,x\nright/0.png,y\n"
-    truth = folder_dataset(both, both, **labels(tmp_path, full, full)).truth
+    truth = datasets.folder(both, both, ground_truth=labels(tmp_path, full, full)).truth
     np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(2, dtype=bool))
-
-
-def test_files_belong_to_the_ground_truth_that_reads_them(folders, tmp_path):
-    files = labels(tmp_path, "", "")
-    for options, words in (
-        ({"ground_truth": "index"}, r"ground_truth=index: .*file; .*index_file"),
-        ({"ground_truth": "order", "index_file": tmp_path / "db.csv"}, r"index_file, .*ground_truth=order"),
-        (files | {"ground_truth": "none"}, r"database_labels, .*ground_truth=none; .*label"),
-        (files | {"query_labels": None}, r"ground_truth=label: .*file; .*query_labels"),
-        (files | {"query_labels": tmp_path / "no.csv"}, r"no.csv: .*got nothing"),
-    ):
-        with pytest.raises(InputError, match=words):
-            folder_dataset(*folders, **options)
 
 
 def test_many_labels_are_a_loop_over_all_pairs():
@@ -256,7 +255,7 @@ def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, conte
     elif content is not None:
         path.write_text(content)
     with one_line_error(None, words, str(path)):
-        folder_dataset(*folders, ground_truth="index", index_file=path)
+        datasets.folder(*folders, ground_truth=IndexFile(path))
 
 
 @pytest.mark.parametrize("name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@inf@1@.png",
@@ -264,4 +263,4 @@ def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, conte
 def test_names_without_coordinates_are_errors(tmp_path, name):
     folder = fill(tmp_path / "db", [name])
     with pytest.raises(InputError, match=r"easting"):
-        folder_dataset(folder, folder, ground_truth="utm")
+        datasets.folder(folder, folder, ground_truth="utm")

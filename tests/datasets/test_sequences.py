@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr import InputError
-from mfvpr.datasets import Positives, folder_dataset
+from mfvpr import InputError, datasets
+from mfvpr.datasets import Positives
 from mfvpr.datasets.contents import contents
 from mfvpr.datasets.sequences import own_rows, without_neighbors
 from mfvpr.retrieval import ExactSearch
@@ -25,7 +25,7 @@ def sequence(tmp_path):
 
 
 def dataset_and_own_rows(database, queries, ground_truth="none"):
-    dataset = folder_dataset(database, queries, ground_truth=ground_truth)
+    dataset = datasets.folder(database, queries, ground_truth=ground_truth)
     return dataset, own_rows(contents(dataset.queries), contents(dataset.database))
 
 

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.datasets import Positives, sequences_dataset
+from mfvpr import datasets
+from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
@@ -39,14 +40,14 @@ SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 
 @pytest.fixture(scope="module")
 def several(split, small_street):
-    return sequences_dataset(
-        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
-    )
+    return datasets.folder(small_street / "database", split, ground_truth=IndexFile("truth.csv", is_widened=True))
 
 
 @pytest.fixture(scope="module")
 def result(dataset):
-    return evaluate_parts(dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)})
+    return evaluate_parts(
+        dataset, SIFT, VLAD, SCORERS, candidates=5, fused={"histogram": Fusion(c=10.0)}, final="count"
+    )
 
 
 def test_systems_and_their_recall(dataset, result):
@@ -64,14 +65,14 @@ def test_systems_and_their_recall(dataset, result):
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):
-    parts = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=5)
+    parts = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=5, final="count")
     [joint] = result.systems["count"]
     rows = np.concatenate([ranked.rows for ranked in parts.systems["count"]])
     np.testing.assert_array_equal(rows, joint.rows)
     recall = parts.recall([0, 1], [1])["count"]
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
-    evaluation = EvaluationReport(parts, [0, 1], [1], "count")
+    evaluation = EvaluationReport(parts, [0, 1], [1])
     table = recall_table(evaluation)
     assert [line[:2] for line in table.rows[:4]] == [
         ["retrieval", name] for name in ("first", "second", "mean", "pooled")
@@ -90,13 +91,13 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match=r"sequences .*got first twice"):
-        sequences_dataset(small_street / "database", [split[0], split[0]], ground_truth="order")
+        datasets.folder(small_street / "database", [split[0], split[0]], ground_truth="order")
 
 
 def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
     result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
-    calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1], "count"))
+    calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1]))
     predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
     correct, halved = calibrated.evaluation.hits("count"), halves(dataset.truth.positives(1))
@@ -255,7 +256,7 @@ def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path)
     shutil.copytree(small_street / "database", tmp_path / "database")
     (tmp_path / "database" / "0004.png").write_bytes(b"")
     Image.new("RGB", (160, 120)).save(tmp_path / "database" / "0005.png")
-    several, lines = sequences_dataset(tmp_path / "database", split, ground_truth="none"), []
+    several, lines = datasets.folder(tmp_path / "database", split, ground_truth="none"), []
     for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
         lines.clear()
         feature_cache = FeatureCache(root, skip_bad=True, runtime=mfvpr.Runtime(log=lines.append))
@@ -318,7 +319,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
 def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
     names = ["count_retrieval", "count + retrieval", "../../up", "count"]
     systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
-    write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1], "count"))
+    write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1]))
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     for kind in ("predictions", "failures"):
         assert len([*(tmp_path / "out" / kind).iterdir()]) == len(names)
@@ -327,7 +328,7 @@ def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
 @pytest.mark.parametrize("taken", ["mean", "pooled"])
 def test_no_sequence_is_called_as_a_row_of_the_table(small_street, tmp_path, taken):
     with pytest.raises(InputError, match=f"queries: .*sequence .*{taken}"):
-        sequences_dataset(small_street / "database", [tmp_path / "a", tmp_path / taken], ground_truth="none")
+        datasets.folder(small_street / "database", [tmp_path / "a", tmp_path / taken], ground_truth="none")
 
 
 def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp_path, monkeypatch):
@@ -339,10 +340,10 @@ def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp
     (tmp_path / "real" / "deeper").mkdir()
     monkeypatch.chdir(split[1])
     folders = [*(tmp_path / name for name in names), tmp_path / "real" / "deeper" / "..", Path()]
-    several = sequences_dataset(small_street / "database", folders, ground_truth="none")
+    several = datasets.folder(small_street / "database", folders, ground_truth="none")
     assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
     result = evaluate_parts(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
-    write_rankings(tmp_path / "out", EvaluationReport(result, [], [1], "count"))
+    write_rankings(tmp_path / "out", EvaluationReport(result, [], [1]))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
     for name in (*names, "real", "second"):
         folder = tmp_path / "out" / "sequences" / name

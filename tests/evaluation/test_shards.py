@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.datasets import sequences_dataset
-from mfvpr.evaluation import Pipeline, Shard, System, evaluate, fill_shard
+from mfvpr import datasets
+from mfvpr.datasets import IndexFile
+from mfvpr.evaluation import Pipeline, Shard, System, fill_shard, rank_dataset
 from mfvpr.evaluation.shards import shard_of
 from mfvpr.features import Aggregated, VladFitting
 from mfvpr.reranking import FrameCorrelation, Fusion
@@ -48,12 +49,12 @@ def share(dataset, system, root, count, **options):
     """Start every shard twice, and return the lines and the result of a run without shards."""
     order = [*range(count)][::-1]
     lines = [fill_shard(dataset, system, FeatureCache(root, **options), Shard(index, count)) for index in 2 * order]
-    return lines, evaluate(dataset, system, cache=FeatureCache(root, **options))
+    return lines, rank_dataset(dataset, system, cache=FeatureCache(root, **options))
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_shards_give_what_one_machine_gives(dataset, tmp_path, count):
-    expected = evaluate(dataset, system_of(SIFT), cache=FeatureCache(tmp_path / "plain"))
+    expected = rank_dataset(dataset, system_of(SIFT), cache=FeatureCache(tmp_path / "plain"))
     extractor = Counted()
     lines, result = share(dataset, system_of(extractor), tmp_path / "s", count)
     assert_same(result, expected)
@@ -74,12 +75,10 @@ def test_matches_are_made_by_shards_alone(dataset, tmp_path):
 
 @pytest.mark.slow
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
-    several = sequences_dataset(
-        small_street / "database", split, ground_truth="index", index_file="truth.csv", widen_index=True
-    )
+    several = datasets.folder(small_street / "database", split, ground_truth=IndexFile("truth.csv", True))
     extractor = TwoScales()
     system = system_of(extractor, Retrieval(extractor), candidates=3)
-    assert_same(share(several, system, tmp_path / "s", 17)[1], evaluate(several, system))
+    assert_same(share(several, system, tmp_path / "s", 17)[1], rank_dataset(several, system))
 
 
 def test_a_bad_image_of_one_shard_is_bad_for_all(dataset, small_street, tmp_path):
@@ -93,7 +92,7 @@ def test_a_bad_image_of_one_shard_is_bad_for_all(dataset, small_street, tmp_path
     damaged, system = replace(dataset, sequences=(replace(sequence, images=images),)), system_of(SIFT, cohort=None)
     _, result = share(damaged, system, tmp_path / "s", 3, skip_bad=True)
     assert [*result.matched[0].bad_queries] == [4]
-    assert_same(result, evaluate(damaged, system, cache=FeatureCache(tmp_path / "plain", skip_bad=True)))
+    assert_same(result, rank_dataset(damaged, system, cache=FeatureCache(tmp_path / "plain", skip_bad=True)))
 
 
 @pytest.mark.parametrize("text", ["2/2", "-1/2", "1", "0/0", "0/10000", "x/2", "٣/8"])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.datasets import ImageFolder, sequences_dataset
+from mfvpr import datasets
+from mfvpr.datasets import ImageFolder
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
@@ -275,7 +276,7 @@ def test_parts_of_retrievers_are_learned_as_well(cells, model, dataset):
 
 def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, dataset, tmp_path):
     labels, database = [], small_street / "database"
-    several = sequences_dataset(database, [small_street / "queries", database], ground_truth="none")
+    several = datasets.folder(database, [small_street / "queries", database], ground_truth="none")
     options = {"candidates": 3, "matcher": CANDIDATE, "cache": labeled_cache(tmp_path, labels)}
     report = evaluate_parts(several, cells, RETRIEVAL, {"count": mfvpr.MatchCount()}, **options)
     assert labels.count("SsmCells whitening") == 1

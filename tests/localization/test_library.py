@@ -7,7 +7,6 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, Map
-from mfvpr.datasets import folder_dataset
 from mfvpr.features import VladFitting
 from mfvpr.storage import FeatureCache
 from tests.builders import map_system
@@ -43,11 +42,11 @@ def test_what_is_there_is_not_added_again(street, small_street):
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
     system = mfvpr.load_system("mfvpr", **features, retrieval={"num_words": 8}, candidates=5)
-    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    dataset = mfvpr.datasets.folder(small_street / "database", small_street / "queries", ground_truth="order")
     result = mfvpr.evaluate(dataset, system, cache=FeatureCache(tmp_path / "cache"))
     known = Map.create(tmp_path / "map", dataset.database, system)
     assert system.headline == "histogram + anchor + retrieval"
-    [ranked] = result.systems[system.headline]
+    [ranked] = result.only.systems[system.headline]
     for row, path in enumerate(dataset.queries.paths):
         alternatives = known.localize(path).alternatives
         assert [alternative.row for alternative in alternatives] == ranked.rows[row].tolist()
@@ -57,7 +56,7 @@ def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
 def test_images_that_a_cache_knows_are_not_described_again(small_street, tmp_path):
     extractor, cache = Counted(), FeatureCache(tmp_path / "cache")
     system = map_system(extractor, VladFitting(num_words=8), candidates=5)
-    dataset = folder_dataset(small_street / "database", small_street / "queries", ground_truth="order")
+    dataset = mfvpr.datasets.folder(small_street / "database", small_street / "queries", ground_truth="order")
     mfvpr.evaluate(dataset, system, cache=cache)
     seen = extractor.seen
     known = Map.create(tmp_path / "map", dataset.database, system, cache=cache)

@@ -501,9 +501,9 @@ def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
 @pytest.mark.slow
 def test_killed_while_adding_it_has_whole_rows(dataset, small_street, tmp_path):
     program = (
-        "import sys; from pathlib import Path; from mfvpr.datasets.datasets import folder_dataset\n"
+        "import sys; from pathlib import Path; from mfvpr import datasets\n"
         "from tests.localization.test_map import opened\n"
-        "root = Path(sys.argv[1]); data = folder_dataset(root / 'database', root / 'queries', ground_truth='order')\n"
+        "root = Path(sys.argv[1]); data = datasets.folder(root / 'database', root / 'queries', ground_truth='order')\n"
         "known = opened(sys.argv[2]); known.learn(data.database); print('ready', flush=True)\n"
         "for turn in range(int(sys.argv[3]), 10**6):\n"
         "    known.add(data.database.paths[turn % 10], turn, name=str(turn)); print('added', flush=True)\n"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.datasets import sequences_dataset
+from mfvpr import datasets
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.reranking import FrameCorrelation, Fusion
-from mfvpr.reranking.fusion import rank_by_systems
+from mfvpr.reranking.fusion import final_scores, rank_by_scores
 from mfvpr.reranking.ranking import rank_shortlist
 from mfvpr.types import Shortlist
 from tests import oracles
@@ -93,7 +93,8 @@ def sequence_matches(dataset):
 
 def rank_by(matched, fused, correlated):
     scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
-    return rank_by_systems(matched.candidates, scores, fused, correlated, "retrieval")
+    by_name = final_scores(SCORERS, None, fused, correlated)
+    return rank_by_scores(matched.candidates, scores, by_name.values(), "retrieval")
 
 
 def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches):
@@ -135,7 +136,7 @@ def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
     folders = [tmp_path / name for name in ("first", "second")]
     for folder in folders:
         folder.symlink_to(small_street / "queries")
-    several = sequences_dataset(small_street / "database", folders, ground_truth="none")
+    several = datasets.folder(small_street / "database", folders, ground_truth="none")
     options = {"candidates": 5, "fused": {"histogram": BOTH}}
     results = [evaluate_parts(data, SIFT, VLAD, SCORERS, **options) for data in (dataset, several)]
     [alone], rankings = (result.systems["histogram + count + retrieval"] for result in results)

@@ -1,5 +1,7 @@
 """Fusion and ranking."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Shortlist, balancing_c, combine, rank, rerank
-from mfvpr.reranking import fuse_scales
+from mfvpr.reranking import Fusion, fuse_scales
 from mfvpr.reranking.ranking import fuse, fuse_shortlist, retrieval_scores
 from tests import oracles
 
@@ -46,6 +48,24 @@ def test_combined_score_spans_plain_to_retrieval_order():
     np.testing.assert_array_equal(rank(combine(retrieval_scores, scores)), rank(retrieval_scores))
     expected = 3.0 * np.asarray(retrieval_scores, float) + np.asarray(scores, float)
     np.testing.assert_allclose(combine(retrieval_scores, scores, c=3.0), expected, 1e-6)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int32, np.float16, jnp.bfloat16])
+@pytest.mark.parametrize("array", [np.array, jnp.array])
+def test_scores_of_few_bits_are_combined_in_single_precision(array, kind):
+    """Also whole numbers, whose products and squares would overflow."""
+    retrieval_scores, scores = array([[100, 200, 96]], kind), array([[250, 10, 240]], kind)
+    wide = [jnp.asarray(values, jnp.float32) for values in (retrieval_scores, scores)]
+    np.testing.assert_array_equal(combine(retrieval_scores, scores, c=1000), combine(*wide, c=1000.0))
+    mask = np.ones((1, 3), bool)
+    c = balancing_c(retrieval_scores[0], scores[0], mask[0])
+    np.testing.assert_allclose(c, np.std(wide[1]) / np.std(wide[0]), rtol=1e-5)
+    if not jnp.issubdtype(kind, jnp.floating):
+        return  # no scores of a shortlist
+    candidates = Shortlist(np.arange(3)[None], np.asarray(retrieval_scores), mask)
+    for fusion in (Fusion(1000.0), Fusion(), Fusion("zscore")):
+        expected = fusion("it", replace(candidates, scores=np.asarray(wide[0])), {"it": np.asarray(wide[1])})
+        np.testing.assert_allclose(fusion("it", candidates, {"it": np.asarray(scores)}), expected, rtol=1e-5)
 
 
 def test_padding_is_no_similarity():

@@ -100,6 +100,8 @@ def test_recall(seed, depth):
     order[rng.random(order.shape) < 0.2] = -1
     positives = rng.random((5, 9)) < 0.2
     ks = [1, 2, 5, 100]
+    with pytest.raises(InputError, match=r"order: expected database rows \[Q, C\].*, got \[2, "):
+        recall_at_k(np.stack([order, order]), positives, ks)
     expected = oracles.recall_at_k(order, positives, ks)
     np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
     np.testing.assert_array_equal(recall_at_k(order, Positives.from_matrix(positives), ks), expected)

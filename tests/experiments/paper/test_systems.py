@@ -10,7 +10,6 @@ from experiments.paper.printed import printed_tables
 from experiments.paper.runs import input_fingerprints, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, row_result
-from mfvpr.cli.truth import positives_fingerprint
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 from mfvpr.systems.settings import SettingsError
 
@@ -113,9 +112,9 @@ def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
     inputs = []
     for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
         dataset = Dataset("corridor", folder, (QuerySequence("one", folder, FrameTruth(rows, 3)),))
-        inputs.append(input_fingerprints(settings, {}, positives_fingerprint(dataset, [1])))
+        inputs.append(input_fingerprints(settings, {}, dataset.positives_fingerprint([1])))
     assert {name for name in inputs[0] if inputs[0][name] != inputs[1][name]} == {"ground truth"}
-    assert positives_fingerprint(Dataset("corridor", folder, (QuerySequence("one", folder, None),)), []) is None
+    assert Dataset("corridor", folder, (QuerySequence("one", folder, None),)).positives_fingerprint([]) is None
 
 
 # Tables

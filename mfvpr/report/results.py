@@ -1,0 +1,197 @@
+"""Evaluation in one call, and its result: tables, predictions, run folders and a page.
+
+data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
+result = mfvpr.evaluate(data, mfvpr.load_system("mfvpr"))
+print(result.table())
+result.write_report("report.html")
+"""
+
+import math
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from mfvpr.datasets.datasets import Dataset
+from mfvpr.evaluation.evaluation import rank_dataset
+from mfvpr.evaluation.results import KS, RankedDataset
+from mfvpr.evaluation.system import System
+from mfvpr.report.evaluations import EvaluationReport, recall_table
+from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import claim_run_folder, write_table
+from mfvpr.report.tables import Table
+from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.runtime import Runtime
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Thresholds = Sequence[float] | None
+
+
+class TopPrediction(NamedTuple):
+    """The first candidate of a query, by names; without a candidate, it is None and its score NaN.
+
+    `is_correct` is that within the middle threshold, and None without ground truth.
+    """
+
+    dataset: str
+    system: str
+    sequence: str
+    query: str
+    prediction: str | None
+    score: float
+    is_correct: bool | None
+
+
+def evaluate(
+    data: Dataset | Mapping[str, Dataset],
+    system: System | Mapping[str, System],
+    *,
+    cache: FeatureCache | None = None,
+    runtime: Runtime | None = None,
+) -> "Result":
+    """Rank the candidates of every query, and report how many predictions are correct.
+
+        result = mfvpr.evaluate(data, system, cache=FeatureCache("features"))
+        result = mfvpr.evaluate({"night": night, "snow": snow}, {"mine": mine, "paper": paper})
+
+    Args:
+        data: a data set, or several by name.
+        system: finds, matches, scores and ranks candidates; or several by name.
+        cache: where features and matches are kept; None = features in memory. All systems share it. With a folder, they
+            share matches as well.
+        runtime: devices, memory, progress and messages; None = those of the cache.
+
+    Raises:
+        InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
+            or a scorer; one line says which, and how to fix it.
+    """
+    cache = cache or FeatureCache()
+    datasets = data if isinstance(data, Mapping) else {data.name: data}
+    systems = system if isinstance(system, Mapping) else {system.headline: system}
+    pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
+    if not pairs:
+        raise InputError("evaluate: expected at least one data set and one system, got none")
+    ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
+    return Result(dict(zip(pairs, ranked, strict=True)), cache)
+
+
+@dataclass(frozen=True, repr=False)
+class Result:
+    """Rankings of data sets by systems, the result of `mfvpr.evaluate`.
+
+    `thresholds` are largest distances of a correct prediction in the unit of the ground truth, `ks` depths of recall.
+    The defaults are those of the programs: 1, 2 and 5 frames or 25 m, and 1, 5 and 10.
+
+    Attributes:
+        parts: by names of the data set and of the system; a system without a name has that of its final score.
+        cache: of the evaluation.
+    """
+
+    parts: Mapping[tuple[str, str], RankedDataset]
+    cache: FeatureCache
+
+    def __repr__(self) -> str:
+        return f"Result({', '.join(self._names(0))}; {', '.join(self._names(1))})"
+
+    @property
+    def only(self) -> RankedDataset:
+        """Rankings of the only data set by the only system; InputError if there are several."""
+        if len(self.parts) > 1:
+            raise InputError(f"result: expected one data set and one system, got {len(self.parts)} pairs; choose one "
+                             f"of parts: {', '.join(map(str, self.parts))}")  # fmt: skip
+        return next(iter(self.parts.values()))
+
+    def table(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> Table:
+        """Recall in %: of every final score of a single system, or of those that decide of several systems."""
+        several_data, several_systems = (len(self._names(place)) > 1 for place in (0, 1))
+        rows: list[dict[str, str]] = []
+        for (dataset, system), report in self._reports(thresholds, ks):
+            table = recall_table(report)
+            for line in table.rows:
+                row = ({"data set": dataset} if several_data else {}) | dict(zip(table.header, line, strict=True))
+                if not several_systems:
+                    rows.append(row)
+                elif row["system"] == report.headline:
+                    rows.append(row | {"system": system})
+        names = dict.fromkeys(name for row in rows for name in row)
+        texts = [name for name in ("data set", "system", "sequence") if name in names]
+        header = texts + [name for name in names if name not in texts]
+        return Table(header, [[row.get(name, "") for name in header] for row in rows], len(texts))
+
+    def to_latex(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> str:
+        """`table` as a `tabular` for the booktabs package."""
+        return self.table(thresholds, ks).latex()
+
+    def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
+        """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold."""
+        try:
+            import pandas
+        except ImportError:
+            raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
+        return pandas.DataFrame([
+            {"data set": dataset, "system": system, "score": score, "decides": score == report.headline}
+            | {name: value for name, value in row.items() if name != "recall_at"}
+            | {f"R@{k}": recall for k, recall in row["recall_at"].items()}
+            for (dataset, system), report in self._reports(thresholds, ks)
+            for score in report.ranked.systems
+            for row in report.rows(score)
+        ])  # fmt: skip
+
+    @cached_property
+    def predictions(self) -> list[TopPrediction]:
+        """The top prediction of every query, by the final score that decides of each system."""
+        predictions = []
+        for names, report in self._reports(None, KS):
+            database = report.ranked.dataset.database.names
+            for place, ranked in enumerate(report.ranked.systems[report.headline]):
+                sequence, correct = report.sequences[place], report.is_correct(report.headline, place)
+                for query, (row, score) in enumerate(zip(ranked.rows[:, 0], ranked.scores[:, 0], strict=True)):
+                    top = (database[row], float(score)) if row >= 0 else (None, math.nan)
+                    is_correct = None if correct is None else bool(correct[query, 0])
+                    name = sequence.images.names[query]
+                    predictions.append(TopPrediction(*names, sequence.name, name, *top, is_correct))
+        return predictions
+
+    def save(self, folder: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> list[Path]:
+        """Write the files of `mfvpr evaluate` but its figures, for `mfvpr report`, and return the run folders.
+
+        Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table.
+
+        Raises:
+            InputError: the folder is not empty.
+        """
+        from mfvpr.report.run_files import save_run  # here, since SciPy's statistics take 0.3 s
+
+        folders, several = [], len(self.parts) > 1
+        files = [file_names(self._names(place)) for place in (0, 1)]
+        with claim_run_folder(Path(folder)) as root:
+            for (dataset, system), report in self._reports(thresholds, ks):
+                folders.append(root / files[0][dataset] / files[1][system] if several else root)
+                save_run(folders[-1], report, self.cache)
+            if several:
+                write_table(root, self.table(thresholds, ks), f"recall in %, {self!r}")
+        return folders
+
+    def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
+        """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""
+        from mfvpr.report.pages import one_run, several_runs
+
+        with tempfile.TemporaryDirectory() as root:
+            folders = self.save(Path(root) / "run", thresholds, ks)
+            if len(folders) > 1:
+                several_runs.write_comparison(folders, Path(path))
+            else:
+                one_run.write_report(folders[0], Path(path))
+
+    def _names(self, place: Literal[0, 1]) -> list[str]:
+        """Names of the data sets, or of the systems."""
+        return list(dict.fromkeys(names[place] for names in self.parts))
+
+    def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> Iterator[tuple[tuple[str, str], EvaluationReport]]:
+        for names, ranked in self.parts.items():
+            yield names, EvaluationReport.of(ranked, thresholds, ks)

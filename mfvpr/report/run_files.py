@@ -1,0 +1,200 @@
+"""Files of the run folder of an evaluation: of `mfvpr evaluate`, and of `save` of a result in Python."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.published import published_differences
+from mfvpr.datasets.truth import middle
+from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.features.extractor import Source
+from mfvpr.report.confidences import CalibratedPredictions, write_confidence
+from mfvpr.report.differences import write_gains
+from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings, write_skipped
+from mfvpr.report.runs import write_about, write_json, write_table, writing
+from mfvpr.report.shifts import write_shifts
+from mfvpr.reranking.fusion import FinalScore, Fusion
+from mfvpr.storage.extraction import open_sinks
+from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.utils.versions import versions
+
+
+@dataclass(frozen=True)
+class RunDescription:
+    """Settings of an evaluation, as JSON values for its run folder.
+
+    Attributes:
+        stages: name and settings of "retrieval", "features" and "matching".
+        parameters: by final score.
+        truth: kind, files, unit and thresholds of the ground truth.
+        truth_words: the same in words, for headings.
+        contents: of the image files, by side.
+        settings: that scores depend on.
+        command: of a program.
+    """
+
+    stages: Mapping[str, Mapping[str, Any]]
+    parameters: Mapping[str, Mapping[str, Any]]
+    truth: Mapping[str, Any]
+    truth_words: str
+    contents: Mapping[str, Contents]
+    settings: Mapping[str, Any]
+    command: str | None = None
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Fingerprints of all folders, by side."""
+        return {side: contents.fingerprint for side, contents in self.contents.items()}
+
+
+def parameters(
+    final_scores: Iterable[FinalScore],
+    scorers: Mapping[str, Mapping[str, Any]],
+    fusion: dict[str, Any] | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Parameters by final score, from those of scorers by name, and of all fusions; None = the fields of each."""
+    by_name: dict[str, dict[str, Any]] = {}
+    for score in final_scores:
+        values: dict[str, Any] = by_name[score.base] if score.base else {**scorers.get(score.name, {})}
+        if isinstance(score.step, Fusion) and len(score.scorers) > 1:
+            values = {name: scorers[name] for name in score.scorers}
+        if score.step is not None:
+            values = values | (fusion if fusion and isinstance(score.step, Fusion) else asdict(score.step))
+        by_name[score.name] = values
+    return by_name
+
+
+def heading(report: EvaluationReport, description: RunDescription) -> str:
+    """Data set, numbers of images, retrieval, features and ground truth in one line."""
+    dataset, matched, stages = report.ranked.dataset, report.ranked.matched, description.stages
+    bad_queries = sum(len(sequence.bad_queries) for sequence in matched)
+    bad_database = len({row for sequence in matched for row in sequence.bad_database})
+    matching = stages["matching"]
+    check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
+    check = "" if check == "cross_check=mutual" else f", {check}"
+    several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
+    incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
+    return (
+        f"{dataset.name}{incomplete}: {report.num_queries} queries{several}{_skip_note(bad_queries)}, "
+        f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
+        f"{_num_candidates(report)} candidates ({stages['retrieval']['name']}), "
+        f"{stages['features']['name']} features{check}; {description.truth_words}"
+    )
+
+
+def _skip_note(number: int) -> str:
+    return f" ({number} skipped)" if number else ""
+
+
+def write_run_folder(folder: Path, calibrated: CalibratedPredictions, description: RunDescription) -> None:
+    """Write all files of a run folder but run.json and the figures."""
+    report, refused = calibrated.evaluation, calibrated.refused_of_headline
+    write_json(folder / "results.json", result_rows(report, description))
+    if report.thresholds:
+        write_table(folder, recall_table(report), heading(report, description))
+    write_rankings(folder, report, refused)
+    write_gains(folder, report)
+    write_confidence(folder, calibrated, _provenance(report, description))
+    if report.histogram is not None:
+        write_shifts(folder, report, report.histogram, refused)
+    write_skipped(folder, report.ranked)
+
+
+def ground_truth(report: EvaluationReport, description: RunDescription) -> dict[str, Any]:
+    """Description and fingerprint of the ground truth."""
+    fingerprint = report.ranked.dataset.positives_fingerprint(report.thresholds)
+    return {**description.truth, "fingerprint": fingerprint}
+
+
+def result_rows(report: EvaluationReport, description: RunDescription) -> list[dict[str, Any]]:
+    """One row per final score and threshold, and per sequence if there are several."""
+    dataset = report.ranked.dataset
+    common = {
+        **description.stages,
+        "candidates": _num_candidates(report),
+        "queries": report.num_queries,
+        "database": len(dataset.database),
+        "dataset": dataset.name,
+        "incomplete": list(published_differences(dataset)),
+        "data_fingerprint": description.fingerprints,
+        "ground_truth": ground_truth(report, description),
+        "reading": {side: contents.summary() for side, contents in description.contents.items()},
+        "bytes_per_image": _bytes_per_image(report),
+        "seconds": report.ranked.seconds,
+        "versions": versions(),
+    }
+    rows = []
+    for name, score in report.ranked.system.final_scores.items():
+        system = {
+            "system": name,
+            "scorer": " + ".join(score.scorers) or "none",
+            "decides": name == report.headline,
+            "parameters": description.parameters[name],
+        }
+        rows += [system | recall | common for recall in report.rows(name)]
+    return rows
+
+
+def _provenance(report: EvaluationReport, description: RunDescription) -> dict[str, Any]:
+    """The data and settings that confidences are fitted with, for their file."""
+    truth = report.sequences[0].truth
+    return {
+        "dataset": report.ranked.dataset.name,
+        "data_fingerprint": description.fingerprints,
+        "queries": report.num_queries,
+        "correct_within": [middle(report.thresholds), truth.unit] if truth else None,
+        "candidates": _num_candidates(report),
+        "ground_truth": description.truth,
+        "settings": description.settings,
+        "command": description.command,
+        "versions": versions(),
+    }
+
+
+def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> None:
+    """Write the run folder of an evaluation in Python, whose settings are the recipes of its values."""
+    dataset, system, truth = report.ranked.dataset, report.ranked.system, report.sequences[0].truth
+    pipeline, several = system.pipeline, len(dataset.sequences) > 1
+    known, words = {"kind": "none"}, "no ground truth: rankings only"
+    if truth is not None:
+        known = {"kind": type(truth).__name__, "unit": truth.unit, "thresholds": report.thresholds}
+        words = f"recall in %, ground truth: {known['kind']}"
+    folders = {f"query {each.name}" if several else "query": each.images for each in dataset.sequences}
+    folders = {"database": dataset.database, **folders}
+    parts = {"retrieval": pipeline.retriever, "features": pipeline.extractor, "matching": pipeline.matcher}
+    stages = {name: _values(part, cache) for name, part in parts.items()}
+    scorers = {name: _values(scorer, cache) for name, scorer in system.scorers.items()}
+    roots = {side: str(images.root) for side, images in folders.items()}
+    settings = {
+        "dataset": {"name": dataset.name, **roots}, **stages, "candidates": pipeline.candidates, "scorer": scorers,
+        "cohort": system.cohort, "ties": system.ties, "final": system.headline,
+    }  # fmt: skip
+    contents = {side: cache.recipes.contents(images) for side, images in folders.items()}
+    by_score = parameters(system.final_scores.values(), scorers)
+    description = RunDescription(stages, by_score, known, words, contents, settings)
+    with writing(folder) as new:
+        write_run_folder(new, CalibratedPredictions(report), description)
+        write_about(new, settings, ground_truth(report, description))
+
+
+def _values(part: Any, cache: FeatureCache) -> dict[str, Any]:
+    """The name and the recipe of a part of a system, which may be a function without recipe."""
+    name = getattr(part, "__name__", type(part).__name__)
+    try:
+        return {"name": name, **cache.recipes.of(part)}
+    except TypeError:
+        return {"name": name}
+
+
+def _num_candidates(report: EvaluationReport) -> int:
+    return num_candidates(report.ranked.system.pipeline.candidates, report.ranked.dataset.database)
+
+
+def _bytes_per_image(report: EvaluationReport) -> int | None:
+    """Expected bytes of an image's features on disk; None for imported features, which are not stored."""
+    extractor = report.ranked.system.pipeline.extractor
+    if isinstance(extractor, Source):
+        return None
+    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, []))

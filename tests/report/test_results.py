@@ -1,0 +1,125 @@
+"""Results in Python: tables, predictions, run folders and pages of several data sets and systems."""
+
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import datasets
+from mfvpr.datasets import IndexFile
+from mfvpr.datasets.truth import RADIUS, TOLERANCES
+from mfvpr.evaluation.results import KS
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.report.pages.files import read_run
+from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.retrieval import Retrieval
+from mfvpr.utils import InputError
+from tests.programs import composed
+
+pytestmark = pytest.mark.thorough
+
+SIFT = Sift(max_keypoints=60, image_size=(160, 120))
+
+
+def half_count(matches):
+    """A scorer without recipe."""
+    return mfvpr.MatchCount()(matches) / 2
+
+
+@pytest.fixture(scope="module")
+def systems():
+    pipeline = mfvpr.Pipeline(SIFT, Retrieval(Aggregated(SIFT, VladFitting(num_words=8))), candidates=5)
+    paper = mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts(), "my + count": half_count})
+    return {"paper": paper, "mine": replace(paper, fused={"my + count": Fusion()}, final="my + count + retrieval")}
+
+
+@pytest.fixture(scope="module")
+def result(dataset, small_street, split, systems):
+    truth = IndexFile("truth.csv", is_widened=True)
+    data = {"one": dataset, "two": datasets.folder(small_street / "database", split, ground_truth=truth)}
+    return mfvpr.evaluate(data, systems)
+
+
+def test_one_result_has_all_data_sets_and_systems(result, dataset, systems):
+    table = result.table([1, 0], [1, 5])
+    assert table.header == ["data set", "system", "sequence", "R@1 ±0", "R@1 ±1", "R@5 ±1"]
+    parts = ["first", "second", "mean", "pooled"]
+    expected = [("one", system, "") for system in systems] + [("two", system, p) for system in systems for p in parts]
+    assert [tuple(row[:3]) for row in table.rows] == expected
+    assert table.rows[0][3:] == table.rows[5][3:]  # the sequences are the parts of the one
+    assert str(table) in f"{table}"
+    assert result.to_latex([0], [1]).count(" \\\\\n") == 11
+    alone = mfvpr.evaluate(dataset, systems["mine"]).table([0, 1], [1, 5])
+    assert [row[0] for row in alone.rows] == ["retrieval", "histogram", "my + count", "my + count + retrieval"]
+    assert alone.rows[-1][1:] == table.rows[1][3:]
+    assert repr(result) == "Result(one, two; paper, mine)"
+    for short in (result.parts["one", "paper"], dataset, dataset.database, dataset.only):
+        assert len(repr(short)) < 200
+    with pytest.raises(InputError, match=r"expected one data set .* got 4"):
+        result.only  # noqa: B018
+
+
+def test_predictions_are_those_of_the_score_that_decides(result, dataset):
+    predictions = [each for each in result.predictions if (each.dataset, each.system) == ("two", "mine")]
+    assert len(result.predictions) == 4 * len(predictions) == 4 * len(dataset.queries)
+    [ranked] = result.parts["one", "mine"].systems["my + count + retrieval"]
+    names = np.array(dataset.database.names)[ranked.rows[:, 0]]
+    assert [each.prediction for each in predictions] == names.tolist()
+    assert [each.query for each in predictions] == [*dataset.queries.names]
+    np.testing.assert_array_equal([each.score for each in predictions], ranked.scores[:, 0])
+    correct = dataset.truth.positives(2).contains(ranked.rows)[:, 0]
+    assert [each.is_correct for each in predictions] == correct.tolist()
+    unknown = replace(dataset, sequences=(replace(dataset.only, truth=None),))
+    [first, *_] = mfvpr.Result({("a", "b"): replace(result.parts["one", "mine"], dataset=unknown)}, None).predictions
+    assert (first.prediction, first.is_correct) == (names[0], None)
+
+
+def test_a_saved_result_is_a_run_folder(result, dataset, tmp_path):
+    folders = result.save(tmp_path / "all")
+    assert folders[1] == tmp_path / "all" / "one" / "mine"
+    run = read_run(folders[1])
+    assert (run.headline, run.thresholds) == ("my + count + retrieval", [1, 2, 5])
+    assert [row["scorer"] for row in run.results[::3]] == ["none", "histogram", "my + count", "my + count"]
+    assert run.results[-1]["parameters"] == {
+        "name": "half_count",
+        "c": None,
+        "retrieval_score": "cosine",
+        "weights": {},
+    }
+    assert (tmp_path / "all" / "table.csv").read_text() == result.table().csv()
+    with pytest.raises(InputError, match="expected a new or empty run folder"):
+        result.save(tmp_path / "all")
+    result.write_report(tmp_path / "all.html")
+    assert "one/mine" in (tmp_path / "all.html").read_text("utf-8")
+    mfvpr.Result({("one", "mine"): result.parts["one", "mine"]}, result.cache).write_report(tmp_path / "one.html")
+    assert "queries in" in (tmp_path / "one.html").read_text("utf-8")
+
+
+def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match=r"pip install 'mfvpr\[pandas\]'"):
+        result.to_pandas()
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=list))
+    rows = result.to_pandas([1], [1, 5])
+    assert len(rows) == (3 + 4) * 5  # rankings of both systems; a sequence, or two with their means
+    last = rows[-1]
+    assert list(last) == ["data set", "system", "score", "decides", "sequence", "tolerance", "R@1", "R@5"]
+    recall = result.parts["two", "mine"].recall([1], [1, 5])["my + count + retrieval"]
+    np.testing.assert_allclose([last["R@1"], last["R@5"]], recall.pooled[0])
+
+
+def test_names_of_scores_are_not_taken_apart(systems):
+    correlated = {"my + count + retrieval": FrameCorrelation()}
+    scores = replace(systems["mine"], cohort=2, correlated=correlated).final_scores
+    assert {name: score.scorers for name, score in scores.items()} == {
+        "retrieval": (), "histogram": ("histogram",), "my + count": ("my + count",),
+        "histogram + cohort": ("histogram",), "my + count + cohort": ("my + count",),
+        "my + count + retrieval": ("my + count",), "my + count + retrieval + frames": ("my + count",),
+    }  # fmt: skip
+
+
+def test_defaults_are_those_of_the_programs():
+    assert composed()["recall"] == {"tolerances": [*TOLERANCES], "radius": RADIUS, "ks": [*KS]}
