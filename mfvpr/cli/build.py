@@ -1,8 +1,10 @@
 """Turn checked settings into objects of the library, by fixed tables: nothing named in a YAML file is called."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import Runtime, recipe_of
+from mfvpr.utils import Cluster, Runtime, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 
 # Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
@@ -183,14 +185,28 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
     return FeatureCache(root, skip_bad=skip_bad, wait=wait, runtime=runtime(settings))
 
 
+@contextmanager
+def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
+    """Connect to the cluster that the settings name, or start it, until the block ends."""
+    chosen = settings.get("cluster")
+    if chosen is None:
+        yield None
+        return
+    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": partial(Cluster.slurm, log=console.tell)}
+    with starts[chosen["name"]](**_without(chosen, "name")) as started:
+        console.tell(f"cluster: {started}")
+        yield started
+
+
 def runtime(settings: dict[str, Any]) -> Runtime:
-    """Devices, memory, progress and messages."""
+    """Devices, memory, progress, messages, and the cluster that `command_line` started."""
     import jax
 
     devices, number = jax.local_devices(), settings["devices"]
     if number != "all" and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
-    return Runtime(devices if number == "all" else devices[:number], settings["memory"], console.track, console.tell)
+    devices = devices if number == "all" else devices[:number]
+    return Runtime(devices, settings["memory"], console.track, console.tell, settings.get("cluster"))
 
 
 def pipeline(settings: dict[str, Any], data: Dataset | None) -> Pipeline:

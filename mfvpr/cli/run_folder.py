@@ -13,7 +13,7 @@ from mfvpr.report.runs import Figure
 from mfvpr.utils import InputError
 from mfvpr.utils.versions import versions
 
-_NO_SETTINGS = ("multirun", "command")  # added by `command_line`
+_NO_SETTINGS = ("multirun", "command", "cluster")  # added by `command_line`; results do not depend on them
 
 
 @contextmanager

@@ -4,7 +4,7 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.features.feature_set import FeatureSet, memory_budget
 from mfvpr.matching import batched
-from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.matching.match_set import MatchSet, QueryMatches, Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.batched_scoring import score
 from mfvpr.reranking.ranking import BIN_STEP
@@ -33,6 +33,7 @@ __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match"
 
 SHIFTS_AT_ONCE = 64  # pairs
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
 
 
 def match(
@@ -49,7 +50,7 @@ def match(
         store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
             batches; the result is read from it.
         rows: of the queries that are matched and returned; None = all.
-        runtime: devices that share the queries, memory, and progress over queries.
+        runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
         InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
@@ -72,13 +73,33 @@ def match(
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
-        tracked = iter(track(match_rows(missing), len(missing)))
-        while batch := dict(itertools.islice(tracked, STORE_BATCH)):
-            store.write(batch)
+        if runtime.cluster is None:
+            _write(store, track(match_rows(missing), len(missing)))
+        else:
+            shared = queries, database, candidates, matcher, runtime.memory or WORKER_MEMORY, store
+            blocks = runtime.cluster.map(match_block, shared, missing, track, multiple=batched.QUERIES)
+            for block, counts in blocks:
+                store.counts[block] = counts
     match_set, shortlist = stored_matches(store, rows, memory=runtime.memory)
     if not missing:
         _require_candidates(store, candidates, dict(zip(requested, shortlist.indices, strict=True)))
     return match_set
+
+
+def match_block(
+    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher, memory: float,
+    store: MatchStore, rows: Sequence[int],
+) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
+    """Match queries in a worker of a cluster; returns their rows, and the numbers of their matches."""
+    missing, devices = [row for row in rows if not store.done[row]], [device_of(())]
+    _write(store, batched.match_queries(queries, database, candidates, missing, matcher, memory=memory, devices=devices))
+    return rows, store.counts[rows]
+
+
+def _write(store: MatchStore, matched: Iterable[tuple[int, QueryMatches]]) -> None:
+    remaining = iter(matched)
+    while batch := dict(itertools.islice(remaining, STORE_BATCH)):
+        store.write(batch)
 
 
 def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:

@@ -2,15 +2,21 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import FeatureSource, InMemory
 from mfvpr.storage import features, vectors
 from mfvpr.storage.manifest import VECTORS, store_path
 from mfvpr.storage.rows import RowStore, require_space
+from mfvpr.utils.cluster import Cluster
+from mfvpr.utils.progress import Track
 
 _MB = 1e6
 
@@ -102,6 +108,22 @@ class Extraction:
         for sink in self.sinks:
             sink.write(batch)
 
+    def describe(
+        self, folder: ImageFolder, rows: Sequence[int], *, skip_bad: bool, track: Track, cluster: Cluster | None
+    ) -> None:
+        """Describe images in this process, or in the workers of a cluster, and write them to all sinks."""
+        if cluster is None or not rows:
+            for batch in describe_folder(folder, self.extractor, rows, self.bad, skip_bad=skip_bad, track=track):
+                self.write(batch)
+            return
+        extractor: Any = self.extractor  # copied without its compiled programs
+        state = replace(self, extractor=replace(extractor) if is_dataclass(extractor) else extractor)
+        shared, multiple = (folder, state, skip_bad), self.extractor.batch_size
+        for block, counts, bad in cluster.map(describe_block, shared, rows, track, multiple=multiple):
+            self.bad |= bad
+            for store, numbers in zip(self.stores, counts, strict=True):
+                store.counts[block] = numbers
+
     def announcement(self, missing: Sequence[int], requested: int) -> Iterator[str]:
         """A line: how many of the `requested` images are missing; if none, only once. Requires space on the disk."""
         if not self.stores or not requested or (self.is_announced and not missing):
@@ -128,6 +150,16 @@ class Extraction:
                 yield (f"{size / _MB:.1f} MB, {size / images / _MB:.2f} MB and {features / images:.0f} features an "
                        f"image; as the paper stores them, in float32, {paper / _MB:.1f} MB: "
                        f"{size / paper:.2f}x")  # fmt: skip
+
+
+def describe_block(
+    folder: ImageFolder, state: Extraction, skip_bad: bool, rows: Sequence[int]
+) -> tuple[Sequence[int], list[np.ndarray], dict[int, str]]:
+    """Describe images in a worker; returns the rows, the numbers of their features by store, and the bad ones."""
+    for batch in describe_folder(folder, state.extractor, state.missing(rows), state.bad, skip_bad=skip_bad):
+        state.write(batch)
+    bad = {row: state.bad[row] for row in rows if row in state.bad}
+    return rows, [store.counts[rows] for store in state.stores], bad
 
 
 def open_sinks(

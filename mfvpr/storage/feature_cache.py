@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage import matches as match_stores
@@ -73,6 +72,8 @@ class FeatureCache:
 
     def __post_init__(self) -> None:
         self.root = None if self.root is None else Path(self.root)
+        if self.root is None and self.runtime.cluster is not None:
+            raise InputError("cluster: expected a cache with a root, a folder that all workers share")
 
     @property
     def recipes(self) -> Recipes:
@@ -146,9 +147,8 @@ class FeatureCache:
             missing = state.missing(requested)
             for line in state.announcement(missing, len(requested)):
                 self.log(f"{label}: {line}")
-            options = {"skip_bad": self.skip_bad, "track": self.runtime.progress(label)}
-            for batch in describe_folder(folder, extractor, missing, state.bad, **options):
-                state.write(batch)
+            track, cluster = self.runtime.progress(label), self.runtime.cluster
+            state.describe(folder, missing, skip_bad=self.skip_bad, track=track, cluster=cluster)
             for line in state.size_lines() if missing else ():
                 self.log(f"{label}: {line}")
         return state

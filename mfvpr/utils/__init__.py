@@ -1,7 +1,7 @@
 """Files, hashes, errors, progress and arithmetic that several packages need.
 
 Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), code_hash (of users'
-classes), arrays and numbers (their files and texts), progress, runtime, threads, locks, ragged (padding), whitening,
+classes), arrays and numbers (their files and texts), progress, runtime, cluster, threads, locks, ragged (padding), whitening,
 versions.
 
 Imports nothing of mfvpr.

@@ -1,4 +1,5 @@
 __all__ = [
+    "Cluster",
     "InputError",
     "NoGradientError",
     "Runtime",
@@ -6,6 +7,7 @@ __all__ = [
     "recipe_of",
 ]
 
+from .cluster import Cluster
 from .errors import InputError, NoGradientError
 from .fingerprints import recipe_of
 from .progress import Stopwatch

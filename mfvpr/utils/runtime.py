@@ -1,9 +1,10 @@
-"""Settings of a call that change no result: devices, memory, progress and messages."""
+"""Settings of a call that change no result: devices, memory, progress, messages and a cluster."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device
 from mfvpr.utils.progress import Track, no_progress
@@ -11,20 +12,23 @@ from mfvpr.utils.progress import Track, no_progress
 
 @dataclass(frozen=True)
 class Runtime:
-    """Devices, memory, progress and messages of a call.
+    """Devices, memory, progress, messages and cluster of a call.
 
     Attributes:
         devices: that share the work; None = the default device of JAX.
         memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what
-            is free.
+            is free (in workers of a cluster: 2 GB each).
         progress: label -> progress bar of the next loop.
         log: called with one line: the work to be done and the disk space it takes, or a warning.
+        cluster: workers that describe images and match queries; None = this process alone. Retrieval and scores stay
+            in this process.
     """
 
     devices: Sequence[Device] | None = None
     memory: float | None = None
     progress: Callable[[str], Track] = lambda label: no_progress
     log: Callable[[str], None] = lambda line: None
+    cluster: Cluster | None = None
 
     def __post_init__(self) -> None:
         if self.memory is not None and not 0 < self.memory < math.inf:
