@@ -6,6 +6,7 @@
 
 import os
 import shlex
+import signal
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from mfvpr.utils.errors import InputError
@@ -70,9 +72,10 @@ class Cluster:
         distributed = _distributed()
         threads = os.environ.get("PJRT_NPROC") or str(max(1, available_cpus() // max(1, workers)))
         options = {"dashboard_address": ":0", "env": {"PJRT_NPROC": threads}} | options
-        with _settings(), distributed.LocalCluster(n_workers=workers, **_WORKER, **options) as started:
-            with cls.connect(started) as cluster:
-                yield cluster
+        with _settings(), _ctrl_c_is_ours():
+            started = distributed.LocalCluster(n_workers=workers, **_WORKER, **options)
+        with started, cls.connect(started) as cluster:
+            yield cluster
 
     @classmethod
     @contextmanager
@@ -175,6 +178,17 @@ def _distributed() -> Any:
     except ImportError:
         raise InputError("cluster: expected Dask Distributed; install it with pip install 'mfvpr[cluster]'") from None
     return distributed
+
+
+@contextmanager
+def _ctrl_c_is_ours() -> Iterator[None]:
+    """Processes of threads that start in the block never see Ctrl-C; this thread sees it when the block ends."""
+    resource_tracker.ensure_running()  # whose start would undo this
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _settings() -> Any:
