@@ -1,5 +1,6 @@
 """Turn checked settings into objects of the library, by fixed tables: nothing named in a YAML file is called."""
 
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -194,6 +195,8 @@ def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
         return
     starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": partial(Cluster.slurm, log=console.tell)}
     with starts[chosen["name"]](**_without(chosen, "name")) as started:
+        for part in ("client", "scheduler"):  # errors of tasks are raised here, and told in one line
+            logging.getLogger(f"distributed.{part}").setLevel(logging.CRITICAL)
         console.tell(f"cluster: {started}")
         yield started
 

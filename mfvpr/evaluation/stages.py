@@ -91,8 +91,8 @@ def match_block(
     store: MatchStore, rows: Sequence[int],
 ) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
     """Match queries in a worker of a cluster; returns their rows, and the numbers of their matches."""
-    missing, devices = [row for row in rows if not store.done[row]], [device_of(())]
-    _write(store, batched.match_queries(queries, database, candidates, missing, matcher, memory=memory, devices=devices))
+    missing, options = [row for row in rows if not store.done[row]], {"memory": memory, "devices": [device_of(())]}
+    _write(store, batched.match_queries(queries, database, candidates, missing, matcher, **options))
     return rows, store.counts[rows]
 
 

@@ -116,8 +116,10 @@ class Extraction:
             for batch in describe_folder(folder, self.extractor, rows, self.bad, skip_bad=skip_bad, track=track):
                 self.write(batch)
             return
-        extractor: Any = self.extractor  # copied without its compiled programs
-        state = replace(self, extractor=replace(extractor) if is_dataclass(extractor) else extractor)
+        extractor: Any = self.extractor
+        if is_dataclass(extractor):
+            extractor = replace(extractor)  # without compiled programs  # pyright: ignore[reportArgumentType]
+        state = replace(self, extractor=extractor)
         shared, multiple = (folder, state, skip_bad), self.extractor.batch_size
         for block, counts, bad in cluster.map(describe_block, shared, rows, track, multiple=multiple):
             self.bad |= bad

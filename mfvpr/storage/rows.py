@@ -122,7 +122,7 @@ class RowStore(Generic[Item]):
         self._blocks.pop().close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """For workers, which write while this process holds the lock."""
+        """The state for workers of a cluster, which write while this process holds the lock."""
         return self.__dict__ | {"_lock": None, "_blocks": []}
 
     def look(self) -> None:

@@ -2,13 +2,10 @@
 
 import os
 import signal
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import mfvpr
@@ -27,31 +24,28 @@ SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 
 
 def die_once(flag):
-    """Kill this process, a worker, if the file is there, which is removed before."""
-    if flag and os.getpid() != int(Path(flag).stem):
-        with suppress(FileNotFoundError):
-            os.unlink(flag)
-            os.kill(os.getpid(), signal.SIGKILL)
+    """Kill this process, if the file is there, which is removed before."""
+    with suppress(FileNotFoundError):
+        os.unlink(flag)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 @dataclass(frozen=True)
 class FatalSift(Sift):
-    """Kills the first worker that describes images."""
+    """Kills the first worker that describes images, or without a flag every worker."""
 
-    flag: str = ""
+    flag: str | None = None
 
     def __call__(self, images):
-        die_once(self.flag)
+        die_once(self.flag) if self.flag else os.kill(os.getpid(), signal.SIGKILL)
         return super().__call__(images)
 
 
+@dataclass(frozen=True)
 class FatalMatcher:
     """Kills the first worker that matches."""
 
-    recipe = "fatal"
-
-    def __init__(self, flag):
-        self.flag = flag
+    flag: str
 
     def __call__(self, features0, features1):
         die_once(self.flag)
@@ -66,14 +60,15 @@ def cluster():
 
 @pytest.fixture
 def flag(tmp_path):
-    path = tmp_path / f"{os.getpid()}.flag"
+    path = tmp_path / "flag"
     path.touch()
     return str(path)
 
 
 def system_of(extractor=SIFT, retriever=None, cohort=1, **options):
     retriever = retriever or Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
-    return System(Pipeline(extractor, retriever, candidates=4, **options), SCORERS, {"histogram": Fusion()}, cohort=cohort)
+    pipeline = Pipeline(extractor, retriever, candidates=4, **options)
+    return System(pipeline, SCORERS, {"histogram": Fusion()}, cohort=cohort)
 
 
 def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset, cluster, tmp_path):
@@ -92,14 +87,15 @@ def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset
     runtime = Runtime(cluster=cluster, progress=progress)
     result = evaluate(dataset, system, cache=FeatureCache(tmp_path / "store"), runtime=runtime)
     assert_same(result, evaluate(dataset, system, cache=FeatureCache(tmp_path / "plain")))
-    assert labels == {"database descriptors", "query folder descriptors", "matching", "scores"}
+    assert {"database descriptors", "query folder descriptors", "matching"} <= labels
 
 
 @pytest.mark.parametrize("stage", ["describing", "matching"])
 def test_a_killed_worker_costs_time_alone(dataset, cluster, flag, tmp_path, stage):
     fatal = {"describing": {"extractor": FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3, flag=flag)},
              "matching": {"matcher": FatalMatcher(flag)}}  # fmt: skip
-    result = evaluate(dataset, system_of(**fatal[stage]), cache=FeatureCache(tmp_path / "store"), runtime=Runtime(cluster=cluster))
+    cache = FeatureCache(tmp_path / "store", runtime=Runtime(cluster=cluster))
+    result = evaluate(dataset, system_of(**fatal[stage]), cache=cache)
     assert not Path(flag).exists()
     assert_same(result, evaluate(dataset, system_of(), cache=FeatureCache(tmp_path / "plain")))
 
@@ -113,6 +109,21 @@ def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path)
         assert "\n" not in str(raised.value)
     cache = FeatureCache(tmp_path / "store", skip_bad=True, runtime=runtime)
     assert [*cache.describe(folder, SIFT).bad] == [0]
+
+
+def test_workers_need_the_versions_of_the_client(dataset, cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr("mfvpr.utils.cluster.versions", lambda: {"jax": "0.1"})
+    with pytest.raises(InputError, match=r"cluster: expected jax 0\.1 on all workers, got .* on "):
+        FeatureCache(tmp_path, runtime=Runtime(cluster=cluster)).describe(dataset.database, SIFT)
+
+
+@pytest.mark.slow
+def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
+    extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
+    cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
+    with pytest.raises(InputError, match="cluster: 4 workers died in the same block"):
+        cache.describe(dataset.database, extractor)
+    assert cache.describe(dataset.database, SIFT).missing(range(10)) == []
 
 
 def test_a_cluster_needs_a_folder(dataset, cluster):
