@@ -1,11 +1,9 @@
 """Turn checked settings into objects of the library, by fixed tables: nothing named in a YAML file is called."""
 
-import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -189,14 +187,11 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
 @contextmanager
 def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
     """Connect to the cluster that the settings name, or start it, until the block ends."""
-    chosen = settings.get("cluster")
-    if chosen is None:
+    if (chosen := settings.get("cluster")) is None:
         yield None
         return
-    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": partial(Cluster.slurm, log=console.tell)}
+    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
     with starts[chosen["name"]](**_without(chosen, "name")) as started:
-        for part in ("client", "scheduler"):  # errors of tasks are raised here, and told in one line
-            logging.getLogger(f"distributed.{part}").setLevel(logging.CRITICAL)
         console.tell(f"cluster: {started}")
         yield started
 

@@ -143,10 +143,9 @@ def check(settings: Mapping[str, Any]) -> None:
     if fusion.get("weights") and fusion["c"] != "zscore":
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
-    cluster = settings.get("cluster")
     for name, needed, expected in _NEEDS:
-        if settings.get(name) is not None and settings[needed] is None:
-            value = cluster["name"] if name == "cluster" and cluster else settings[name]
+        if (value := settings.get(name)) is not None and settings[needed] is None:
+            value = value["name"] if isinstance(value, Mapping) else value
             raise SettingsError(f"{name}={value}: expected {expected}")
 
 

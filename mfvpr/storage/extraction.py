@@ -15,8 +15,7 @@ from mfvpr.features.feature_set import FeatureSource, InMemory
 from mfvpr.storage import features, vectors
 from mfvpr.storage.manifest import VECTORS, store_path
 from mfvpr.storage.rows import RowStore, require_space
-from mfvpr.utils.cluster import Cluster
-from mfvpr.utils.progress import Track
+from mfvpr.utils.progress import Track, no_progress
 
 _MB = 1e6
 
@@ -103,28 +102,10 @@ class Extraction:
                 stack.enter_context(store)
             return stack.pop_all()
 
-    def write(self, batch: Mapping[int, Description]) -> None:
-        """Write a batch of descriptions to all sinks."""
-        for sink in self.sinks:
-            sink.write(batch)
-
-    def describe(
-        self, folder: ImageFolder, rows: Sequence[int], *, skip_bad: bool, track: Track, cluster: Cluster | None
-    ) -> None:
-        """Describe images in this process, or in the workers of a cluster, and write them to all sinks."""
-        if cluster is None or not rows:
-            for batch in describe_folder(folder, self.extractor, rows, self.bad, skip_bad=skip_bad, track=track):
-                self.write(batch)
-            return
-        extractor: Any = self.extractor
-        if is_dataclass(extractor):
-            extractor = replace(extractor)  # without compiled programs  # pyright: ignore[reportArgumentType]
-        state = replace(self, extractor=extractor)
-        shared, multiple = (folder, state, skip_bad), self.extractor.batch_size
-        for block, counts, bad in cluster.map(describe_block, shared, rows, track, multiple=multiple):
-            self.bad |= bad
-            for store, numbers in zip(self.stores, counts, strict=True):
-                store.counts[block] = numbers
+    def without_programs(self) -> "Extraction":
+        """A copy that can be sent to workers: its extractor has compiled nothing."""
+        is_value = is_dataclass(self.extractor) and not isinstance(self.extractor, type)
+        return replace(self, extractor=replace(self.extractor)) if is_value else self
 
     def announcement(self, missing: Sequence[int], requested: int) -> Iterator[str]:
         """A line: how many of the `requested` images are missing; if none, only once. Requires space on the disk."""
@@ -154,12 +135,14 @@ class Extraction:
                        f"{size / paper:.2f}x")  # fmt: skip
 
 
-def describe_block(
-    folder: ImageFolder, state: Extraction, skip_bad: bool, rows: Sequence[int]
+def describe_rows(
+    folder: ImageFolder, state: Extraction, skip_bad: bool, rows: Sequence[int], track: Track = no_progress
 ) -> tuple[Sequence[int], list[np.ndarray], dict[int, str]]:
-    """Describe images in a worker; returns the rows, the numbers of their features by store, and the bad ones."""
-    for batch in describe_folder(folder, state.extractor, state.missing(rows), state.bad, skip_bad=skip_bad):
-        state.write(batch)
+    """Write the descriptions of images; returns the rows, the numbers of features by store, and the bad rows."""
+    missing = state.missing(rows)
+    for batch in describe_folder(folder, state.extractor, missing, state.bad, skip_bad=skip_bad, track=track):
+        for sink in state.sinks:
+            sink.write(batch)
     bad = {row: state.bad[row] for row in rows if row in state.bad}
     return rows, [store.counts[rows] for store in state.stores], bad
 

@@ -23,7 +23,7 @@ from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage import matches as match_stores
 from mfvpr.storage.disk import lock_store
-from mfvpr.storage.extraction import Extraction, open_sinks
+from mfvpr.storage.extraction import Extraction, describe_rows, open_sinks
 from mfvpr.storage.manifest import LOCKS, MATCHES, store_path
 from mfvpr.storage.memo import Memo, Value, states
 from mfvpr.storage.recipes import Recipes
@@ -147,8 +147,12 @@ class FeatureCache:
             missing = state.missing(requested)
             for line in state.announcement(missing, len(requested)):
                 self.log(f"{label}: {line}")
-            track, cluster = self.runtime.progress(label), self.runtime.cluster
-            state.describe(folder, missing, skip_bad=self.skip_bad, track=track, cluster=cluster)
+            shared = folder, state if self.runtime.cluster is None else state.without_programs(), self.skip_bad
+            blocks = self.runtime.map(describe_rows, shared, missing, label, extractor.batch_size) if missing else ()
+            for block, counts, bad in blocks:
+                state.bad |= bad
+                for store, numbers in zip(state.stores, counts, strict=True):
+                    store.counts[block] = numbers
             for line in state.size_lines() if missing else ():
                 self.log(f"{label}: {line}")
         return state

@@ -143,7 +143,7 @@ def test_version(succeed, program):
     ("evaluate", ["cluster=local", "cache=null"], "cluster=local: expected cache=DIR as well, a folder that all"),
     ("evaluate", ["cluster.address=HOST"], "cluster.address=HOST: expected tcp://HOST:PORT"),
     ("evaluate", ["cluster.workers=2"], "cluster=local and cluster=slurm have cluster.workers"),
-    ("sweep", ["cluster=slurm"], "cluster: expected Slurm's command sbatch on this machine, got none"),
+    ("sweep", ["cluster=slurm"], "error: sbatch: No such file or directory"),
     ("evaluate", ["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
     ("evaluate", ["threshold=2"], "threshold=2: expected a number from 0 to 1"),
     ("evaluate", ["confidence=/none.json"], "/none.json: expected the confidence.json"),

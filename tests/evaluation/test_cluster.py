@@ -113,7 +113,7 @@ def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path)
 
 def test_workers_need_the_versions_of_the_client(dataset, cluster, tmp_path, monkeypatch):
     monkeypatch.setattr("mfvpr.utils.cluster.versions", lambda: {"jax": "0.1"})
-    with pytest.raises(InputError, match=r"cluster: expected jax 0\.1 on all workers, got .* on "):
+    with pytest.raises(InputError, match=r"cluster: expected workers with .*0\.1.*, got "):
         FeatureCache(tmp_path, runtime=Runtime(cluster=cluster)).describe(dataset.database, SIFT)
 
 
@@ -121,7 +121,7 @@ def test_workers_need_the_versions_of_the_client(dataset, cluster, tmp_path, mon
 def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
     extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
-    with pytest.raises(InputError, match="cluster: 4 workers died in the same block"):
+    with pytest.raises(InputError, match="cluster: 4 workers died in one block"):
         cache.describe(dataset.database, extractor)
     assert cache.describe(dataset.database, SIFT).missing(range(10)) == []
 
