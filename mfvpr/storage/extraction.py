@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +104,8 @@ class Extraction:
 
     def without_programs(self) -> "Extraction":
         """A copy that can be sent to workers: its extractor has compiled nothing."""
-        is_value = is_dataclass(self.extractor) and not isinstance(self.extractor, type)
-        return replace(self, extractor=replace(self.extractor)) if is_value else self
+        extractor: Any = self.extractor
+        return replace(self, extractor=replace(extractor)) if hasattr(extractor, "__dataclass_fields__") else self
 
     def announcement(self, missing: Sequence[int], requested: int) -> Iterator[str]:
         """A line: how many of the `requested` images are missing; if none, only once. Requires space on the disk."""
