@@ -47,6 +47,7 @@ from .evaluation.recall import recall_at_k
 # systems, by name or by parts; a whole data set, and one image at a time
 from .cli.systems import load_system
 from .evaluation.system import Pipeline, System
+from .utils.cluster import Cluster
 from .utils.runtime import Runtime
 from .report.results import Result, evaluate
 from .localization.map import Map
@@ -106,6 +107,7 @@ __all__ = [
     "load_system",
     "Pipeline",
     "System",
+    "Cluster",
     "Runtime",
     "Result",
     "evaluate",

@@ -51,6 +51,8 @@ LIBRARIES = {
     "optax": {"tuning"},
     "orbax": {"tuning"},
     "filelock": {"utils"},
+    "dask": {"utils"},
+    "distributed": {"utils"},
     "h5py": {"io"},
     "matplotlib": {"report"},
     "plotly": {"report"},

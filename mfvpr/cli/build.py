@@ -1,6 +1,7 @@
 """Turn checked settings into a data set, a cache and a runtime; `mfvpr.systems.assembly` has the parts of a system."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from mfvpr import datasets
@@ -12,7 +13,7 @@ from mfvpr.datasets.streets import seasons_folder, streets_folder
 from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import Runtime
+from mfvpr.utils import Cluster, Runtime
 from mfvpr.utils.files import expand_user
 
 
@@ -67,11 +68,25 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
     return FeatureCache(root, skip_bad=skip_bad, wait=wait, runtime=runtime(settings))
 
 
+@contextmanager
+def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
+    """Connect to the cluster that the settings name, or start it, until the block ends."""
+    if (chosen := settings.get("cluster")) is None:
+        yield None
+        return
+    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
+    options = {name: value for name, value in chosen.items() if name != "name"}
+    with starts[chosen["name"]](**options) as started:
+        console.tell(f"cluster: {started}")
+        yield started
+
+
 def runtime(settings: dict[str, Any]) -> Runtime:
-    """Devices, memory, progress and messages."""
+    """Devices, memory, progress, messages, and the cluster that `command_line` started."""
     import jax
 
     devices, number = jax.local_devices(), settings["devices"]
     if number != "all" and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
-    return Runtime(devices if number == "all" else devices[:number], settings["memory"], console.track, console.tell)
+    devices = devices if number == "all" else devices[:number]
+    return Runtime(devices, settings["memory"], console.track, console.tell, settings.get("cluster"))

@@ -55,9 +55,12 @@ def run(config: str) -> None:
             arguments = [override for override in overrides if not override.startswith("launcher=")]
             command = f"{name} {shlex.join(arguments)}"
             job = import_job(job_path)
+            from mfvpr.cli import build  # imported with the job
+
             _set_up_jax(settings.pop("compiled"))
-            with on_interrupt(signal.default_int_handler), in_settings(settings), _frozen_imports():
-                job(settings | {"multirun": is_multirun, "command": command})
+            interruptible = on_interrupt(signal.default_int_handler)
+            with interruptible, in_settings(settings), _frozen_imports(), build.cluster(settings) as cluster:
+                job(settings | {"multirun": is_multirun, "command": command, "cluster": cluster})
 
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
@@ -65,6 +68,9 @@ def run(config: str) -> None:
     with hydra_errors(config, typed):
         multirun = sorted({*_MULTIRUN} & {*typed})
         arguments = split_first(typed) if config == "learn" and not multirun else typed
+        names = {argument.partition("=")[0] for argument in arguments}
+        if "cluster.address" in names and "cluster" not in names:
+            arguments = ["cluster=address", *arguments]
         for argument in arguments:
             _check_form(argument, config)
             if argument.startswith("launcher=") and not (multirun and "," not in argument):

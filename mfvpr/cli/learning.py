@@ -53,7 +53,7 @@ def learn(settings: dict[str, Any]) -> None:
                                  checkpoints=checkpoints, track=console.track)  # fmt: skip
         heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
-        left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command")
+        left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command", "cluster")
         about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
         results = {
             **(about if report else _about(teach[0])), **comparisons.comparison_json(comparison),

@@ -13,7 +13,7 @@ from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from mfvpr.utils.files import expand_user
 
-_NO_SETTINGS = ("multirun", "command")  # added by `command_line`
+_NO_SETTINGS = ("multirun", "command", "cluster")  # added by `command_line`; results do not depend on them
 
 
 @contextmanager

@@ -6,7 +6,6 @@ Files and threads stay on the host; each computation is one compiled program per
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -26,13 +25,15 @@ from mfvpr.scoring.weights import match_weights
 from mfvpr.storage.matches import MatchStore, StoredMatches
 from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import at_least_single, compiled, device_of
+from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
+from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
 SHIFTS_AT_ONCE = 64  # pairs
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
 
 
 def match(
@@ -49,7 +50,7 @@ def match(
         store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
             batches; the result is read from it.
         rows: of the queries that are matched and returned; None = all.
-        runtime: devices that share the queries, memory, and progress over queries.
+        runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
         InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
@@ -58,13 +59,11 @@ def match(
     if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
         raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
-    match_rows = partial(
-        batched.match_queries, queries, database, candidates, matcher=matcher, memory=runtime.memory,
-        devices=runtime.devices or [device_of(())],
-    )  # fmt: skip
-    requested, track = range(len(queries)) if rows is None else rows, runtime.progress("matching")
+    sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
     if store is None:
-        matched = [query for _, query in track(match_rows(requested), len(requested))]
+        options = {"memory": runtime.memory, "devices": runtime.devices or [device_of(())]}
+        pairs = batched.match_queries(*sides, requested, matcher, **options)
+        matched = [query for _, query in runtime.progress("matching")(pairs, len(requested))]
         counts = np.array([query.counts for query in matched], np.int32).reshape(
             len(matched), candidates.indices.shape[1]
         )
@@ -72,13 +71,28 @@ def match(
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
-        tracked = iter(track(match_rows(missing), len(missing)))
-        while batch := dict(itertools.islice(tracked, STORE_BATCH)):
-            store.write(batch)
+        here = runtime.memory, runtime.devices
+        shared = *sides, matcher, *(here if runtime.cluster is None else (runtime.memory or WORKER_MEMORY, None)), store
+        for block, counts in runtime.map(match_rows, shared, missing, "matching", batched.QUERIES):
+            store.counts[block] = counts
     match_set, shortlist = stored_matches(store, rows, memory=runtime.memory)
     if not missing:
         _require_candidates(store, candidates, dict(zip(requested, shortlist.indices, strict=True)))
     return match_set
+
+
+def match_rows(
+    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher, memory: float | None,
+    devices: Sequence[Device] | None, store: MatchStore, rows: Sequence[int], track: Track = no_progress,
+) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
+    """Write the matches of queries to a store; returns their rows, and the numbers of their matches."""
+    missing = [row for row in rows if not store.done[row]]
+    options = {"memory": memory, "devices": devices or [device_of(())]}
+    matched = batched.match_queries(queries, database, candidates, missing, matcher, **options)
+    tracked = iter(track(matched, len(missing)))
+    while batch := dict(itertools.islice(tracked, STORE_BATCH)):
+        store.write(batch)
+    return rows, store.counts[rows]
 
 
 def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:

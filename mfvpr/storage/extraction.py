@@ -2,15 +2,20 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import FeatureSource, InMemory
 from mfvpr.storage import features, vectors
 from mfvpr.storage.manifest import VECTORS, store_path
 from mfvpr.storage.rows import RowStore, require_space
+from mfvpr.utils.progress import Track, no_progress
 
 _MB = 1e6
 
@@ -97,10 +102,10 @@ class Extraction:
                 stack.enter_context(store)
             return stack.pop_all()
 
-    def write(self, batch: Mapping[int, Description]) -> None:
-        """Write a batch of descriptions to all sinks."""
-        for sink in self.sinks:
-            sink.write(batch)
+    def without_programs(self) -> "Extraction":
+        """A copy that can be sent to workers: its extractor has compiled nothing."""
+        extractor: Any = self.extractor
+        return replace(self, extractor=replace(extractor)) if hasattr(extractor, "__dataclass_fields__") else self
 
     def announcement(self, missing: Sequence[int], requested: int) -> Iterator[str]:
         """A line: how many of the `requested` images are missing; if none, only once. Requires space on the disk."""
@@ -128,6 +133,18 @@ class Extraction:
                 yield (f"{size / _MB:.1f} MB, {size / images / _MB:.2f} MB and {features / images:.0f} features an "
                        f"image; as the paper stores them, in float32, {paper / _MB:.1f} MB: "
                        f"{size / paper:.2f}x")  # fmt: skip
+
+
+def describe_rows(
+    folder: ImageFolder, state: Extraction, skip_bad: bool, rows: Sequence[int], track: Track = no_progress
+) -> tuple[Sequence[int], list[np.ndarray], dict[int, str]]:
+    """Write the descriptions of images; returns the rows, the numbers of features by store, and the bad rows."""
+    missing = state.missing(rows)
+    for batch in describe_folder(folder, state.extractor, missing, state.bad, skip_bad=skip_bad, track=track):
+        for sink in state.sinks:
+            sink.write(batch)
+    bad = {row: state.bad[row] for row in rows if row in state.bad}
+    return rows, [store.counts[rows] for store in state.stores], bad
 
 
 def open_sinks(

@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage import matches as match_stores
 from mfvpr.storage.disk import lock_store
-from mfvpr.storage.extraction import Extraction, open_sinks
+from mfvpr.storage.extraction import Extraction, describe_rows, open_sinks
 from mfvpr.storage.manifest import LOCKS, MATCHES, store_path
 from mfvpr.storage.memo import Memo, Value, states
 from mfvpr.storage.recipes import Recipes
@@ -73,6 +72,8 @@ class FeatureCache:
 
     def __post_init__(self) -> None:
         self.root = None if self.root is None else Path(self.root)
+        if self.root is None and self.runtime.cluster is not None:
+            raise InputError("cluster: expected a cache with a root, a folder that all workers share")
 
     @property
     def recipes(self) -> Recipes:
@@ -146,9 +147,12 @@ class FeatureCache:
             missing = state.missing(requested)
             for line in state.announcement(missing, len(requested)):
                 self.log(f"{label}: {line}")
-            options = {"skip_bad": self.skip_bad, "track": self.runtime.progress(label)}
-            for batch in describe_folder(folder, extractor, missing, state.bad, **options):
-                state.write(batch)
+            shared = folder, state if self.runtime.cluster is None else state.without_programs(), self.skip_bad
+            blocks = self.runtime.map(describe_rows, shared, missing, label, extractor.batch_size) if missing else ()
+            for block, counts, bad in blocks:
+                state.bad |= bad
+                for store, numbers in zip(state.stores, counts, strict=True):
+                    store.counts[block] = numbers
             for line in state.size_lines() if missing else ():
                 self.log(f"{label}: {line}")
         return state

@@ -121,6 +121,10 @@ class RowStore(Generic[Item]):
     def __exit__(self, *_: object) -> None:
         self._blocks.pop().close()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for workers of a cluster, which write while this process holds the lock."""
+        return self.__dict__ | {"_lock": None, "_blocks": []}
+
     def look(self) -> None:
         """Find the rows that are done by now; raises `InputError` if they were made from something else."""
         entries: dict[str, int] = {}

@@ -40,6 +40,7 @@ RULES: dict[str, Rule] = {
         "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
         "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
         "matching.name": one_of("neighbors", "lightglue"),
+        "cluster.name": one_of("local", "slurm", "address"),
         "ground_truth": one_of(None, "order", "index", "utm", "label", "none"),  # None: an error, see build.dataset
         "lengths": one_of("unit", "normalize", "keep"),
         "seasons": list_of(one_of("fall", "spring", "summer", "winter"), 2),
@@ -66,13 +67,15 @@ RULES: dict[str, Rule] = {
         "database_prefix query_prefix": either(_TEXT, ""),
         "also report": either(_TEXT, None),
         ".datasets .systems": either(list_of(_TEXT), None),
+        "cluster.address": pattern(r"(tcp|tls|ucx)://\S+:\d+", "tcp://HOST:PORT"),
+        "cluster.options": either(_TEXT, ""),
         "shard": either(pattern(r"[0-9]+/[0-9]+", "i/n with i from 0 to n - 1, such as 0/8"), None),
         "figures": _FIGURES,
         # whole numbers
         "seed alternatives recent": _INDEX,
         "exclude_neighbors cohort": either(_INDEX, None),
         "tolerances": list_of(_INDEX),
-        "max_samples steps every patience": _COUNT,
+        "max_samples steps every patience workers": _COUNT,
         "max_images max_windows max_matches chunk_size chunk.settings chunk.queries": either(_COUNT, None),
         "candidates devices": either(_COUNT, "all"),
         "ks": list_of(_COUNT),
@@ -106,6 +109,7 @@ RULES: dict[str, Rule] = {
 # Settings that take effect with another one only, and the words of the error.
 _NEEDS = (
     ("also", "report", "report=DATASET,... as well, to learn on several data sets and report on others"),
+    ("cluster", "cache", "cache=DIR as well, a folder that all workers share"),
     ("shard", "cache", "cache=DIR as well, the same of all shards"),
     ("threshold", "confidence", "confidence=FILE as well, the confidence.json of a run on other images with ground "
      "truth"),
@@ -140,8 +144,9 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
     for name, needed, expected in _NEEDS:
-        if settings.get(name) is not None and settings[needed] is None:
-            raise SettingsError(f"{name}={settings[name]}: expected {expected}")
+        if (value := settings.get(name)) is not None and settings[needed] is None:
+            value = value["name"] if isinstance(value, Mapping) else value
+            raise SettingsError(f"{name}={value}: expected {expected}")
 
 
 def _check_values(settings: Mapping[str, Any], methods: Mapping[str, str]) -> None:

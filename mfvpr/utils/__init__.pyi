@@ -1,4 +1,5 @@
 __all__ = [
+    "Cluster",
     "InputError",
     "NoGradientError",
     "Runtime",
@@ -7,6 +8,7 @@ __all__ = [
     "recipe_of",
 ]
 
+from .cluster import Cluster
 from .compiled_programs import keep_compiled_programs
 from .errors import InputError, NoGradientError
 from .fingerprints import recipe_of

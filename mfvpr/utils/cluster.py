@@ -1,0 +1,157 @@
+"""Work on many processes or machines, by Dask Distributed (extra `cluster`).
+
+with Cluster.local(4) as cluster:
+    mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
+"""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import Any, TypeVar
+
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import available_cpus, round_up
+from mfvpr.utils.progress import Track
+from mfvpr.utils.versions import versions
+
+BLOCK = 32  # rows of a task at most, which a killed worker loses
+_BLOCKS = 16  # tasks at least, if there are so many rows
+_LOGGING = {"logging": {"distributed.client": "critical", "distributed.scheduler": "critical"}}
+_SETTINGS = {"distributed": {  # defaults of Dask
+    "scheduler": {"no-workers-timeout": "30 minutes"},  # then a call ends with an error
+    "nanny": {"pre-spawn-environ": {"DASK_LOGGING__DISTRIBUTED": "critical"}},  # the client raises errors of blocks
+    "admin": {"large-graph-warning-threshold": "8 GB"},  # extractors include the weights of their networks
+}}  # fmt: skip
+
+Result = TypeVar("Result")
+
+
+class Cluster:
+    """Workers that describe images and match queries in blocks, and write the results to the folder of one cache.
+
+    All machines need the folders of the cache and of the images under the same paths, and the same versions, which
+    every block checks. If a worker dies, another worker repeats its block. Results are those of one process to the bit
+    if all machines have the same processors or GPUs, number of XLA threads, and options of JAX, which workers read from
+    their environment. Put extractors and matchers of your own into a module that workers can import.
+    """
+
+    def __init__(self, client: Any) -> None:
+        """Use the workers of a `distributed.Client`, whatever started them; they need one thread each."""
+        self._client = client
+
+    def __str__(self) -> str:
+        address = self._client.scheduler.address
+        return f"{len(self._client.nthreads())} workers at {address}, dashboard {self._client.dashboard_link}"
+
+    @classmethod
+    @contextmanager
+    def connect(cls, address: str) -> Iterator["Cluster"]:
+        """The workers of the scheduler at `tcp://HOST:PORT`."""
+        try:
+            client = _distributed().Client(address, set_as_default=False)
+        except OSError:
+            raise InputError(f"cluster: expected a scheduler at {address}, got no answer; check the address") from None
+        with client:
+            yield cls(client)
+
+    @classmethod
+    @contextmanager
+    def local(cls, workers: int, **options: Any) -> Iterator["Cluster"]:
+        """Start worker processes on this machine, until the block ends; `options` are those of `LocalCluster` of Dask.
+
+        Each has an equal share of the processors, or as many threads of XLA as the variable PJRT_NPROC says. Scripts
+        need `if __name__ == "__main__":` before it.
+        """
+        threads = os.environ.get("PJRT_NPROC") or str(max(1, available_cpus() // max(1, workers)))
+        options = {"dashboard_address": ":0", "env": {"PJRT_NPROC": threads}} | options
+        resource_tracker.ensure_running()  # its start would unblock the signal
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers end with this process
+        try:  # Dask does not count JAX's memory
+            started = _distributed().LocalCluster(n_workers=workers, threads_per_worker=1, memory_limit=0, **options)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with started, cls.connect(started) as cluster:
+            yield cluster
+
+    @classmethod
+    @contextmanager
+    def slurm(cls, workers: int, options: str = "") -> Iterator["Cluster"]:
+        """Start an array of Slurm jobs with one worker each, until the block ends.
+
+        `options` are those of `sbatch`, such as `--partition=gpu --gpus=1`.
+        """
+        with cls.local(0, host="tcp://") as cluster:
+            worker = [sys.executable, "-m", "distributed.cli.dask_worker", cluster._client.scheduler.address,
+                      "--nthreads=1", "--memory-limit=0", "--no-dashboard", "--death-timeout=60"]  # fmt: skip
+            script = f"export PJRT_NPROC=${{PJRT_NPROC:-${{SLURM_CPUS_PER_TASK:-1}}}}; exec {shlex.join(worker)}"
+            array = ["--parsable", "--requeue", "--job-name=mfvpr", f"--array=1-{workers}"]
+            job = _run_slurm("sbatch", *array, *shlex.split(options), f"--wrap={script}").partition(";")[0].strip()
+            try:
+                yield cluster
+            finally:
+                _run_slurm("scancel", job)
+
+    def map(
+        self, function: Callable[..., Result], shared: tuple[Any, ...], rows: Sequence[int], track: Track, multiple: int
+    ) -> list[Result]:
+        """Results of `function(*shared, block)` in workers, see `Runtime.map`, in the order in which blocks finish."""
+        size = round_up(min(BLOCK, len(rows) // _BLOCKS), multiple)
+        blocks = [rows[start : start + size] for start in range(0, len(rows), size)]
+        client, distributed, results = self._client, _distributed(), list[Result]()
+        again = "finished blocks are in the cache; run again to go on"
+        futures: dict[Any, Sequence[int]] = {}
+
+        def finished_rows() -> Iterator[int]:
+            for future in distributed.as_completed(list(futures), loop=client.loop):
+                results.append(future.result())
+                yield from futures.pop(future)  # Dask would repeat the block if its worker died while the future exists
+
+        try:
+            client.wait_for_workers(1)
+            value = client.submit(tuple, shared, pure=False)  # Dask repeats a task if its worker dies; not `scatter`
+            futures |= {client.submit(_run, versions(), function, value, block, pure=False): block for block in blocks}
+            for _ in track(finished_rows(), len(rows)):
+                pass
+        except distributed.KilledWorker as error:
+            number = error.allowed_failures + 1
+            raise InputError(f"cluster: {number} workers died in one block; give them more memory; {again}") from None
+        except distributed.scheduler.NoWorkerError:
+            raise InputError(f"cluster: no worker is left; {again}") from None
+        except (CancelledError, distributed.comm.CommClosedError):
+            raise InputError(f"cluster: the scheduler at {client.scheduler.address} is gone; {again}") from None
+        finally:
+            for future in futures:
+                future.release()
+        return results
+
+
+def _run(expected: dict[str, str], function: Callable[..., Any], shared: tuple[Any, ...], block: Sequence[int]) -> Any:
+    if (installed := versions()) != expected:
+        raise InputError(f"cluster: expected workers with {expected}, got {installed}; install the same versions")
+    return function(*shared, block)
+
+
+def _distributed() -> Any:
+    try:
+        from dask import config
+
+        config.update_defaults(_LOGGING)  # read by the next import
+        import distributed
+    except ImportError:
+        raise InputError("cluster: Dask Distributed is not installed; pip install 'mfvpr[cluster]'") from None
+    config.update_defaults(_SETTINGS)
+    return distributed
+
+
+def _run_slurm(*command: str) -> str:
+    """Output of a command of Slurm."""
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise InputError(f"cluster: {shlex.join(command[:2])}: {' '.join(done.stderr.split())}; check cluster.options")
+    return done.stdout

@@ -1,0 +1,131 @@
+"""A cluster of processes gives what one process gives, whoever is killed."""
+
+import os
+import signal
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import mfvpr
+from mfvpr.evaluation import Pipeline, System, evaluate
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.reranking import Fusion
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
+from mfvpr.utils import Cluster, InputError, Runtime
+from tests.evaluation.test_shards import assert_same
+from tests.storage.extractors import SIFT, TwoScales
+
+pytestmark = pytest.mark.thorough
+
+SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
+
+
+def die_once(flag):
+    """Kill this process, if the file is there, which is removed before."""
+    with suppress(FileNotFoundError):
+        os.unlink(flag)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class FatalSift(Sift):
+    """Kills the first worker that describes images, or without a flag every worker."""
+
+    flag: str | None = None
+
+    def __call__(self, images):
+        die_once(self.flag) if self.flag else os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(images)
+
+
+@dataclass(frozen=True)
+class FatalMatcher:
+    """Kills the first worker that matches."""
+
+    flag: str
+
+    def __call__(self, features0, features1):
+        die_once(self.flag)
+        return mfvpr.match(features0, features1)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with Cluster.local(3) as started:
+        yield started
+
+
+@pytest.fixture
+def flag(tmp_path):
+    path = tmp_path / "flag"
+    path.touch()
+    return str(path)
+
+
+def system_of(extractor=SIFT, retriever=None, cohort=1, **options):
+    retriever = retriever or Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
+    pipeline = Pipeline(extractor, retriever, candidates=4, **options)
+    return System(pipeline, SCORERS, {"histogram": Fusion()}, cohort=cohort)
+
+
+def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset, cluster, tmp_path):
+    extractor, labels = TwoScales(), set()
+    system = system_of(extractor, Retrieval(extractor), cohort=None)
+
+    def progress(label):
+        def track(items, total):
+            done = list(items)
+            assert len(done) == total
+            labels.add(label)
+            return done
+
+        return track
+
+    runtime = Runtime(cluster=cluster, progress=progress)
+    result = evaluate(dataset, system, cache=FeatureCache(tmp_path / "store"), runtime=runtime)
+    assert_same(result, evaluate(dataset, system, cache=FeatureCache(tmp_path / "plain")))
+    assert {"database descriptors", "query folder descriptors", "matching"} <= labels
+
+
+@pytest.mark.parametrize("stage", ["describing", "matching"])
+def test_a_killed_worker_costs_time_alone(dataset, cluster, flag, tmp_path, stage):
+    fatal = {"describing": {"extractor": FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3, flag=flag)},
+             "matching": {"matcher": FatalMatcher(flag)}}  # fmt: skip
+    cache = FeatureCache(tmp_path / "store", runtime=Runtime(cluster=cluster))
+    result = evaluate(dataset, system_of(**fatal[stage]), cache=cache)
+    assert not Path(flag).exists()
+    assert_same(result, evaluate(dataset, system_of(), cache=FeatureCache(tmp_path / "plain")))
+
+
+def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path):
+    (tmp_path / "bad.png").write_bytes(b"no image")
+    folder = mfvpr.datasets.image_folder(tmp_path)
+    for runtime in (Runtime(), Runtime(cluster=cluster)):
+        with pytest.raises(InputError, match=r"bad\.png: .*, or skip bad images") as raised:
+            FeatureCache(tmp_path / "store", runtime=runtime).local(folder, SIFT)
+        assert "\n" not in str(raised.value)
+    cache = FeatureCache(tmp_path / "store", skip_bad=True, runtime=runtime)
+    assert [*cache.describe(folder, SIFT).bad] == [0]
+
+
+def test_workers_need_the_versions_of_the_client(dataset, cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr("mfvpr.utils.cluster.versions", lambda: {"jax": "0.1"})
+    with pytest.raises(InputError, match=r"cluster: expected workers with .*0\.1.*, got "):
+        FeatureCache(tmp_path, runtime=Runtime(cluster=cluster)).describe(dataset.database, SIFT)
+
+
+@pytest.mark.slow
+def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
+    extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
+    cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
+    with pytest.raises(InputError, match="cluster: 4 workers died in one block"):
+        cache.describe(dataset.database, extractor)
+    assert cache.describe(dataset.database, SIFT).missing(range(10)) == []
+
+
+def test_a_cluster_needs_a_folder(dataset, cluster):
+    with pytest.raises(InputError, match="cluster: expected a cache with a root"):
+        evaluate(dataset, system_of(), runtime=Runtime(cluster=cluster))
