@@ -45,6 +45,7 @@ from .evaluation.recall import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
 from .cli.systems import load_system
+from .cli.sweeps import sweep
 from .evaluation.system import Pipeline, System
 from .utils.runtime import Runtime
 from .evaluation.evaluation import evaluate
@@ -102,6 +103,7 @@ __all__ = [
     "radius_positives",
     "recall_at_k",
     "load_system",
+    "sweep",
     "Pipeline",
     "System",
     "Runtime",

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
+from mfvpr.tuning.sweeps.sweep import group_program
 
 import mfvpr
 from mfvpr.matching import MatchSet
 from mfvpr.tuning.sweeps.settings import group_by_program
-from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import of_query, random_matches
 from tests.programs import ROOT

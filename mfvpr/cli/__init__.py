@@ -6,9 +6,9 @@
 | map, data, weights, report | maps, published_data, checkpoints, mfvpr.report.pages |
 
 Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
-settings and rules (checks of settings), systems (`load_system`). Then overrides, help_text, wording (of errors),
-declare (files in conf/ that follow from scorers). Settings become values in build, truth and confidences. Jobs share
-stages, run_folder, axes, console.
+settings and rules (checks of settings), systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text,
+wording (of errors), declare (files in conf/ that follow from scorers). Settings become values in build, truth and
+confidences. Jobs share stages, run_folder, axes, console.
 
 Imports checkpoints, datasets, evaluation, features, localization, matching, networks, report, reranking, retrieval,
 scoring, storage, tuning, types, utils.

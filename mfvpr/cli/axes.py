@@ -11,8 +11,8 @@ from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.rankings import SETTINGS_PER_BLOCK
 from mfvpr.tuning.sweeps.search import require_optuna
-from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import free_host_bytes
 
@@ -54,7 +54,7 @@ def axes(settings: dict[str, Any]) -> Axes:
     defaults = settings["scorer"] | {"max_distance": limit}
     if "c" in values:
         defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0}
-    return Axes(scorer, values, {name: defaults.get(name) for name in values})
+    return Axes(scorer, values, defaults)
 
 
 def search_axes(settings: dict[str, Any]) -> Axes:

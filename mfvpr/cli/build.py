@@ -180,7 +180,7 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["cache"] is None else expand_user(settings["cache"])
     shard = None if settings.get("shard") is None else Shard.parse(settings["shard"])
-    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", wait=settings.get("multirun", False),
+    return FeatureCache(root, skip_bad=settings["on_bad_image"] == "skip", wait=bool(settings.get("multirun")),
                         shard=shard, runtime=runtime(settings))  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from mfvpr.cli import build, console
 from mfvpr.cli.settings import SettingsError
 from mfvpr.report import runs
+from mfvpr.report.jobs import add_job
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
 from mfvpr.utils import InputError
@@ -43,6 +44,9 @@ def write_results(
         print(f"\n{text}", flush=True)
     draw_figures(folder, figures)
     print(f"results: {folder}")
+    if job := settings.get("multirun"):
+        add_job(Path(job["multirun"]), job["number"], job["overrides"], folder)
+        print(f"jobs: {job['multirun']}")
 
 
 def write_files(

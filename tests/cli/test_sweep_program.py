@@ -17,13 +17,13 @@ from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, matches_
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps.rankings"]
 
 
 @pytest.fixture(scope="session")
 def sweep(root):
     """Sweeps into a folder."""
-    return job_of(root, "sweep", sweeping.sweep, (sweeping.sweeps, "heat_maps"))
+    return job_of(root, "sweep", sweeping.sweep, (sweeping.sweeps, "sweep_figures"))
 
 
 GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")
