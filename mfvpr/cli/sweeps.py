@@ -1,7 +1,6 @@
 """Sweeps of the parameters of a system, for users of the library; `sweeping` is the program."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from mfvpr.scoring.parameters import numbers_by_name, static_names
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
 from mfvpr.utils import InputError, Runtime
-from mfvpr.utils.locks import lock_folder
 
 _TOLERANCES, _RADIUS = (1, 2, 5), 25.0  # frames, meters; as in conf/common.yaml
 
@@ -67,13 +65,12 @@ def sweep(
     thresholds = thresholds or sequence.truth.thresholds(tolerances=_TOLERANCES, radius=_RADIUS)
     protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
     runtime = runtime or cache.runtime
-    with _block_folder(out) as blocks:
-        matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=runtime)
-        kind = system.fused[name].retrieval_score if name in system.fused else "cosine"
-        options = SweepOptions(ties=system.ties, retrieval_score=kind, folder=blocks, runtime=runtime)
-        result = Sweep(dataset.name, name, search_grid(swept, protocol, matched.by_scale, matched.candidates, options))
-        if out is not None:
-            result.save(out)
+    kind = system.fused[name].retrieval_score if name in system.fused else "cosine"
+    options = SweepOptions(ties=system.ties, retrieval_score=kind, folder=_block_folder(out), runtime=runtime)
+    matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=runtime)
+    result = Sweep(dataset.name, name, search_grid(swept, protocol, matched.by_scale, matched.candidates, options))
+    if out is not None:
+        result.save(out)
     return result
 
 
@@ -91,17 +88,12 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
                      "mfvpr.System(system.pipeline, {name: scorer})")  # fmt: skip
 
 
-@contextmanager
-def _block_folder(out: Path | str | None) -> Iterator[Path | None]:
-    """The folder of finished blocks, for this sweep alone."""
+def _block_folder(out: Path | str | None) -> Path | None:
+    """The folder of finished blocks, in a new or empty folder or in one of a sweep; None without `out`."""
     if out is None:
-        yield None
-        return
-    folder = Path(out)
-    blocks = folder / "blocks"
-    if not blocks.is_dir() and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"out={folder}: expected a new or empty folder, or one of a sweep; name another")
+        return None
+    blocks = Path(out) / "blocks"
+    if not blocks.is_dir() and Path(out).exists() and (not Path(out).is_dir() or any(Path(out).iterdir())):
+        raise InputError(f"out={out}: expected a new or empty folder, or one of a sweep; name another")
     blocks.mkdir(parents=True, exist_ok=True)
-    error = InputError(f"out={folder}: another sweep is using this folder; wait until it ends, or name another")
-    with lock_folder(blocks, error):
-        yield blocks
+    return blocks

@@ -1,6 +1,7 @@
 """Reports of a sweep: table of all settings, summary, JSON values, and figures."""
 
 import itertools
+import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -154,12 +155,11 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
     protocol, ks = outcome.protocol, outcome.ks
     recall = np.stack([protocol.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
-    return {
-        "axes": {name: list(map(_json_value, values)) for name, values in outcome.axes.values.items()},
-        "own": _json_values(outcome.axes.own),
+    values = {
+        "axes": dict(outcome.axes.values), "own": dict(outcome.axes.own),
         "search": "grid" if outcome.is_grid else "optuna",
         "unit": protocol.unit, "thresholds": list(protocol.thresholds), "ks": list(ks), "split": protocol.split,
-        "chosen": [_json_values(outcome.settings[number]) for number in outcome.chosen],
+        "chosen": [outcome.settings[number] for number in outcome.chosen],
         "report": [
             {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
              "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict(),
@@ -167,20 +167,13 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
             for verdict in outcome.report
         ],
         "settings": [
-            {"parameters": _json_values(setting), "recall_at": {
+            {"parameters": setting, "recall_at": {
                 f"{threshold:g}": {str(k): round(float(recall[number, place, depth]), 6) for depth, k in enumerate(ks)}
                 for place, threshold in enumerate(protocol.thresholds)}}
             for number, setting in enumerate(outcome.settings)
         ],
     }  # fmt: skip
-
-
-def _json_values(setting: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _json_value(value) for name, value in setting.items()}
-
-
-def _json_value(value: Any) -> Any:
-    return value if value is None or isinstance(value, str | int | float | list) else str(value)
+    return json.loads(json.dumps(values, default=str))  # weights that are no words
 
 
 def sweep_summary(outcome: Outcome) -> str:

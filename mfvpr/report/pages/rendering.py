@@ -40,8 +40,8 @@ class Gallery:
 class Section:
     """A part of a page; `name` is a word for its element, `words` stand above everything in it.
 
-    `tables` are by caption. `links` are words and the addresses of other pages, relative to the page. `images` are
-    `data:` URIs by title.
+    `tables` are by caption. `links` are words and the addresses of other pages, relative to the page. `text` keeps
+    its lines. `images` are `data:` URIs by title.
     """
 
     name: str
@@ -51,6 +51,7 @@ class Section:
     tables: Mapping[str, Table] = field(default_factory=dict)
     gallery: Gallery | None = None
     links: Sequence[tuple[str, str]] = ()
+    text: str = ""
     images: Mapping[str, str] = field(default_factory=dict)
 
 

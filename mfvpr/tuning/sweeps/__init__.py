@@ -2,9 +2,9 @@
 
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome
-from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings, result_bytes
+from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings
 from mfvpr.tuning.sweeps.search import search_grid, search_optuna
 from mfvpr.tuning.sweeps.settings import Setting, grid
 
-__all__ = ["Axes", "Outcome", "Setting", "SweepOptions", "grid", "rank_settings", "result_bytes", "search_grid",
+__all__ = ["Axes", "Outcome", "Setting", "SweepOptions", "grid", "rank_settings", "search_grid",
            "search_optuna"]  # fmt: skip

@@ -55,7 +55,7 @@ class Axes:
             is_list = np.iterable(axis) and not isinstance(axis, str)
             values[name] = list(map(_plain, axis)) if is_list else []
             if len({*values[name]}) < max(1, len(values[name])):
-                raise InputError(f"{name}={axis!r}: expected a list of different values")
+                raise InputError(f"{name}={axis!r}: expected different values, in a list")
         own = {name: self.own[name] if name in self.own else self._own(name) for name in values}
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "own", own)

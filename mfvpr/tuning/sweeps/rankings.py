@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -97,13 +97,9 @@ class Work:
 
     @cached_property
     def num_batches(self) -> int:
-        """Number of `batches`."""
+        """Number of batches of pairs."""
         sets = scales(self.match_set)
         return sum(len(partition(scale, self.queries, settings=self.settings)) for scale in sets)
-
-    def batches(self) -> Iterator[PaddedBatch]:
-        """Padded pairs of these queries."""
-        return all_batches(self.match_set, self.queries, settings=self.settings)
 
     def parts(self, size: int) -> Iterator["Work"]:
         """Split into at most `size` queries at a time."""
@@ -112,30 +108,6 @@ class Work:
             candidates = jax.tree.map(lambda values: values[part], self.candidates)  # noqa: B023
             views = [view[part] & candidates.mask for view in self.views]
             yield replace(self, queries=self.queries[part], candidates=candidates, views=views)
-
-
-class Pace(NamedTuple):
-    """Seconds to score a setting and a batch, seconds to compile, and settings of one call; by default unknown."""
-
-    seconds: float = 1.0
-    compilation: float = 0.0
-    settings: int = 10**9
-
-
-@dataclass
-class Progress:
-    """Ticks of a progress bar, one per unit of cost."""
-
-    ticks: Iterator[Any]
-    cost: float = 0.0
-    shown: int = 0
-
-    def begin(self, cost: float) -> None:
-        """Begin a step; the steps before it are done."""
-        while self.shown <= self.cost:
-            next(self.ticks, None)
-            self.shown += 1
-        self.cost += cost
 
 
 @dataclass(frozen=True)
@@ -158,7 +130,7 @@ class Block:
     cs: Sequence[Any]
 
     @property
-    def steps(self) -> int:
+    def amount(self) -> int:
         """Settings times batches."""
         return self.group.rows.size * self.part.num_batches
 
@@ -186,11 +158,11 @@ class Block:
             with suppress(FileNotFoundError):  # another process that ends the same sweep removes the folder
                 write_arrays(folder / f"{self._key}.npz", {"rows": rows}, self._key)
 
-    def rows(self, batches: Sequence[PaddedBatch], pace: Pace, progress: Progress) -> np.ndarray:
-        """Rows `[V, W, q, depth]` of the members."""
+    def rows(self, batches: Sequence[PaddedBatch], size: int, ticks: Iterator[Any]) -> np.ndarray:
+        """Rows `[V, W, q, depth]` of the members; at most `size` settings of one call, each takes one of the ticks."""
         part, group = self.part, self.group
         shape = len(scales(part.match_set)), *part.candidates.mask.shape
-        scores = block_scores(group, batches, shape, part.options.runtime.devices, pace, progress)
+        scores = block_scores(group, batches, shape, part.options.runtime.devices, size, ticks)
         _, first = np.unique(group.rows, return_index=True)
         scores = scores[:, np.sort(first)]
 
@@ -236,11 +208,6 @@ def rank_settings(
     return all_rows
 
 
-def result_bytes(num_views: int, num_settings: int, num_queries: int, depth: int) -> int:
-    """Size of the result of `rank_settings` in bytes."""
-    return 4 * num_views * num_settings * num_queries * depth
-
-
 def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Block]:
     options, (unique, places) = work.options, distinct(settings)
     per_block = min(options.settings_per_block or SETTINGS_PER_BLOCK, len(unique))
@@ -258,78 +225,66 @@ def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Bl
 
 
 def _compute(blocks: Sequence[Block], options: SweepOptions) -> Iterator[tuple[Block, np.ndarray]]:
-    """Rows of the blocks; long work logs its expected time and advances its progress about every second."""
-    paces = _measure(blocks)
-    costs = [block.steps * paces[block.number].seconds for block in blocks]
-    total = math.ceil(sum(costs) + sum(pace.compilation for pace in paces.values()))
-    if sum(block.steps for block in blocks) > _MEASURED:
-        options.runtime.log(f"{options.label}: about {duration(total)}")
+    """Rows of the blocks; long work logs its expected time, and advances its progress about every second."""
+    seconds = _measure(blocks)
+    if sum(block.amount for block in blocks) > _MEASURED:
+        options.runtime.log(f"{options.label}: {duration(sum(b.amount * seconds[b.number] for b in blocks))}")
+    sizes = {number: max(1, int(_STEP / each)) for number, each in seconds.items()}
+    total = sum(block.part.num_batches * len([*block.group.blocks(sizes[block.number])]) for block in blocks)
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
-    progress, begun = Progress(ticks), set[int]()
     for part, of_part in itertools.groupby(blocks, lambda block: block.part):
-        batches = list(part.batches())
+        batches = list(all_batches(part.match_set, part.queries, settings=part.settings))
         for block in of_part:
-            if block.number not in begun:
-                progress.cost += paces[block.number].compilation
-                begun.add(block.number)
-            yield block, block.rows(batches, paces[block.number], progress)
-    for _ in ticks:
-        pass
+            yield block, block.rows(batches, sizes[block.number], ticks)
+    next(ticks, None)
 
 
-def _measure(blocks: Sequence[Block]) -> dict[int, Pace]:
-    """Paces by number of the program, measured for some and interpolated for the others; defaults for little work."""
-    if sum(block.steps for block in blocks) <= _MEASURED:
-        return {block.number: Pace() for block in blocks}
-    examples = {block.number: block for block in reversed(blocks) if block.steps}
+def _measure(blocks: Sequence[Block]) -> dict[int, float]:
+    """Seconds of a setting and a batch by program: measured for some, interpolated for others; 0 for little work."""
+    if sum(block.amount for block in blocks) <= _MEASURED:
+        return {block.number: _STEP / SETTINGS_PER_BLOCK for block in blocks}
+    examples = {block.number: block for block in reversed(blocks) if block.amount}
     numbers = sorted(examples)
-    probed = sorted({numbers[place] for place in np.linspace(0, len(numbers) - 1, _PROBES).round().astype(int)})
-    measured = np.array([_seconds(examples[number]) for number in probed]).T
-    seconds, compilation = (np.interp(numbers, probed, values).tolist() for values in measured)
-    return {
-        number: Pace(each, once, max(1, int(_STEP / each)))
-        for number, each, once in zip(numbers, seconds, compilation, strict=True)
-    }
+    measured = sorted({numbers[place] for place in np.linspace(0, len(numbers) - 1, _PROBES).round().astype(int)})
+    seconds = np.interp(numbers, measured, [_seconds(examples[number]) for number in measured])
+    return dict(zip(numbers, seconds.tolist(), strict=True))
 
 
-def _seconds(block: Block) -> tuple[float, float]:
-    """Measured seconds of a setting and a batch, with all cores at work, and of compilation for every shape."""
+def _seconds(block: Block) -> float:
+    """Measured seconds of a setting and a batch, with all cores at work and without compilation."""
     part, devices = block.part, block.part.options.runtime.devices
     workers = max(available_cpus(), len(devices or ()))
-    batch = next(part.batches())
+    batch = next(all_batches(part.match_set, part.queries, settings=part.settings))
 
     def run(group: Group) -> float:
         start, inputs = time.perf_counter(), (group.scorer, group.settings, group.weightings)
         list(run_batches(_score_settings, inputs, [batch] * workers, devices=devices))
-        return time.perf_counter() - start
+        return (time.perf_counter() - start) / workers / group.rows.size
 
-    group = next(block.group.blocks(1))
-    first, again = run(group), run(group)
-    if again < workers * _STEP / 2:
-        group = next(block.group.blocks(int(workers * _STEP / again)))
-        first, again = run(group), run(group)
-    num_shapes = sum(len(shapes(scale, settings=part.settings)) for scale in scales(part.match_set))
-    return again / workers / group.rows.size, max(0.0, first - again) * num_shapes
+    one = next(block.group.blocks(1))
+    seconds = min(run(one), run(one))  # the first one compiles
+    if seconds > _STEP / 2:
+        return seconds
+    several = next(block.group.blocks(int(_STEP / seconds)))
+    return min(run(several), run(several))
 
 
 def duration(seconds: float) -> str:
-    """Seconds, minutes or hours in words."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.0f} h"
+    """Seconds or minutes in words."""
+    return f"about {seconds:.0f} s" if seconds < 100 else f"about {seconds / 60:,.0f} min"
 
 
 def block_scores(
     block: Group, batches: Sequence[PaddedBatch], shape: tuple[int, int, int], devices: Sequence[Device] | None,
-    pace: Pace, progress: Progress,
+    size: int, ticks: Iterator[Any],
 ) -> Float[np.ndarray, "scales settings queries candidates"]:  # fmt: skip
     """Scores of every scale, settings by weightings; a pair without matches scores 0."""
     scores = np.zeros((block.rows.size, math.prod(shape)), np.float32)
     numbered = replace(block, rows=np.arange(block.rows.size).reshape(block.rows.shape))
-    for part in numbered.blocks(pace.settings):
+    for part in numbered.blocks(size):
         inputs = part.scorer, part.settings, part.weightings
         for places, values in run_batches(_score_settings, inputs, batches, devices=devices):
-            progress.begin(part.rows.size * pace.seconds)
+            next(ticks, None)
             scores[np.ix_(part.rows.reshape(-1), places)] = values.reshape(-1, len(places))
     return np.moveaxis(scores.reshape(-1, *shape), 1, 0)
 

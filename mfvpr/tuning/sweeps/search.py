@@ -84,7 +84,7 @@ def search_optuna(
             study.tell(trial, float(value))
         settings += proposed
         seconds = (time.perf_counter() - start) / len(settings) * (1 + trials - len(settings))
-        options.runtime.log(f"{label}: done, about {duration(seconds)} left")
+        options.runtime.log(f"{label}: done, {duration(seconds)} left")
     return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
 
 

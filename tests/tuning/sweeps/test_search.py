@@ -74,10 +74,10 @@ def test_own_values_follow_from_the_scorer_unless_they_are_given():
 @pytest.mark.parametrize(("values", "words"), [
     ({"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
     ({"sigma": [1.0]}, "sigma: expected a parameter of AggregatedScore, of clamp, mean, temperature, weight"),
-    ({"c": 2}, "c=2: expected a list of different values"),
-    ({"c": [2, 2.0]}, "expected a list of different values"),
-    ({"weight": "fs"}, "weight='fs': expected a list"),
-    ({"c": []}, r"c=\[\]: expected a list"),
+    ({"c": 2}, "c=2: expected different values, in a list"),
+    ({"c": [2, 2.0]}, "expected different values, in a list"),
+    ({"weight": "fs"}, "weight='fs': expected different"),
+    ({"c": []}, r"c=\[\]: expected different"),
 ])  # fmt: skip
 def test_axes_that_cannot_be_swept_are_refused_in_one_line(values, words):
     with pytest.raises(InputError, match=words):
@@ -129,9 +129,7 @@ def test_optuna_draws_within_the_axes():
     assert len({setting["tolerance"] for setting in drawn}) == 20
 
 
-def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_choose(
-    data, monkeypatch, tmp_path
-):
+def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch, tmp_path):
     optuna = pytest.importorskip("optuna")
     values, tell = [], optuna.Study.tell
     monkeypatch.setattr(optuna.Study, "tell", lambda *arguments: values.append(arguments[-1]) or tell(*arguments))

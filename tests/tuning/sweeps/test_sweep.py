@@ -203,7 +203,6 @@ def test_the_largest_size_is_that_of_the_set_whatever_part_is_scored():
 
 def test_memory_is_told_beforehand(data):
     match_set, _ = data
-    assert sweeps.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
     uneven, largest = (MatchSet([], np.array(counts), 320) for counts in ([[0, 9], [300, 300], [9, 9]], [[300, 300]]))
     many = 10**7  # settings, for which padding to one size would not pay
