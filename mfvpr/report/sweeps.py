@@ -74,9 +74,9 @@ class Sweep:
         """
         return self.outcome.report[self.outcome.protocol.main].chosen
 
-    def table(self) -> str:
+    def table(self) -> Table:
         """Recall in % by every setting."""
-        return settings_table(self.outcome).text()
+        return settings_table(self.outcome)
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A row per setting: its values, and recall as fractions.
@@ -87,7 +87,7 @@ class Sweep:
         try:
             import pandas
         except ImportError:
-            raise InputError("to_pandas: expected pandas, got none; pip install 'mfvpr[pandas]'") from None
+            raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
         header, recall = _recalls(self.outcome, range(len(self.outcome.settings)))
         frames = [pandas.DataFrame(self.outcome.settings), pandas.DataFrame(recall, columns=header)]
         return pandas.concat(frames, axis="columns")

@@ -17,6 +17,9 @@ class Table:
     rows: Sequence[Sequence[str]]
     text_columns: int = 1
 
+    def __str__(self) -> str:
+        return self.text()
+
     def text(self) -> str:
         """Text for the terminal."""
         widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]

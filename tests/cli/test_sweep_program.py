@@ -113,6 +113,15 @@ def test_heat_maps_are_pictures(swept):
         assert np.any(np.all(np.abs(picture.astype(int) - (232, 72, 44)) < 8, axis=-1))  # the best is framed
 
 
+def test_a_sweep_has_a_page(swept, succeed, tmp_path):
+    stdout, _ = succeed("report", swept[0], "--out", tmp_path / "page.html")
+    assert stdout == f"report: {tmp_path}/page.html\n"
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('<img src="data:image/png') == 3
+    assert "Recall at 1 in %, with 95 % intervals in brackets:" in page
+    assert page.count("<tr>") > len(swept[1]["settings"])
+
+
 def test_without_a_store(root, sweep, tmp_path):
     """Nor with many ties, by another rule: most pairs have no matches."""
     common = ("cache=null", "matching.max_distance=0.3", "ties=index")

@@ -8,7 +8,7 @@ from typing import Any
 from mfvpr.report.pages.files import errors_as_input_errors, read_table
 from mfvpr.report.pages.rendering import Section, values_table, write_page
 
-_TABLES = {"axes": "All settings", "rows": "All scores", "jobs": "All jobs"}  # by a name in results.json
+_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _LONG = {"settings", "rows", "queries", "report", "jobs"}  # what the tables show
 
 
@@ -19,7 +19,9 @@ def write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> N
         InputError: the files are not those of a sweep, a learning comparison, or a multirun.
     """
     with errors_as_input_errors(folder):
-        [caption] = [caption for name, caption in _TABLES.items() if name in results]
+        caption = next((caption for name, caption in _TABLES.items() if name in results), None)
+        if caption is None:
+            raise ValueError(f"results.json has no {', '.join(_TABLES)}")
         heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
         summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
         figures = {file.stem: f"data:image/png;base64,{b64encode(file.read_bytes()).decode()}"

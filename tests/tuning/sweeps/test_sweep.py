@@ -2,7 +2,9 @@
 
 import errno
 import itertools
+import re
 import sys
+import time
 from dataclasses import replace
 
 import jax
@@ -353,3 +355,37 @@ def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data
     error = OSError
     with pytest.raises(OSError, match="No space left"):
         rank(mfvpr.MatchCount(), settings, *data, folder=tmp_path)
+
+
+@mfvpr.value
+class Slow:
+    """A scorer of another library that takes 20 ms for each call."""
+
+    share: float = 1.0
+
+    def __call__(self, matches):
+        raise NotImplementedError
+
+    def score_pairs(self, matches):
+        time.sleep(0.02)
+        return self.share * matches.mask.sum(axis=-1)
+
+
+def test_long_work_says_how_long_it_takes_and_advances_meanwhile(data):
+    lines, moves, settings = [], [], [{"share": float(share)} for share in range(1, 161)]
+
+    def track(items, total):
+        for item in items:
+            moves.append((time.perf_counter(), item + 1, total))
+            yield item
+
+    runtime = mfvpr.Runtime(log=lambda line: lines.append((time.perf_counter(), line)), progress=lambda _: track)
+    got = rank(Slow(), settings, *data, runtime=runtime)
+    [(start, line)], seconds = lines, time.perf_counter()
+    seconds -= start
+    expected = float(re.fullmatch(r"sweep: about (\d+) s", line)[1])
+    assert expected / 2 - 0.5 <= seconds <= 2 * expected + 0.5
+    times, numbers, totals = zip(*moves, strict=True)
+    assert max(np.diff([start, *times])) < 2
+    assert numbers[-1] == totals[-1]
+    np.testing.assert_array_equal(got, rank(Slow(), settings[:1], *data).repeat(160, axis=1))
