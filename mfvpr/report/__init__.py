@@ -1,7 +1,7 @@
 """Results for people: tables, figures, pages, and the files of a run folder.
 
-Read first: runs (run folders), tables, evaluations (files of an evaluation), sweeps, comparisons (of learning),
-figures, then pages/ (HTML).
+Read first: runs (run folders), jobs (of a multirun), tables, evaluations (files of an evaluation), sweeps, comparisons
+(of learning), figures, then pages/ (HTML).
 
 Imports datasets, evaluation, features, localization, reranking, scoring, tuning, types, utils.
 """
