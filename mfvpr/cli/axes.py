@@ -7,6 +7,7 @@ from mfvpr.cli.settings import SettingsError
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching.match_set import block_bytes, scales
 from mfvpr.scoring import SCORERS
+from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.rankings import SETTINGS_PER_BLOCK
@@ -32,6 +33,10 @@ def axes(settings: dict[str, Any]) -> Axes:
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     [scorer] = build.scorers(settings["scorer"]).values()
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
+    known = [name for name in settings["grid"] if name in {*parameters_of(scorer), "max_distance", "c"}]
+    if unknown := [name for name in values if name not in known]:
+        raise SettingsError(f"grid.{unknown[0]}: scorer={settings['scorer']['method']} has no such parameter; it has "
+                            f"{', '.join(known)}")  # fmt: skip
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip

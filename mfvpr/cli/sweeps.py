@@ -49,10 +49,7 @@ def sweep(
         InputError: an axis that the scorer does not have, no ground truth, a folder of something else, or images that
             cannot be used.
     """
-    if not isinstance(system, System):
-        sift = Sift()
-        pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
-        system = System(pipeline, {getattr(system, "__name__", type(system).__name__): system})
+    system = system if isinstance(system, System) else _default_system(system)
     name, scorer, c = _only_scorer(system)
     if clash := {*numbers_by_name(scorer), *static_names(scorer)} & {"split", "thresholds", "out", "cache", "runtime"}:
         raise InputError(f"{name}.{min(clash)}: mfvpr.sweep means something else by {min(clash)}; rename the field")
@@ -72,6 +69,12 @@ def sweep(
     if out is not None:
         result.save(out)
     return result
+
+
+def _default_system(scorer: Scorer) -> System:
+    sift = Sift()
+    pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+    return System(pipeline, {getattr(scorer, "__name__", type(scorer).__name__): scorer})
 
 
 def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:

@@ -261,12 +261,12 @@ def _seconds(block: Block) -> float:
         list(run_batches(_score_settings, inputs, [batch] * workers, devices=devices))
         return (time.perf_counter() - start) / workers / group.rows.size
 
-    one = next(block.group.blocks(1))
-    seconds = min(run(one), run(one))  # the first one compiles
+    setting = next(block.group.blocks(1))
+    seconds = min(run(setting), run(setting))  # the first run compiles
     if seconds > _STEP / 2:
         return seconds
-    several = next(block.group.blocks(int(_STEP / seconds)))
-    return min(run(several), run(several))
+    settings = next(block.group.blocks(int(_STEP / seconds)))
+    return min(run(settings), run(settings))
 
 
 def duration(seconds: float) -> str:
