@@ -59,7 +59,8 @@ def sweep(
     sequence = dataset.only
     if sequence.truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth to choose by, got none")
-    thresholds = thresholds or sequence.truth.thresholds(tolerances=_TOLERANCES, radius=_RADIUS)
+    if thresholds is None:
+        thresholds = sequence.truth.thresholds(tolerances=_TOLERANCES, radius=_RADIUS)
     protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
     runtime = runtime or cache.runtime
     kind = system.fused[name].retrieval_score if name in system.fused else "cosine"

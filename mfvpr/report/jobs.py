@@ -16,6 +16,7 @@ from mfvpr.utils.locks import lock
 def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path) -> None:
     """Add a finished run to the joint table in the folder of its multirun; jobs may end at the same time."""
     job = {"job": number, "overrides": dict(overrides), "run": str(run), "rows": list(_rows(run))}
+    multirun.mkdir(parents=True, exist_ok=True)
     with lock(multirun, os.O_RDONLY | os.O_DIRECTORY, lambda _: None):
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
         jobs = sorted([*known, job], key=lambda job: job["job"])

@@ -165,7 +165,7 @@ class Run:
 def read_results(folder: Path, name: str = LAST) -> Any:
     """The content of a JSON file of a run folder; InputError if there is none."""
     if not (folder / name).is_file():
-        raise InputError(f"{folder}: {_LEFT_BY}, got none with a {name}")
+        raise InputError(f"{folder}: expected a run folder, got one without {name}")
     with errors_as_input_errors(folder):
         return json.loads((folder / name).read_text("utf-8"))
 

@@ -12,7 +12,7 @@ import numpy as np
 from mfvpr.scoring.fields import Parameter, parameters_of
 from mfvpr.scoring.parameters import numbers_by_name, static_names, with_capacity, with_parameters
 from mfvpr.scoring.scorer import Scorer
-from mfvpr.scoring.weight_registry import named_weight
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
@@ -36,7 +36,7 @@ class Axes:
         own: by name, the plain value without a sweep; what is left out is the scorer's, no limit, and c = 0.
 
     Raises:
-        InputError: no axis, an axis without values or with equal ones, or a name that the scorer does not have.
+        InputError: an axis without values or with equal ones, an unknown word, or a name that the scorer does not have.
     """
 
     scorer: Scorer
@@ -59,8 +59,7 @@ class Axes:
         own = {name: self.own[name] if name in self.own else self._own(name) for name in values}
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "own", own)
-        for name, axis in values.items():
-            _ = [self._value(name, value) for value in axis]  # words are known before any work
+        _ = [self._value(name, value) for name, axis in values.items() for value in axis]  # before any work
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -103,7 +102,9 @@ class Axes:
             return None if name == MAX_DISTANCE else 0
         value = attrgetter(name)(self.scorer)
         if name == "weight":
-            return next((word for word, weight in WEIGHTS.items() if weight == value), value)
+            words = [word for word, weight in WEIGHTS.items() if weight == value]
+            words += [word for word, weight in NAMED_WEIGHTS.items() if weight is value]
+            return words[0] if words else value
         is_none = name in self.parameters and value == self.parameters[name].none
         return None if is_none else _plain(value)
 

@@ -11,6 +11,7 @@ from mfvpr import InputError
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, hits, statistics
 from mfvpr.report import sweeps
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, search
 from tests.scorers import Wrapped
@@ -67,6 +68,8 @@ def test_own_values_follow_from_the_scorer_unless_they_are_given():
     assert axes.values["sigma"] == [5, 10]
     assert type(axes.values["sigma"][0]) is int
     assert axes.own == {"sigma": 22.5, "truncate": None, "weight": "fs"}
+    learned = mfvpr.AggregatedScore(weight=NAMED_WEIGHTS["learned_aliked"])
+    assert Axes(learned, {"weight": ["fs"]}).own == {"weight": "learned_aliked"}
     wrapped = Axes(Wrapped(), {"inner.sigma": [9.0], "c": ["auto"], "max_distance": [0.5]}, {"c": 2, "sigma": 1})
     assert wrapped.own == {"inner.sigma": 18.0, "c": 2, "max_distance": None}
 
