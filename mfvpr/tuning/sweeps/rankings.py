@@ -226,10 +226,11 @@ def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Bl
 
 def _compute(blocks: Sequence[Block], options: SweepOptions) -> Iterator[tuple[Block, np.ndarray]]:
     """Rows of the blocks; long work logs its expected time, and advances its progress about every second."""
-    seconds = _measure(blocks)
+    paces = _measure(blocks)
     if sum(block.amount for block in blocks) > _MEASURED:
-        options.runtime.log(f"{options.label}: {duration(sum(b.amount * seconds[b.number] for b in blocks))}")
-    sizes = {number: max(1, int(_STEP / each)) for number, each in seconds.items()}
+        seconds = sum(block.amount * paces[block.number][0] for block in blocks)
+        options.runtime.log(f"{options.label}: {duration(seconds + sum(pace[1] for pace in paces.values()))}")
+    sizes = {number: max(1, int(_STEP / seconds)) for number, (seconds, _) in paces.items()}
     total = sum(block.part.num_batches * len([*block.group.blocks(sizes[block.number])]) for block in blocks)
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
     for part, of_part in itertools.groupby(blocks, lambda block: block.part):
@@ -239,19 +240,20 @@ def _compute(blocks: Sequence[Block], options: SweepOptions) -> Iterator[tuple[B
     next(ticks, None)
 
 
-def _measure(blocks: Sequence[Block]) -> dict[int, float]:
-    """Seconds of a setting and a batch by program: measured for some, interpolated for others; 0 for little work."""
+def _measure(blocks: Sequence[Block]) -> dict[int, tuple[float, float]]:
+    """`_seconds` by program, measured for some and interpolated for the others; a guess for little work."""
     if sum(block.amount for block in blocks) <= _MEASURED:
-        return {block.number: _STEP / SETTINGS_PER_BLOCK for block in blocks}
+        return {block.number: (_STEP / SETTINGS_PER_BLOCK, 0.0) for block in blocks}
     examples = {block.number: block for block in reversed(blocks) if block.amount}
     numbers = sorted(examples)
     measured = sorted({numbers[place] for place in np.linspace(0, len(numbers) - 1, _PROBES).round().astype(int)})
-    seconds = np.interp(numbers, measured, [_seconds(examples[number]) for number in measured])
-    return dict(zip(numbers, seconds.tolist(), strict=True))
+    columns = zip(*(_seconds(examples[number]) for number in measured), strict=True)
+    paces = zip(*(np.interp(numbers, measured, column).tolist() for column in columns), strict=True)
+    return dict(zip(numbers, paces, strict=True))
 
 
-def _seconds(block: Block) -> float:
-    """Measured seconds of a setting and a batch, with all cores at work and without compilation."""
+def _seconds(block: Block) -> tuple[float, float]:
+    """Measured seconds of a setting and a batch, with all cores at work, and of the compilation for all shapes."""
     part, devices = block.part, block.part.options.runtime.devices
     workers = max(available_cpus(), len(devices or ()))
     batch = next(all_batches(part.match_set, part.queries, settings=part.settings))
@@ -259,14 +261,15 @@ def _seconds(block: Block) -> float:
     def run(group: Group) -> float:
         start, inputs = time.perf_counter(), (group.scorer, group.settings, group.weightings)
         list(run_batches(_score_settings, inputs, [batch] * workers, devices=devices))
-        return (time.perf_counter() - start) / workers / group.rows.size
+        return time.perf_counter() - start
 
-    setting = next(block.group.blocks(1))
-    seconds = min(run(setting), run(setting))  # the first run compiles
-    if seconds > _STEP / 2:
-        return seconds
-    settings = next(block.group.blocks(int(_STEP / seconds)))
-    return min(run(settings), run(settings))
+    group = next(block.group.blocks(1))
+    first, again = run(group), run(group)  # the first run compiles
+    if again < workers * _STEP / 2:
+        group = next(block.group.blocks(int(workers * _STEP / again)))
+        first, again = run(group), min(run(group), run(group))
+    num_shapes = sum(len(shapes(scale, settings=part.settings)) for scale in scales(part.match_set))
+    return again / workers / group.rows.size, (first - again) * num_shapes
 
 
 def duration(seconds: float) -> str:
