@@ -46,6 +46,7 @@ from .evaluation.recall import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
 from .cli.systems import load_system
+from .cli.sweeps import sweep
 from .evaluation.system import Pipeline, System
 from .utils.cluster import Cluster
 from .utils.runtime import Runtime
@@ -105,6 +106,7 @@ __all__ = [
     "radius_positives",
     "recall_at_k",
     "load_system",
+    "sweep",
     "Pipeline",
     "System",
     "Cluster",

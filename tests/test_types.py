@@ -15,8 +15,8 @@ from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
 from mfvpr.matching import MatchSet
+from mfvpr.tuning.sweeps.rankings import group_program
 from mfvpr.tuning.sweeps.settings import group_by_program
-from mfvpr.tuning.sweeps.sweep import group_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import make_features, of_query, random_matches
 from tests.programs import ROOT
@@ -111,7 +111,7 @@ PROGRAMS_OF_THEIR_OWN = {
     "tuning/learning/training.py",  # of a new function, which has one kind of parameters
     "matching/lightglue.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",
-    "tuning/sweeps/sweep.py",  # of a new function
+    "tuning/sweeps/rankings.py",  # of a new function
     "testing.py",  # of new functions, each of which has one scorer
 }
 

@@ -6,9 +6,9 @@
 | map, data, weights, report | maps, published_data, checkpoints, mfvpr.report.pages |
 
 Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
-systems (`load_system`). Then overrides, help_text, wording (of errors), declare (files in conf/ that follow from
-scorers). Settings are checked and become systems in `mfvpr.systems`; other values in build, truth and confidences.
-Jobs share stages, run_folder, axes, console.
+systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text, wording (of errors), declare (files in conf/
+that follow from scorers). Settings are checked and become systems in `mfvpr.systems`; other values in build, truth and
+confidences. Jobs share stages, run_folder, axes, console.
 
 Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, scoring,
 storage, systems, tuning, types, utils.

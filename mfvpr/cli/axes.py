@@ -8,15 +8,13 @@ from mfvpr.scoring import SCORERS
 from mfvpr.scoring.fields import parameters_of
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
-from mfvpr.tuning import sweeps
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.rankings import SETTINGS_PER_BLOCK
 from mfvpr.tuning.sweeps.search import require_optuna
-from mfvpr.tuning.sweeps.sweep import SETTINGS_PER_BLOCK
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import free_host_bytes
 
-_NOT_OF_SCORER = ("max_distance", "c")
 _BYTES_PER_SETTING = 2000  # Python objects, about
 
 
@@ -33,15 +31,12 @@ def axes(settings: dict[str, Any]) -> Axes:
     if "method" not in settings["scorer"]:
         raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
-    [(method, scorer)] = assembly.scorers(settings["scorer"]).items()
-    known = {*parameters_of(scorer), *_NOT_OF_SCORER}
+    [scorer] = assembly.scorers(settings["scorer"]).values()
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
-    for name, axis in values.items():
-        if name not in known:
-            raise SettingsError(f"grid.{name}: scorer={method} has no such parameter; it has "
-                                f"{', '.join(n for n in settings['grid'] if n in known)}")  # fmt: skip
-        if len(set(axis)) < len(axis):
-            raise SettingsError(f"grid.{name}={axis}: expected different values")
+    known = [name for name in settings["grid"] if name in {*parameters_of(scorer), "max_distance", "c"}]
+    if unknown := [name for name in values if name not in known]:
+        raise SettingsError(f"grid.{unknown[0]}: scorer={settings['scorer']['method']} has no such parameter; it has "
+                            f"{', '.join(known)}")  # fmt: skip
     if not values:
         raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
@@ -54,7 +49,11 @@ def axes(settings: dict[str, Any]) -> Axes:
     defaults = settings["scorer"] | {"max_distance": limit}
     if "c" in values:
         defaults |= {"c": _plain_c(settings) if settings["final"] == "combined" else 0}
-    return Axes(scorer, values, {name: defaults.get(name) for name in values})
+    try:
+        return Axes(scorer, values, defaults)
+    except InputError as error:
+        is_axis = str(error).partition("=")[0].partition(":")[0] in values
+        raise SettingsError(f"grid.{error}" if is_axis else str(error)) from error
 
 
 def search_axes(settings: dict[str, Any]) -> Axes:
@@ -107,7 +106,7 @@ def require_memory(settings: dict[str, Any], grid_axes: Axes, views: int, matche
     num_settings = grid_axes.size + (dict(grid_axes.own) not in grid_axes.grid())
     _require_bytes(
         f"grid: rankings of {queries:,} queries by {num_settings:,} settings",
-        sweeps.result_bytes(views, num_settings, queries, max(settings["recall"]["ks"])),
+        4 * views * num_settings * queries * max(settings["recall"]["ks"]),
         "use fewer values, smaller recall.ks, or search=optuna",
     )
     chunk = settings["chunk"]

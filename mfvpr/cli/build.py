@@ -64,7 +64,7 @@ def _ground_truth(settings: dict[str, Any]) -> IndexFile | LabelFiles | str:
 def cache(settings: dict[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["cache"] is None else expand_user(settings["cache"])
-    skip_bad, wait = settings["on_bad_image"] == "skip", settings.get("multirun", False)
+    skip_bad, wait = settings["on_bad_image"] == "skip", bool(settings.get("multirun"))
     return FeatureCache(root, skip_bad=skip_bad, wait=wait, runtime=runtime(settings))
 
 

@@ -15,10 +15,11 @@ from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.systems.settings import SettingsError
-from mfvpr.tuning.learning.comparison import Checkpoints, compare
+from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.losses import LOSSES
 from mfvpr.tuning.learning.teaching import Options
+from mfvpr.tuning.learning.training import Checkpoints
 from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.files import expand_user, write_text
 from mfvpr.utils.fingerprints import fingerprint
@@ -50,7 +51,7 @@ def learn(settings: dict[str, Any]) -> None:
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
             comparison = compare(axes, data.protocol, data.match_set, data.candidates, options,
-                                 checkpoints=checkpoints, track=console.track)  # fmt: skip
+                                 checkpoints=checkpoints, runtime=build.runtime(settings))  # fmt: skip
         heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command", "cluster")

@@ -14,7 +14,7 @@ COMMANDS = {
     "localize": "localize images in a map",
     "weights": "list, download, add and verify weights of networks",
     "data": "list data sets, and check what a folder holds",
-    "report": "write the page of a run folder, or of several compared",
+    "report": "write the page of a run folder (evaluation, sweep, learning, multirun), or of evaluations compared",
 }
 _COMPARISON = "comparison.html"
 
@@ -106,8 +106,9 @@ _ARGUMENTS = {  # of programs that have commands or arguments instead of setting
     "weights": ("Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the package; each "
                 "has its own license.", _add_weights_commands),
     "data": ("Nothing is downloaded: each data set has its place and its license.", _add_data_commands),
-    "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, or of several "
-               "beside each other.", _add_report_arguments),
+    "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, sweep or learn, "
+               "of a multirun (runs/multirun/TIME), or of several evaluations beside each other.",
+               _add_report_arguments),
 }  # fmt: skip
 
 

@@ -4,13 +4,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import console, run_folder, stages, truth
+from mfvpr.cli import run_folder, stages, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
-from mfvpr.report import runs, sweeps
+from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping
-from mfvpr.tuning.sweeps import Outcome
+from mfvpr.tuning.sweeps import Outcome, SweepOptions
 from mfvpr.utils import Stopwatch
-from mfvpr.utils.files import expand_user, write_text
+from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
 
@@ -24,34 +24,24 @@ def sweep(settings: dict[str, Any]) -> None:
         protocol = truth.evaluation_protocol(settings, images.dataset)
         matches, candidates = stages.match_data_set(tools, images, watch)
         blocks = _block_folder(settings, tools, images)
-        options = {
-            "ks": settings["recall"]["ks"], "ties": settings["ties"],
-            "retrieval_score": settings["fusion"]["retrieval_score"], "folder": blocks, "track": console.track,
-            "devices": tools.cache.runtime.devices,
-            "settings_per_block": settings["chunk"]["settings"], "queries_per_block": settings["chunk"]["queries"],
-        }  # fmt: skip
-        number = axes.size if settings["search"] == "grid" else settings["trials"]
-        pairs = int(candidates.mask.sum())
-        console.tell(f"sweep: {number:,} settings on {pairs:,} pairs of {len(candidates.mask):,} queries with their "
-                     f"candidates, {number * pairs:,} scores; the time left stands beside the progress")  # fmt: skip
+        options = SweepOptions(
+            settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
+            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, tools.cache.runtime,
+        )  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
                 axes.check(matches.image_sizes)
                 require_memory(settings, axes, 1 + len(protocol.halves), matches)
-                outcome = sweeping.search_grid(axes, protocol, matches, candidates, **options)
+                outcome = sweeping.search_grid(axes, protocol, matches, candidates, options)
             else:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
-                outcome = sweeping.search_optuna(axes, protocol, matches, candidates, **trials, **options)
+                outcome = sweeping.search_optuna(axes, protocol, matches, candidates, options, **trials)
         heading = _heading(settings, images, outcome)
-        text = f"{heading}\n\n{sweeps.sweep_summary(outcome)}"
-
-        def write(new: Path) -> None:
-            runs.write_table(new, sweeps.settings_table(outcome), heading)
-            runs.write_json(new / "results.json", _results(settings, images, outcome, watch.seconds))
-            write_text(new / "summary.txt", f"{text}\n")
-
-        ground_truth, figures = truth.describe(settings, images.dataset), sweeps.heat_maps(outcome)
-        run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
+        results = _results(settings, images, outcome, watch.seconds)
+        run_folder.write_results(
+            folder, settings, truth.describe(settings, images.dataset), text=sweeps.summary_text(outcome, heading),
+            write=lambda new: sweeps.write_sweep(new, outcome, heading, results), figures=sweeps.sweep_figures(outcome),
+        )  # fmt: skip
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
 

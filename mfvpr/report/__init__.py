@@ -1,7 +1,7 @@
 """Results for people: tables, figures, pages, and the files of a run folder.
 
-Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations and run_files (files of an evaluation),
-sweeps, comparisons (of learning), figures, then pages/ (HTML).
+Read first: results (`mfvpr.evaluate`), runs (run folders), jobs (of a multirun), tables, evaluations and run_files
+(files of an evaluation), sweeps, comparisons (of learning), figures, then pages/ (HTML).
 
 Imports datasets, evaluation, features, localization, reranking, scoring, storage, tuning, types, utils.
 """

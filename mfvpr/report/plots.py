@@ -108,7 +108,6 @@ def _label(panel: Axes, x: str, y: str) -> None:
 
 
 def heat_map_figure(
-    path: Path,
     recall: Float[np.ndarray, "rows columns"],
     rows: tuple[str, Sequence[str]],
     columns: tuple[str, Sequence[str]],
@@ -116,8 +115,8 @@ def heat_map_figure(
     best: tuple[int, int],
     defaults: tuple[int, int] | None,
     title: str,
-) -> None:
-    """Draw recall (fractions) over two parameters of a sweep; `rows` and `columns` are name and values.
+) -> Figure:
+    """Recall (fractions) over two parameters of a sweep; `rows` and `columns` are name and values.
 
     `best` is the row and column of the best setting, framed; `defaults` those of the scorer's own values, marked with a
     circle (None = the grid lacks them).
@@ -139,6 +138,26 @@ def heat_map_figure(
         axes.plot(defaults[1], defaults[0], marker="o", markersize=30, markerfacecolor="none", markeredgecolor=_MARK)
     axes.set_title(title, fontsize=9, parse_math=False)
     figure.colorbar(image, ax=axes, label="%")
+    return figure
+
+
+def trials_figure(
+    path: Path, recall: Float[np.ndarray, " trials"], values: Mapping[str, Sequence[Any]], label: str
+) -> None:
+    """Draw recall (fractions) over the trials, with the best so far, and over the values of each parameter."""
+    figure, [first, *axes] = panels(1 + len(values), 3.4, 2.6, sharey=True)
+    percent = 100 * recall
+    first.plot(np.maximum.accumulate(percent), color=_MARK, label="best so far")
+    first.plot(percent, ".", color=_LOSS)
+    first.set_xlabel("trial; 0 = the scorer's own values", fontsize=8)
+    first.set_ylabel(label, fontsize=8)
+    first.legend(fontsize=7)
+    for panel, (name, of_trials) in zip(axes, values.items(), strict=True):
+        is_number = all(isinstance(value, int | float) and not isinstance(value, bool) for value in of_trials)
+        places = of_trials if is_number else list(map(str, of_trials))
+        panel.scatter(places, percent, s=12, c=np.arange(len(percent)), cmap="viridis")  # later trials are brighter
+        panel.plot(places[int(np.argmax(percent))], percent.max(), "s", fillstyle="none", color=_MARK, markersize=9)
+        panel.set_xlabel(name, fontsize=8)
     save_figure(figure, path)
 
 

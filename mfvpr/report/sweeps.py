@@ -1,23 +1,129 @@
-"""Reports of a sweep: table of all settings, summary, JSON values, and heat maps."""
+"""Reports of a sweep: table of all settings, summary, JSON values, and figures."""
 
 import itertools
-from collections.abc import Iterable, Iterator
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure as Canvas
 
 from mfvpr import evaluation
 from mfvpr.evaluation.statistics import Estimate
+from mfvpr.report import runs
 from mfvpr.report.file_names import file_names
-from mfvpr.report.plots import heat_map_figure
+from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_value
 from mfvpr.tuning.sweeps.outcome import Outcome
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import write_text
+from mfvpr.utils.versions import versions
+
+if TYPE_CHECKING:
+    import pandas
 
 TOP = 10
 MAX_HEAT_MAPS = 6
+
+
+@dataclass(frozen=True, repr=False)
+class Sweep:
+    """The result of `mfvpr.sweep`: recall by every setting, and the best one.
+
+    Attributes:
+        dataset: name of the data set.
+        scorer: name of the scorer.
+        outcome: rankings by every setting.
+    """
+
+    dataset: str
+    scorer: str
+    outcome: Outcome
+
+    def __repr__(self) -> str:
+        axes = self.outcome.axes
+        return (f"Sweep({self.dataset}, {self.scorer}: {axes.size} settings of {', '.join(axes.values)}; best "
+                f"{_in_words(self.best)}; {_label(self.outcome)} {_with_interval(self.interval)})")  # fmt: skip
+
+    @property
+    def best(self) -> dict[str, Any]:
+        """The setting with the highest recall@1 on the queries to choose on, plain values by axis.
+
+        With `split="both"`, all queries choose it: it is the setting to use from now on. `chosen` has the settings that
+        each half chose.
+        """
+        return dict(self.outcome.settings[self.outcome.best])
+
+    @property
+    def chosen(self) -> dict[str, dict[str, Any]]:
+        """The best setting by name of the half that chose it; "all" without a split."""
+        names = self.outcome.protocol.names or ["all"]
+        return {name: dict(self.outcome.settings[row]) for name, row in zip(names, self.outcome.chosen, strict=True)}
+
+    @property
+    def interval(self) -> Estimate:
+        """Recall@1 of `chosen` at the middle threshold, with its 95 % interval.
+
+        With a split, each setting counts on the half that did not choose it. Without one, the queries that chose the
+        setting count, which flatters it.
+        """
+        return self.outcome.report[self.outcome.protocol.main].chosen
+
+    def table(self) -> Table:
+        """Recall in % by every setting."""
+        return settings_table(self.outcome)
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """A row per setting: its values, and recall as fractions.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
+        header, recall = _recalls(self.outcome, range(len(self.outcome.settings)))
+        frames = [pandas.DataFrame(self.outcome.settings), pandas.DataFrame(recall, columns=header)]
+        return pandas.concat(frames, axis="columns")
+
+    def plot(self, *names: str) -> Canvas:
+        """A heat map of recall@1 over one or two axes, the other axes at the best setting: `plot("sigma", "weight")`.
+
+        The square is the best setting, the circle the scorer's own values; `figure.savefig(path)` writes it.
+        """
+        axes = self.outcome.axes.values
+        if not 1 <= len(names) <= 2 or not {*names} <= {*axes}:
+            raise InputError(f"plot: expected one or two axes of {', '.join(axes)}, got {', '.join(names) or 'none'}")
+        return _heat_map(self.outcome, *("", *names)[-2:])
+
+    def save(self, folder: Path | str) -> None:
+        """Write table, summary, figures and results.json, each file whole; earlier ones are replaced."""
+        folder = Path(folder)
+        shutil.rmtree(folder / "figures", ignore_errors=True)
+        for name, draw in sweep_figures(self.outcome):
+            draw(folder / "figures" / name)
+        sizes = f"{len(self.outcome.protocol.places)} queries, {len(self.outcome.settings)} settings"
+        heading = f"{self.dataset}: {sizes} of {self.scorer}"
+        about = {"dataset": self.dataset, "scorer": {"method": self.scorer}, "versions": versions()}
+        write_sweep(folder, self.outcome, heading, about | sweep_json(self.outcome))
+
+
+def write_sweep(folder: Path, outcome: Outcome, heading: str, results: Mapping[str, Any]) -> None:
+    """Write table, summary.txt and results.json of a sweep."""
+    runs.write_table(folder, settings_table(outcome), heading)
+    write_text(folder / "summary.txt", f"{summary_text(outcome, heading)}\n")
+    runs.write_json(folder / "results.json", results)
+
+
+def summary_text(outcome: Outcome, heading: str) -> str:
+    """The summary below a heading."""
+    return f"{heading}\n\n{sweep_summary(outcome)}"
 
 
 def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Table:
@@ -25,14 +131,8 @@ def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Ta
 
     `numbers` choose settings; None = all.
     """
-    protocol, (first, *deeper) = outcome.protocol, outcome.ks
     numbers = range(len(outcome.settings)) if numbers is None else numbers
-    header = [protocol.label(first, threshold) for threshold in protocol.thresholds]
-    header += [protocol.label(k, protocol.thresholds[protocol.main]) for k in deeper]
-    rows = outcome.rows[0][list(numbers)]
-    recalls = np.column_stack(
-        [protocol.recall(rows, first), *(protocol.recall(rows, k)[:, protocol.main] for k in deeper)]
-    )
+    header, recalls = _recalls(outcome, numbers)
     lines = [
         [*(format_value(outcome.settings[number][name]) for name in outcome.axes.values),
          *(f"{100 * value:.1f}" for value in recall)]
@@ -41,11 +141,21 @@ def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Ta
     return Table([*outcome.axes.values, *header], lines, text_columns=0)
 
 
+def _recalls(outcome: Outcome, numbers: Iterable[int]) -> tuple[list[str], np.ndarray]:
+    """Labels and values `[settings, labels]` of the recalls of a table."""
+    protocol, (first, *deeper) = outcome.protocol, outcome.ks
+    header = [protocol.label(first, threshold) for threshold in protocol.thresholds]
+    header += [protocol.label(k, protocol.thresholds[protocol.main]) for k in deeper]
+    rows = outcome.rows[0][list(numbers)]
+    deeper_recalls = (protocol.recall(rows, k)[:, protocol.main] for k in deeper)
+    return header, np.column_stack([protocol.recall(rows, first), *deeper_recalls])
+
+
 def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
     protocol, ks = outcome.protocol, outcome.ks
     recall = np.stack([protocol.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
-    return {
+    values = {
         "axes": dict(outcome.axes.values), "own": dict(outcome.axes.own),
         "search": "grid" if outcome.is_grid else "optuna",
         "unit": protocol.unit, "thresholds": list(protocol.thresholds), "ks": list(ks), "split": protocol.split,
@@ -63,6 +173,7 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
             for number, setting in enumerate(outcome.settings)
         ],
     }  # fmt: skip
+    return json.loads(json.dumps(values, default=str))  # weights that are no words
 
 
 def sweep_summary(outcome: Outcome) -> str:
@@ -84,8 +195,7 @@ def sweep_summary(outcome: Outcome) -> str:
 
 def _verdicts(outcome: Outcome) -> Iterator[str]:
     protocol = outcome.protocol
-    words = [", ".join(f"{name} = {format_value(value)}" for name, value in outcome.settings[number].items())
-             for number in outcome.chosen]  # fmt: skip
+    words = [_in_words(outcome.settings[number]) for number in outcome.chosen]
     for name, half, setting in zip(protocol.names, protocol.halves, words, strict=False):
         yield (f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half: "
                f"{setting}")  # fmt: skip
@@ -107,43 +217,54 @@ def _verdicts(outcome: Outcome) -> Iterator[str]:
         )
 
 
+def _in_words(setting: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {format_value(value)}" for name, value in setting.items())
+
+
 def _with_interval(estimate: Estimate) -> str:
     low, high = estimate.interval
     return f"{100 * estimate.recall:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def heat_maps(outcome: Outcome) -> list[Figure]:
-    """Heat maps of every pair of axes with several values, the others at the best setting (of all queries).
+def sweep_figures(outcome: Outcome) -> list[Figure]:
+    """Heat maps of every pair of axes with several values; of a search that tried no complete grid, all trials."""
+    names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1]
+    if not outcome.is_grid:
+        values = {name: [setting[name] for setting in outcome.settings] for name in names}
+        recall = outcome.recall[:, outcome.protocol.main]
+        return [("trials.png", partial(trials_figure, recall=recall, values=values, label=_label(outcome)))]
+    pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
+    files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
+    return [(f"{file}.png", partial(_draw, outcome, *pair))
+            for pair, file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False)]  # fmt: skip
 
-    A space that was not searched completely has none.
-    """
+
+def _draw(outcome: Outcome, first: str, second: str, path: Path) -> None:
+    save_figure(_heat_map(outcome, first, second), path)
+
+
+def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
+    """Heat map over two axes (the first may be ""), the others at the best setting (of all queries)."""
     axes, protocol = outcome.axes, outcome.protocol
     values = {"": [""]} | {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
-    names = [name for name, axis in values.items() if len(axis) > 1] if outcome.is_grid else []
-    pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
-    if not pairs:
-        return []
     recall = outcome.recall[: axes.size, protocol.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
     own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
-    files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
-    figures: list[Figure] = []
-    for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
-        plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
-        fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
-        in_grid = own[first] in values[first] and own[second] in values[second]
-        draw = partial(
-            heat_map_figure,
-            recall=plane,
-            rows=(first, _short(values[first])),
-            columns=(second, _short(values[second])),
-            best=(best[first], best[second]),
-            defaults=(values[first].index(own[first]), values[second].index(own[second])) if in_grid else None,
-            title="; ".join([f"{protocol.label(1, protocol.thresholds[protocol.main])} in %", *fixed]),
-        )
-        figures.append((f"{file}.png", draw))
-    return figures
+    plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
+    if list(values).index(first) > list(values).index(second):
+        plane = plane.T
+    fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
+    in_grid = own[first] in values[first] and own[second] in values[second]
+    return heat_map_figure(
+        plane, (first, _short(values[first])), (second, _short(values[second])), best=(best[first], best[second]),
+        defaults=(values[first].index(own[first]), values[second].index(own[second])) if in_grid else None,
+        title="; ".join([_label(outcome), *fixed]),
+    )  # fmt: skip
+
+
+def _label(outcome: Outcome) -> str:
+    return f"{outcome.protocol.label(1, outcome.protocol.thresholds[outcome.protocol.main])} in %"
 
 
 def _short(values: list[str]) -> list[str]:

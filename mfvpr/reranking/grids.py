@@ -17,6 +17,7 @@ from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import numbers_by_name, whole_numbers, with_capacity, with_parameters
 from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs
+from mfvpr.scoring.weight_registry import named_weight
 from mfvpr.scoring.weights import ChosenWeight, Weight, match_weights
 from mfvpr.types import Array, Matches
 from mfvpr.utils.numerics import (
@@ -43,7 +44,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
         matches: `[C, K, ...]`.
         **axes: values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of numbers of its parts,
             `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of `weight`,
-            e.g. `weight=[UnitWeight(), ...]`.
+            e.g. `weight=["ratio", UnitWeight(), ...]`.
 
     Raises:
         ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
@@ -240,9 +241,10 @@ def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
     """Weights of the `weight` axis; none without the axis."""
     if "weight" not in axes or not hasattr(scorer, "weight"):
         return ()
-    if not all(map(callable, axes["weight"])):
-        raise ValueError(f"grid axis weight: expected weights such as UnitWeight(), got {list(axes['weight'])}")
-    return tuple(axes["weight"])
+    weights = tuple(map(named_weight, axes["weight"]))
+    if not all(map(callable, weights)):
+        raise ValueError(f"grid axis weight: expected weights such as 'ratio' or UnitWeight(), got {list(weights)}")
+    return weights
 
 
 def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:

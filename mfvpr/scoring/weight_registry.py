@@ -8,6 +8,7 @@ from typing import Any
 
 from mfvpr.scoring.weight_files import SUFFIX, read_weight
 from mfvpr.scoring.weights import WEIGHTS, Weight
+from mfvpr.utils.errors import InputError
 
 _LEARNED = Path(__file__).parent / "learned"
 
@@ -52,3 +53,10 @@ def _read(path: Path, modified_ns: int) -> tuple[Weight, dict[str, Any]]:
 
 NAMED_WEIGHTS: Mapping[str, Weight] = _NamedWeights()
 """Weights by word, or by the path `*.json` of a file that `mfvpr learn` wrote (InputError for other files)."""
+
+
+def named_weight(weight: Weight | str) -> Weight:
+    """The weight that a word or the path of a file stands for; any other weight as it is."""
+    if isinstance(weight, str) and weight not in NAMED_WEIGHTS:
+        raise InputError(f"weight={weight!r}: expected one of {', '.join(NAMED_WEIGHTS)}, or FILE{SUFFIX}")
+    return NAMED_WEIGHTS[weight] if isinstance(weight, str) else weight

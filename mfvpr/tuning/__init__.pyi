@@ -1,9 +1,10 @@
 __all__ = [
     "Axes",
     "Outcome",
+    "SweepOptions",
+    "rank_settings",
     "search_grid",
     "search_optuna",
-    "sweep",
 ]
 
-from .sweeps import Axes, Outcome, search_grid, search_optuna, sweep
+from .sweeps import Axes, Outcome, SweepOptions, rank_settings, search_grid, search_optuna

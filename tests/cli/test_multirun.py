@@ -7,14 +7,14 @@ import pytest
 
 from mfvpr.cli import console
 from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, composed, matches_path, results, run, small
+from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, matches_path, results, run, small
 
 pytestmark = pytest.mark.thorough
 
 SIGMA = "grid.sigma=[10]"
 
 
-def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call):
+def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call, succeed):
     monkeypatch.chdir(tmp_path)
     jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
     code, stdout, stderr = call("sweep", *small(root), "-m", *jobs)
@@ -27,6 +27,32 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
     assert stderr.splitlines()[-1].startswith(line)
     assert "Traceback" not in stderr
     assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
+    [joint] = (tmp_path / "runs" / "multirun").iterdir()
+    lines = csv_rows(joint / "table.csv")
+    assert [(line["job"], line["scorer"]) for line in lines] == [("0", "sum"), ("2", "histogram")]
+    for line in lines:
+        content = results(tmp_path / line["run"])
+        assert line["system"] == content["scorer"]["method"] == line["scorer"]
+        for verdict in content["report"]:
+            assert float(line[f"R@1 ±{verdict['threshold']}"]) == round(100 * verdict["chosen"]["recall"], 1)
+    assert (joint / "table.md").exists()
+    stdout, _ = succeed("report", joint)
+    assert lines[0]["run"] in (joint / "report.html").read_text()
+
+
+def test_a_joint_table_has_a_line_per_job_and_system(root, tmp_path, monkeypatch, succeed):
+    monkeypatch.chdir(tmp_path)
+    succeed("evaluate", "-m", *small(root), "figures=0", "scorer=sum", "candidates=4,8")
+    [joint] = (tmp_path / "runs" / "multirun").iterdir()
+    lines = csv_rows(joint / "table.csv")
+    assert [line["candidates"] for line in lines] == ["4", "4", "4", "8", "8", "8"]
+    for number in (0, 3):
+        assert [line["system"] for line in lines[number : number + 3]] == ["retrieval", "sum", "sum + retrieval"]
+        names = [name for name in lines[number] if name.startswith("R@")]
+        rows = csv_rows(tmp_path / lines[number]["run"] / "table.csv")
+        assert [[row[name] for name in names] for row in rows] == [
+            [line[name] for name in names] for line in lines[number : number + 3]
+        ]
 
 
 @pytest.mark.slow

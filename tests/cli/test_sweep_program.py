@@ -17,13 +17,13 @@ from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, matches_
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.tuning.sweeps.sweep"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps.rankings"]
 
 
 @pytest.fixture(scope="session")
 def sweep(root):
     """Sweeps into a folder."""
-    return job_of(root, "sweep", sweeping.sweep, (sweeping.sweeps, "heat_maps"))
+    return job_of(root, "sweep", sweeping.sweep, (sweeping.sweeps, "sweep_figures"))
 
 
 GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")
@@ -111,6 +111,15 @@ def test_heat_maps_are_pictures(swept):
         assert min(picture.shape[:2]) > 200
         assert picture.std() > 30
         assert np.any(np.all(np.abs(picture.astype(int) - (232, 72, 44)) < 8, axis=-1))  # the best is framed
+
+
+def test_a_sweep_has_a_page(swept, succeed, tmp_path):
+    stdout, _ = succeed("report", swept[0], "--out", tmp_path / "page.html")
+    assert stdout == f"report: {tmp_path}/page.html\n"
+    page = (tmp_path / "page.html").read_text()
+    assert page.count('<img src="data:image/png') == 3
+    assert "Recall at 1 in %, with 95 % intervals in brackets:" in page
+    assert page.count("<tr>") > len(swept[1]["settings"])
 
 
 def test_without_a_store(root, sweep, tmp_path):

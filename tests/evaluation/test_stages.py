@@ -16,7 +16,7 @@ from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.matches import StoredMatches, open_match_store
-from mfvpr.tuning.sweeps import sweep
+from mfvpr.tuning.sweeps import rank_settings
 from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -80,7 +80,7 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     monkeypatch.setattr(match_sets, "BLOCK_BYTES", 1)  # a query at a time
     one_by_one = stages.score(scorers, read_again, candidates)
     jax.tree.map(np.testing.assert_array_equal, one_by_one, fresh)
-    rows = [sweep(scorers["h"], [{"sigma": 9.0}], match_set, candidates) for match_set in (matches, read_again)]
+    rows = [rank_settings(scorers["h"], [{"sigma": 9.0}], match_set, candidates) for match_set in (matches, read_again)]
     np.testing.assert_array_equal(*rows)
 
 

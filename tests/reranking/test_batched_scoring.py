@@ -17,7 +17,7 @@ from mfvpr.tuning import sweeps
 from tests import oracles
 from tests.programs import ROOT
 from tests.scorers import plain
-from tests.tuning.sweeps.test_sweep import CANDIDATES, QUERIES, make_set
+from tests.tuning.sweeps.test_sweep import CANDIDATES, QUERIES, make_set, rank
 
 pytestmark = pytest.mark.thorough
 
@@ -69,12 +69,12 @@ def devices_agree():
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
 
-    runtimes = mfvpr.Runtime(), mfvpr.Runtime(devices)
+    runtimes = mfvpr.Runtime(), mfvpr.Runtime(devices[3:5])
     alone, shared = (stages.score({"a": plain}, match_set, candidates, runtime=runtime)["a"] for runtime in runtimes)
     np.testing.assert_array_equal(alone, shared, strict=True)
     assert len(np.unique(alone)) > CANDIDATES
     settings = [{"max_distance": limit, "c": 0.1} for limit in (0.8, 1.5)]
-    alone, shared = (sweeps.sweep(plain, settings, match_set, candidates, devices=on) for on in (None, devices[3:5]))
+    alone, shared = (rank(plain, settings, match_set, candidates, runtime=on) for on in runtimes)
     np.testing.assert_array_equal(alone, shared)
 
 
@@ -111,8 +111,8 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tm
     scales = replace(scales, normalize=normalize)
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.7
     settings = sweeps.grid({"mean": ["unweighted", "median"], "c": [None, 0.5]})
-    got = sweeps.sweep(
-        SCORERS["sum"], settings, scales, candidates, views=[candidates.mask, view], depth=CANDIDATES,
+    got = rank(
+        SCORERS["sum"], settings, scales, candidates, views=[candidates.mask, view], ks=[CANDIDATES],
         queries_per_block=3, settings_per_block=1, folder=tmp_path,
     )  # fmt: skip
     for seen, by_setting in zip((candidates.mask, view & candidates.mask), got, strict=True):
@@ -132,8 +132,8 @@ def test_blocks_of_other_weights_or_scales_are_not_read(two_scales, tmp_path):
         Scales([first, first], WEIGHTS), Scales([second, first], WEIGHTS), first, second,
     ]  # fmt: skip
     for number, case in enumerate(cases, start=1):
-        expected = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates)
-        stored = sweeps.sweep(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
+        expected = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates)
+        stored = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
         np.testing.assert_array_equal(stored, expected)
         assert len(list(tmp_path.iterdir())) == number
 

@@ -81,6 +81,8 @@ def test_kinds_of_weights_and_distances_are_axes_too(matches):
         for j, weight in enumerate(weights):
             expected = score_candidates(AggregatedScore(weight=weight), near)
             np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
+    words = score_grid(AggregatedScore(), matches, max_distance=[0.7, 1.5], weight=["fs", "dmf", "unit"])
+    np.testing.assert_array_equal(words, got)
 
 
 def test_fine_bins_do_not_tax_coarse_ones(matches):
@@ -102,7 +104,8 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
         (HistogramOfShifts(), {}, "at least one axis"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
         (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
-        (AnchorPoints(), {"weight": [1.0]}, "expected weights such as UnitWeight"),
+        (AnchorPoints(), {"weight": [1.0]}, "expected weights such as 'ratio' or UnitWeight"),
+        (AnchorPoints(), {"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
         (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
     ],
 )

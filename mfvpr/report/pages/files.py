@@ -21,6 +21,7 @@ from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import read_csv
+from mfvpr.report.runs import LAST
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError, require_word
 
@@ -125,7 +126,7 @@ class Run:
     @cached_property
     def tables(self) -> Mapping[str, Table]:
         """Tables of the CSV files, by name; numbers are finite."""
-        return {name: _table(self.folder / name, text) for name, text in _TABLES.items()
+        return {name: read_table(self.folder / name, text) for name, text in _TABLES.items()
                 if (self.folder / name).exists()}  # fmt: skip
 
     @cached_property
@@ -148,7 +149,7 @@ class Run:
     def predictions(self) -> Iterator[Prediction]:
         """The first predictions of all systems, those of the system that decides first."""
         systems, files = sorted(self.systems, key=lambda name: name != self.headline), file_names(self.systems)
-        with _errors_as_input_errors(self.folder):
+        with errors_as_input_errors(self.folder):
             for system, (place, sequence) in itertools.product(systems, enumerate(self.sequences)):
                 folder = sequence_folder(self.folder, self.sequences, place) / "predictions"
                 first = {row["query"]: row for row in read_csv(folder / f"{files[system]}.csv") if row["rank"] == "1"}
@@ -161,17 +162,22 @@ class Run:
                     yield Prediction(system, sequence, query, *texts, outcome, str(rank or ""))
 
 
+def read_results(folder: Path, name: str = LAST) -> Any:
+    """The content of a JSON file of a run folder; InputError if there is none."""
+    if not (folder / name).is_file():
+        raise InputError(f"{folder}: expected a run folder, got one without {name}")
+    with errors_as_input_errors(folder):
+        return json.loads((folder / name).read_text("utf-8"))
+
+
 def read_run(folder: Path) -> Run:
     """Read and check the files of a run folder.
 
     Raises:
         InputError: there is no such folder, or its files are not those of an evaluation.
     """
-    for name in ("results.json", "run.json"):
-        if not (folder / name).is_file():
-            raise InputError(f"{folder}: {_LEFT_BY}, got none with a {name}")
-    with _errors_as_input_errors(folder):
-        results, about = (json.loads((folder / name).read_text("utf-8")) for name in ("results.json", "run.json"))
+    results, about = read_results(folder), read_results(folder, "run.json")
+    with errors_as_input_errors(folder):
         _check(results, about)
         run = Run(folder, results, about)
         if not run.sequences:
@@ -188,7 +194,7 @@ def read_run(folder: Path) -> Run:
 def _check(results: Any, about: Any) -> None:
     """Raise an error unless the values have what pages need."""
     if not isinstance(results, list) or not results:
-        raise ValueError("results.json has no rows")
+        raise ValueError("results.json is of no evaluation")
     for kinds, rows in ((_KINDS_OF_A_ROW, results), (_KINDS, results[:1]), ({"settings": dict}, [about])):
         for row, (name, kind) in itertools.product(rows, kinds.items()):
             value = functools.reduce(operator.getitem, name.split("."), row)
@@ -221,7 +227,7 @@ def _check_numbers(name: str, values: Iterable[Any]) -> None:
 
 
 @contextmanager
-def _errors_as_input_errors(folder: Path) -> Iterator[None]:
+def errors_as_input_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, StopIteration, csv.Error) as error:
@@ -230,7 +236,7 @@ def _errors_as_input_errors(folder: Path) -> Iterator[None]:
         ) from None
 
 
-def _table(path: Path, num_texts: int | None) -> Table:
+def read_table(path: Path, num_texts: int | None) -> Table:
     with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
         header, *rows = csv.reader(file)
     if any(len(row) != len(header) for row in rows):

@@ -1,10 +1,8 @@
 """The page of one run."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,13 +10,13 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.evaluation.precision import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
-from mfvpr.report.pages.files import Gains, Run, read_run
+from mfvpr.report.pages.files import Gains, Run, read_results, read_run
 from mfvpr.report.pages.pictures import pictures
-from mfvpr.report.pages.rendering import Gallery, Section, write_page
+from mfvpr.report.pages.rendering import PAGE, Gallery, Section, values_table, write_page
+from mfvpr.report.pages.searches import write_search_page
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
 
-PAGE = "report.html"  # in a run folder
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
@@ -33,9 +31,13 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     """Write the page of a run folder, by default into it; returns its path.
 
     Raises:
-        InputError: the folder is not the run folder of an evaluation.
+        InputError: the folder is no run folder.
     """
-    run, path = read_run(folder), path or folder / PAGE
+    path, results = path or folder / PAGE, read_results(folder)
+    if isinstance(results, dict):
+        write_search_page(folder, results, path)
+        return path
+    run = read_run(folder)
     sections = [_recall_section(run), *_differences_section(run)] if run.gains else []
     sections += [*_confidence_section(run), _predictions_section(run), _costs_section(run), _settings_section(run)]
     write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
@@ -214,17 +216,3 @@ def _settings_section(run: Run) -> Section:
     if skipped := run.tables.get("skipped.csv"):
         tables["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
     return Section("settings", "Settings and versions", tables=tables)
-
-
-def values_table(values: Mapping[str, Any]) -> Table:
-    """Nested values by their dotted names."""
-    return Table(["name", "value"], [*map(list, flat(values))], text_columns=2)
-
-
-def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Nested values as (dotted name, text)."""
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
-        else:
-            yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

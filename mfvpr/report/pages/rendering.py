@@ -1,10 +1,12 @@
 """Parts of a page, and pages from their template: everything escaped and embedded, without any network access."""
 
+import json
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from mfvpr.report.pages.charts import Chart
 from mfvpr.report.pages.files import Prediction
@@ -13,6 +15,7 @@ from mfvpr.report.tables import Table
 from mfvpr.utils.files import write_text
 
 # Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
+PAGE = "report.html"  # in a run folder
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -37,7 +40,8 @@ class Gallery:
 class Section:
     """A part of a page; `name` is a word for its element, `words` stand above everything in it.
 
-    `tables` are by caption. `links` are words and the addresses of other pages, relative to the page.
+    `tables` are by caption. `links` are words and the addresses of other pages, relative to the page. `text` keeps
+    its lines. `images` are `data:` URIs by title.
     """
 
     name: str
@@ -47,6 +51,8 @@ class Section:
     tables: Mapping[str, Table] = field(default_factory=dict)
     gallery: Gallery | None = None
     links: Sequence[tuple[str, str]] = ()
+    text: str = ""
+    images: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
@@ -72,3 +78,17 @@ def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], 
         hashes=" ".join(f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts),
     )  # fmt: skip
     write_text(path, text)
+
+
+def values_table(values: Mapping[str, Any]) -> Table:
+    """Nested values by their dotted names."""
+    return Table(["name", "value"], [*map(list, flat(values))], text_columns=2)
+
+
+def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Nested values as (dotted name, text)."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

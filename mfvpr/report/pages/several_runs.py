@@ -13,13 +13,12 @@ from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.one_run import (
     depths_chart,
     description,
-    flat,
     paired_tests,
     precision_charts,
     recall_bar,
     tolerance_charts,
 )
-from mfvpr.report.pages.rendering import Section, write_page
+from mfvpr.report.pages.rendering import Section, flat, write_page
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -18,27 +17,15 @@ from mfvpr.tuning.learning.models import Model
 from mfvpr.tuning.learning.parameters import can_learn
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.teaching import Options, of_matches, start, train
-from mfvpr.tuning.learning.training import Fit
+from mfvpr.tuning.learning.training import Checkpoints, Fit
 from mfvpr.tuning.sweeps.axes import Axes
-from mfvpr.tuning.sweeps.search import Stages, untracked_stages
+from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings
 from mfvpr.tuning.sweeps.settings import FUSION, Setting
-from mfvpr.tuning.sweeps.sweep import sweep
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import no_progress
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 _OF_THE_PAPER = (FeatureScoreWeight, DescriptorDistanceWeight, UnitWeight)
-
-
-class Checkpoints(NamedTuple):
-    """The folder of trainings, where an interrupted training is continued.
-
-    folder: of all trainings.
-    recipe: JSON values that determine the results, without the half and the model.
-    """
-
-    folder: Path
-    recipe: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -85,7 +72,7 @@ class Comparison:
 def compare(
     axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet, candidates: Shortlist,
     options: Options | None = None, *,
-    checkpoints: Checkpoints | None = None, track: Stages = untracked_stages,
+    checkpoints: Checkpoints | None = None, runtime: Runtime = DEFAULT_RUNTIME,
 ) -> Comparison:  # fmt: skip
     """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
 
@@ -101,7 +88,7 @@ def compare(
         candidates: their shortlist.
         options: of the learning.
         checkpoints: where an interrupted training is continued; None = nowhere.
-        track: progress.
+        runtime: progress.
 
     Raises:
         InputError: the scorer has nothing to learn or no match weight, a setting cannot be scored, a half has too few
@@ -113,7 +100,7 @@ def compare(
     axes.check(match_set.image_sizes)
     options = options or Options()
     splits = training_splits(match_set, candidates, protocol, retrieval_score=options.retrieval_score)
-    halves = [_HalfComparison(split, axes, options, checkpoints, track) for split in splits]
+    halves = [_HalfComparison(split, axes, options, checkpoints, runtime) for split in splits]
     return Comparison(protocol, match_set, candidates, [list(half.rows()) for half in halves])
 
 
@@ -125,7 +112,7 @@ class _HalfComparison:
     axes: Axes
     options: Options
     checkpoints: Checkpoints | None
-    track: Stages
+    runtime: Runtime
 
     def rows(self) -> Iterator[Row]:
         """All scores, each evaluated as soon as it is chosen or learned."""
@@ -184,16 +171,16 @@ class _HalfComparison:
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
     ) -> np.ndarray:
         """First rows `[S, q, 1]` of the rankings of the seen candidates by every setting."""
-        track = self.track(f"{self.split.name}: {name}") if len(settings) > 1 else no_progress
-        part, views = self.split.part(queries), [seen[queries]]
-        return sweep(scorer, settings, *part, views=views, depth=1, ties=self.options.ties, track=track)[0]
+        runtime, label = self.runtime if len(settings) > 1 else DEFAULT_RUNTIME, f"{self.split.name}: {name}"
+        options = SweepOptions((1,), self.options.ties, runtime=runtime, label=label)
+        return rank_settings(scorer, settings, *self.split.part(queries), views=[seen[queries]], options=options)[0]
 
     def learn(self, name: str, model: Model) -> Fit:
         """Train a model, with checkpoints in the folder `half-name`."""
-        folder, recipe = None, None
-        if self.checkpoints:
+        checkpoints = self.checkpoints
+        if checkpoints:
             folder_name = f"{self.split.name}-{name}".replace(" ", "_").replace("_+_", "_")
-            folder = self.checkpoints.folder / folder_name
-            recipe = {**self.checkpoints.recipe, "half": self.split.name, "model": name}
-        track = self.track(f"{self.split.name}: {name}")
-        return train(self.split, model, self.options, folder=folder, recipe=recipe, track=track)
+            recipe = {**checkpoints.recipe, "half": self.split.name, "model": name}
+            checkpoints = Checkpoints(checkpoints.folder / folder_name, recipe)
+        track = self.runtime.progress(f"{self.split.name}: {name}")
+        return train(self.split, model, self.options, checkpoints=checkpoints, track=track)

@@ -15,7 +15,7 @@ from mfvpr.scoring.weights import RatioWeight, UnitWeight
 from mfvpr.tuning.learning.losses import Loss, cross_entropy
 from mfvpr.tuning.learning.models import Model, Parameters
 from mfvpr.tuning.learning.splits import Batch, TrainingSplit
-from mfvpr.tuning.learning.training import Fit, fit
+from mfvpr.tuning.learning.training import Fit, Schedule, fit
 
 TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image
 FIRST_SHARE = 0.3  # the retrieval's weight at the start, in units of the balanced weight
@@ -90,7 +90,7 @@ def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
 
 
 def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) -> Fit:
-    """Learn a model's parameters; `keeping` are `folder`, `recipe` and `track` of `training.fit`."""
+    """Learn a model's parameters; `keeping` are `checkpoints` and `track` of `training.fit`."""
     size = options.batch
     objective = model.objective(options.loss)
     mean_loss = jax.jit(objective)
@@ -106,7 +106,5 @@ def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) 
     def validate(learned: Parameters) -> float:
         return sum(float(mean_loss(learned, batch)) * count for batch, count in validation) / len(split.validation)
 
-    return fit(
-        model.start, objective, batches, optimizer=optax.adam(options.learning_rate), steps=options.steps,
-        validate=validate, every=options.every, patience=options.patience, **keeping,
-    )  # fmt: skip
+    schedule = Schedule(optax.adam(options.learning_rate), options.steps, options.every, options.patience)
+    return fit(model.start, objective, batches, schedule, validate=validate, **keeping)

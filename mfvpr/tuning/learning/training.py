@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mfvpr.tuning.learning import checkpoints
+from mfvpr.tuning.learning.checkpoints import leaves_by_path, lock_checkpoints, newest, restore, save_checkpoint
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Track, no_progress
@@ -58,11 +58,38 @@ class _State(NamedTuple):
     optimizer: Any
 
 
+class Checkpoints(NamedTuple):
+    """A folder in which an interrupted training is continued, or a folder of such folders.
+
+    folder: a training in it is resumed, also to do more steps. With the same `every`, the result has the bits of a
+        training that was never interrupted.
+    recipe: JSON values that determine the result: the model, the data, all settings.
+    """
+
+    folder: Path
+    recipe: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The schedule of a training.
+
+    Attributes:
+        optimizer: of optax.
+        steps: total number of updates, also of a resumed training.
+        every: steps from one validation, and checkpoint, to the next; the last step has both as well.
+        patience: validations without a gain after which to stop; None = do all steps.
+    """
+
+    optimizer: optax.GradientTransformation
+    steps: int
+    every: int = 10
+    patience: int | None = None
+
+
 def fit(
-    parameters: Any, objective: Callable[[Any, Any], Array], batches: Callable[[int], Any], *,
-    optimizer: optax.GradientTransformation, steps: int, validate: Callable[[Any], float] | None = None,
-    every: int = 10, patience: int | None = None, folder: Path | None = None,
-    recipe: Mapping[str, Any] | None = None, track: Track = no_progress,
+    parameters: Any, objective: Callable[[Any, Any], Array], batches: Callable[[int], Any], schedule: Schedule, *,
+    validate: Callable[[Any], float] | None = None, checkpoints: Checkpoints | None = None, track: Track = no_progress,
 ) -> Fit:  # fmt: skip
     """Minimize the objective.
 
@@ -70,14 +97,9 @@ def fit(
         parameters: pytree of floating-point arrays to start from.
         objective: parameters and a batch -> loss `[]`; compiled once per shape of the batches.
         batches: a step, counted from 0, -> its batch; the same batch in every call.
-        optimizer: of optax.
-        steps: total number of updates, also of a resumed training.
+        schedule: optimizer, steps and validations.
         validate: parameters -> a number, smaller = better.
-        every: steps from one validation, and checkpoint, to the next; the last step has both as well.
-        patience: validations without a gain after which to stop.
-        folder: of checkpoints. A training in it is resumed, also to do more steps. With the same `every`, the result
-            has the bits of a training that was never interrupted.
-        recipe: JSON values that determine the result: the model, the data, all settings.
+        checkpoints: folder and recipe; None = no checkpoints.
         track: progress over the steps.
 
     Raises:
@@ -85,13 +107,14 @@ def fit(
             another training or of more steps.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
+    every, steps, patience = schedule.every, schedule.steps, schedule.patience
     if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
         raise ValueError(f"fit({steps=}, {every=}, {patience=}): expected counts, and a patience only with validate")
-    update = _update(objective, optimizer)
-    training = _Training(update, batches, validate, steps, every, patience, folder, recipe or {}, track)
+    update = _update(objective, schedule.optimizer)
+    training = _Training(update, batches, validate, schedule, checkpoints, track)
     parameters = _strong(parameters)
-    start = _State(parameters, parameters, _strong(optimizer.init(parameters)))
-    with checkpoints.lock_checkpoints(folder) if folder else nullcontext():
+    start = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
+    with lock_checkpoints(checkpoints.folder) if checkpoints else nullcontext():
         state, history = training.descend(*training.begin(start))
     is_early = _out_of_patience(history, patience)
     ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
@@ -120,37 +143,36 @@ class _Training:
     update: Callable
     batches: Callable[[int], Any]
     validate: Callable[[Any], float] | None
-    steps: int
-    every: int
-    patience: int | None
-    folder: Path | None
-    recipe: Mapping[str, Any]
+    schedule: Schedule
+    checkpoints: Checkpoints | None
     track: Track
 
     def begin(self, state: _State) -> tuple[_State, list[Record], list[float]]:
         """State, history and the losses since the last validation, from the folder or at the start."""
-        stored = checkpoints.restore(self.folder, self.recipe, state) if self.folder else None
+        stored = restore(*self.checkpoints, state) if self.checkpoints else None
         if stored is None:
             return state, [Record(0, None, self.validation(state.parameters, 0))], []
         state, (rows, losses) = _strong(stored[0]), stored[1]
         history = [Record(*row) for row in rows]
-        if (done := history[-1].step + len(losses)) > self.steps:
-            raise InputError(f"{self.folder}: this checkpoint is of step {done}, expected at most {self.steps}; ask "
-                             "for more steps, or choose another folder")  # fmt: skip
+        if self.checkpoints and (done := history[-1].step + len(losses)) > (most := self.schedule.steps):
+            raise InputError(f"{self.checkpoints.folder}: this checkpoint is of step {done}, expected at most {most}; "
+                             "ask for more steps, or choose another folder")  # fmt: skip
         return state, history, losses
 
     def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
         """Do the remaining steps, until patience ends."""
         done = history[-1].step + len(losses)
-        remaining = 0 if _out_of_patience(history, self.patience) else self.steps - done
+        steps, every, patience = self.schedule.steps, self.schedule.every, self.schedule.patience
+        remaining = 0 if _out_of_patience(history, patience) else steps - done
         for step in self.track(range(done, done + remaining), remaining):
             state, loss = self.advance(state, step)
             losses = [*losses, loss]
-            if is_due := (step + 1) % self.every == 0:
+            if is_due := (step + 1) % every == 0:
                 (state, history), losses = self.add_record(state, history, losses), []
-            if self.folder and (is_due or step + 1 == self.steps):
-                checkpoints.save_checkpoint(self.folder, step + 1, self.recipe, state, (history, losses))
-            if _out_of_patience(history, self.patience):
+            if self.checkpoints and (is_due or step + 1 == steps):
+                folder, recipe = self.checkpoints
+                save_checkpoint(folder, step + 1, recipe, state, (history, losses))
+            if _out_of_patience(history, patience):
                 break
         # After the checkpoint: a training of more steps would not validate here.
         return self.add_record(state, history, losses) if losses else (state, history)
@@ -166,7 +188,7 @@ class _Training:
         batch = self.batches(step)
         parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
         if not finite:
-            suspects = checkpoints.leaves_by_path({"loss": loss, "gradient": gradient, "updated": parameters})
+            suspects = leaves_by_path({"loss": loss, "gradient": gradient, "updated": parameters})
             culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
             raise self.error(f"{culprit} of batch {step}", state.parameters, step)
         return _State(parameters, state.best, memory), float(loss)
@@ -180,10 +202,10 @@ class _Training:
         return value
 
     def error(self, what: str, parameters: Any, step: int) -> TrainingError:
-        leaves = checkpoints.leaves_by_path(parameters).items()
+        leaves = leaves_by_path(parameters).items()
         scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
         values = f" at {', '.join(scalars)}" if scalars else ""
-        saved = self.folder and checkpoints.newest(self.folder)
+        saved = self.checkpoints and newest(self.checkpoints.folder)
         checkpoint = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
         return TrainingError(
             f"step {step}: {what} is not finite{values}; {checkpoint}; look at the data, or lower the learning rate"

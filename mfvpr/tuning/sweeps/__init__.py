@@ -2,9 +2,9 @@
 
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome
+from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings
 from mfvpr.tuning.sweeps.search import search_grid, search_optuna
 from mfvpr.tuning.sweeps.settings import Setting, grid
-from mfvpr.tuning.sweeps.sweep import result_bytes, sweep
 
-__all__ = ["Axes", "Outcome", "Setting", "grid", "result_bytes", "search_grid", "search_optuna",
-           "sweep"]  # fmt: skip
+__all__ = ["Axes", "Outcome", "Setting", "SweepOptions", "grid", "rank_settings", "search_grid",
+           "search_optuna"]  # fmt: skip

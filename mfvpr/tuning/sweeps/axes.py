@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, is_dataclass
+from operator import attrgetter
 from typing import Any
 
+import jax
 import numpy as np
 
-from mfvpr.scoring.fields import parameters_of
-from mfvpr.scoring.parameters import with_capacity, with_parameters
+from mfvpr.scoring.fields import Parameter, parameters_of
+from mfvpr.scoring.parameters import numbers_by_name, static_names, with_capacity, with_parameters
 from mfvpr.scoring.scorer import Scorer
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, named_weight
+from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
 
@@ -21,17 +25,46 @@ CAPACITY = ("bin_size", "align")  # parameters that determine the number of bins
 class Axes:
     """Parameters to vary, and their values.
 
+        axes = Axes(mfvpr.HistogramOfShifts(), {"sigma": [5, 10, 22.5], "weight": ["fs", "ratio"]})
+
     Attributes:
         scorer: its other parameters stay.
         values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
-            (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None).
-        own: by name, the plain value of the scorer, or the one that is used without a sweep.
+            (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None). Words stand for weights in every
+            scorer.
+        own: by name, the plain value without a sweep; what is left out is the scorer's, no limit, and c = 0.
+
+    Raises:
+        InputError: an axis without values or with equal ones, an unknown word, or a name that the scorer does not have.
     """
 
     scorer: Scorer
     values: Mapping[str, Sequence[Any]]
-    own: Mapping[str, Any]
+    own: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        scorer = self.scorer
+        known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
+        known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
+        values = {}
+        for name, axis in self.values.items():
+            if name not in {*known, MAX_DISTANCE, FUSION}:
+                raise InputError(f"{name}: expected a parameter of {type(scorer).__name__}, of "
+                                 f"{', '.join([*known, MAX_DISTANCE, FUSION])}")  # fmt: skip
+            is_list = np.iterable(axis) and not isinstance(axis, str)
+            values[name] = list(map(_plain, axis)) if is_list else []
+            if len({*values[name]}) < max(1, len(values[name])):
+                raise InputError(f"{name}={axis!r}: expected different values, in a list")
+        own = {name: self.own[name] if name in self.own else self._own(name) for name in values}
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "own", own)
+        _ = [self._value(name, value) for name, axis in values.items() for value in axis]  # before any work
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Declared parameters of the scorer."""
+        return parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
 
     @property
     def size(self) -> int:
@@ -44,11 +77,10 @@ class Axes:
 
     def without(self, name: str) -> "Axes":
         """All axes but one."""
-        values = {key: value for key, value in self.values.items() if key != name}
-        return Axes(self.scorer, values, {key: value for key, value in self.own.items() if key != name})
+        return Axes(self.scorer, {key: value for key, value in self.values.items() if key != name}, self.own)
 
     def setting(self, plain: Mapping[str, Any]) -> Setting:
-        """Convert plain values to a setting of `mfvpr.tuning.sweeps.sweep`.
+        """Convert plain values to a setting of `mfvpr.tuning.sweeps.rank_settings`.
 
         Raises:
             InputError: a word that its parameter does not have.
@@ -56,27 +88,36 @@ class Axes:
         return {name: self._value(name, value) for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        """Raise errors of settings before any work.
+        """Raise an InputError before any work if a histogram has too many bins.
 
         Args:
             image_sizes: `[n, 2]` all sizes of queries and of database images (`MatchSet.image_sizes`).
-
-        Raises:
-            InputError: `own` and `values` have different names, or a histogram has too many bins.
         """
-        if {*self.own} != {*self.values}:
-            raise InputError(f"own: expected a value of each of {', '.join(self.values)}, got {', '.join(self.own)}")
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
             with_capacity(with_parameters(self.scorer, setting), *image_sizes)
+
+    def _own(self, name: str) -> Any:
+        """The plain value without a sweep."""
+        if name in (MAX_DISTANCE, FUSION):
+            return None if name == MAX_DISTANCE else 0
+        value = attrgetter(name)(self.scorer)
+        if name == "weight":
+            words = [word for word, weight in WEIGHTS.items() if weight == value]
+            words += [word for word, weight in NAMED_WEIGHTS.items() if weight is value]
+            return words[0] if words else value
+        is_none = name in self.parameters and value == self.parameters[name].none
+        return None if is_none else _plain(value)
 
     def _value(self, name: str, value: Any) -> Any:
         if name == FUSION:
             return None if value == "auto" else float(value)
         if name == MAX_DISTANCE:
             return math.inf if value is None else value
-        parameter = parameters_of(self.scorer).get(name)
-        if parameter is None:
-            return value
-        if parameter.named is not None and value not in parameter.named:
-            raise InputError(f"{name}={value!r}: expected one of {', '.join(parameter.named)}")
-        return parameter.value(value)
+        if name == "weight":
+            return named_weight(value)
+        return self.parameters[name].value(value) if name in self.parameters else value
+
+
+def _plain(value: Any) -> Any:
+    """The number that a scalar array holds; any other value as it is."""
+    return value.item() if isinstance(value, np.generic | np.ndarray | jax.Array) else value

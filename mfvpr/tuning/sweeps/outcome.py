@@ -63,12 +63,23 @@ class Outcome:
         return self.settings.index(dict(self.axes.own))
 
     @cached_property
+    def _tuning(self) -> Float[np.ndarray, "halves settings"]:
+        """Recall@1 on the queries to choose on, of the settings that may be chosen."""
+        size = self.axes.size if self.is_grid else len(self.settings)
+        return self.protocol.tuning(self.rows)[:, :size, self.protocol.main]
+
+    def _choose(self, recall: Float[np.ndarray, " settings"]) -> int:
+        return evaluation.best_setting(recall, self.axes.values if self.is_grid else None)
+
+    @cached_property
     def chosen(self) -> list[int]:
         """Number of the best setting, for each half."""
-        size = self.axes.size if self.is_grid else len(self.settings)
-        axes = self.axes.values if self.is_grid else None
-        tuning = self.protocol.tuning(self.rows)
-        return [evaluation.best_setting(recall[:size, self.protocol.main], axes) for recall in tuning]
+        return list(map(self._choose, self._tuning))
+
+    @cached_property
+    def best(self) -> int:
+        """Number of the best setting by the mean recall of the halves."""
+        return self._choose(self._tuning.mean(axis=0))
 
     @cached_property
     def report(self) -> list[Verdict]:

@@ -1,6 +1,8 @@
 """Search for the best setting: all settings of a grid, or those that Optuna proposes, batch by batch."""
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -8,31 +10,21 @@ import numpy as np
 
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.matching.match_set import MatchSet, Scales
-from mfvpr.scoring.fields import parameters_of
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome
-from mfvpr.tuning.sweeps.sweep import sweep
+from mfvpr.tuning.sweeps.rankings import DEFAULT_OPTIONS, SweepOptions, duration, rank_settings
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Track, no_progress
 
 if TYPE_CHECKING:
     import optuna
 
 BATCH = 16  # settings of one compiled call, after which Optuna gets their recalls
-KS = (1, 5, 10)
-
-Stages = Callable[[str], Track]  # the name of a stage -> its progress
-
-
-def untracked_stages(stage: str) -> Track:
-    """No progress bars."""
-    return no_progress
 
 
 def search_grid(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, *,
-    ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist,
+    options: SweepOptions = DEFAULT_OPTIONS,
 ) -> Outcome:  # fmt: skip
     """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them.
 
@@ -41,23 +33,22 @@ def search_grid(
         protocol: the ground truth, and the queries to choose on.
         match_set: matches of Q queries with C candidates.
         candidates: their shortlist.
-        ks: of the recall.
-        track: progress.
-        options: of `mfvpr.tuning.sweeps.sweep`: `ties`, `retrieval_score`, the sizes of blocks, and their folder.
+        options: depths of the recall, ties, blocks and runtime.
 
     Raises:
         InputError: a setting cannot be scored.
     """
     axes.check(match_set.image_sizes)
-    protocol, own_values, settings = protocol.of(candidates), dict(axes.own), axes.grid()
-    settings += [] if own_values in settings else [own_values]
-    rank = _ranker(axes, protocol, match_set, candidates, depth=max(ks), **options)
-    return Outcome(axes, protocol, settings, rank(settings, track("sweep")), sorted({*ks}), is_grid=True)
+    protocol, settings = protocol.of(candidates), axes.grid()
+    settings += [] if dict(axes.own) in settings else [dict(axes.own)]
+    _announce(len(settings), candidates, options)
+    rows = _rank(axes, settings, protocol, match_set, candidates, options)
+    return Outcome(axes, protocol, settings, rows, sorted({*options.ks}), is_grid=True)
 
 
 def search_optuna(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, *,
-    trials: int, seed: int = 0, ks: Sequence[int] = KS, track: Stages = untracked_stages, **options: Any,
+    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist,
+    options: SweepOptions = DEFAULT_OPTIONS, *, trials: int, seed: int = 0,
 ) -> Outcome:  # fmt: skip
     """Rank with the scorer's own values, and with settings that Optuna's sampler (TPE) proposes from a seed.
 
@@ -78,20 +69,23 @@ def search_optuna(
 
     axes.check(match_set.image_sizes)
     protocol = protocol.of(candidates)
-    rank = _ranker(axes, protocol, match_set, candidates, depth=max(ks), **options)
+    _announce(1 + trials, candidates, options)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
-    settings: list[Mapping[str, Any]] = [dict(axes.own)]
-    rows = [rank(settings, track("own values"))]
-    for start in range(0, trials, BATCH):
-        batch = [study.ask() for _ in range(min(BATCH, trials - start))]
+    settings, start = [dict(axes.own)], time.perf_counter()
+    rows = [_rank(axes, settings, protocol, match_set, candidates, replace(options, label="own values"))]
+    while len(settings) <= trials:
+        batch = [study.ask() for _ in range(min(BATCH, trials + 1 - len(settings)))]
         proposed = [suggest_setting(trial, axes) for trial in batch]
-        rows.append(rank(proposed, track(f"trials {start + 1} to {start + len(batch)}")))
+        label = f"trials {len(settings)} to {len(settings) + len(batch) - 1}"
+        rows.append(_rank(axes, proposed, protocol, match_set, candidates, replace(options, label=label)))
         recall = protocol.tuning(rows[-1])[..., protocol.main].mean(axis=0)
         for trial, value in zip(batch, recall, strict=True):
             study.tell(trial, float(value))
         settings += proposed
-    return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*ks}), is_grid=False)
+        seconds = (time.perf_counter() - start) / len(settings) * (1 + trials - len(settings))
+        options.runtime.log(f"{label}: done, {duration(seconds)} left")
+    return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
 
 
 def require_optuna() -> None:
@@ -100,19 +94,24 @@ def require_optuna() -> None:
         raise InputError("Optuna is not installed; pip install 'mfvpr[sweep]'")
 
 
-def _ranker(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist, **options: Any
-) -> Callable[[Sequence[Mapping[str, Any]], Track], np.ndarray]:
-    """A function of plain settings that returns the rows `[V, S, Q, depth]` of their rankings."""
-    return lambda settings, track: sweep(
-        axes.scorer, [axes.setting(plain) for plain in settings], match_set, candidates,
-        views=protocol.views, track=track, **options,
-    )  # fmt: skip
+def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
+    pairs = int(candidates.mask.sum())
+    options.runtime.log(f"sweep: {number:,} settings on {pairs:,} pairs of {len(candidates.mask):,} queries with their "
+                        f"candidates, {number * pairs:,} scores")  # fmt: skip
+
+
+def _rank(
+    axes: Axes, settings: Sequence[Mapping[str, Any]], protocol: EvaluationProtocol,
+    match_set: MatchSet | Scales, candidates: Shortlist, options: SweepOptions,
+) -> np.ndarray:  # fmt: skip
+    """Rows `[V, S, Q, depth]` of the rankings by plain settings."""
+    of_scorer = [axes.setting(plain) for plain in settings]
+    return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
 
 
 def suggest_setting(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
     """Draw a plain value of every axis."""
-    integers = {name for name, parameter in parameters_of(axes.scorer).items() if parameter.whole}
+    integers = {name for name, parameter in axes.parameters.items() if parameter.whole}
     return {name: _suggest(trial, name, values, is_integer=name in integers) for name, values in axes.values.items()}
 
 

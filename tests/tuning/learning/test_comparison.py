@@ -6,14 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, score_candidates
+from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, Runtime, score_candidates
 from mfvpr.scoring.learned_weight import ABSOLUTE
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.comparison import Options, start
 from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss
 from mfvpr.tuning.learning.models import Model
 from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.search import untracked_stages
 from tests.builders import random_matches, stack
 from tests.tuning.learning.paths import QUERIES, SIZES, TOLERANCES, split
 
@@ -84,7 +83,7 @@ def test_images_of_two_sizes_are_reported_on_as_one_by_one():
     for query in at.half.report:
         order = np.argsort(-(scores_of(HISTOGRAM, at, query) + c * at.candidates.scores[query]), kind="stable")
         expected.append([abs(at.candidates.indices[query][order[0]] - query) <= width for width in TOLERANCES])
-    compared = comparison._HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, untracked_stages)
+    compared = comparison._HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, Runtime())
     np.testing.assert_array_equal(compared.evaluate("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
 
 

@@ -14,7 +14,7 @@ from jax.test_util import check_grads
 from mfvpr import MatchCount, match, soft_match
 from mfvpr.tuning.learning.losses import cross_entropy, mean_loss
 from mfvpr.tuning.learning.projection import Projection
-from mfvpr.tuning.learning.training import fit
+from mfvpr.tuning.learning.training import Schedule, fit
 from tests.builders import make_features, unit
 
 pytestmark = pytest.mark.thorough
@@ -114,7 +114,7 @@ def test_a_projection_is_learned_through_soft_matching():
     def objective(projection, _):
         return mean_loss(cross_entropy, scores(projection), correct, np.ones_like(correct))
 
-    fitted = fit(start, objective, lambda step: 0, optimizer=optax.adam(0.1), steps=80, every=80)
+    fitted = fit(start, objective, lambda step: 0, Schedule(optax.adam(0.1), steps=80, every=80))
     scores_of_both = [jax.jit(scores)(projection) for projection in (start, fitted.parameters)]
     losses = [mean_loss(cross_entropy, of_pair, correct, np.ones_like(correct)) for of_pair in scores_of_both]
     recall = [np.mean(np.argmax(of_pair, axis=1) == np.arange(5)) for of_pair in scores_of_both]

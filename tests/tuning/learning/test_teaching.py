@@ -13,7 +13,7 @@ from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.tuning.learning.models import Model
 from mfvpr.tuning.learning.splits import Batch
 from mfvpr.tuning.learning.teaching import TEACHER_SIGMA, Options, of_matches
-from mfvpr.tuning.learning.training import fit
+from mfvpr.tuning.learning.training import Schedule, fit
 from tests.builders import make_matches
 from tests.tuning.learning.paths import SIZES, split
 
@@ -74,7 +74,7 @@ def test_the_loss_is_that_of_a_loop():
 def test_it_finds_what_tells_right_matches_from_wrong_ones():
     taught, other = batch(), batch(seed=9)
     teachable = model(taught)
-    result = fit(teachable.start, teachable.objective(None), lambda _: taught, optimizer=optax.adam(0.05), steps=40)
+    result = fit(teachable.start, teachable.objective(None), lambda _: taught, Schedule(optax.adam(0.05), steps=40))
     loss = jax.jit(teachable.objective(None))
     assert loss(result.parameters, other) < 0.85 * loss(teachable.start, other)
     learned = teachable.scorer_of(result.parameters)

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 
 from mfvpr.tuning.learning import checkpoints
-from mfvpr.tuning.learning.training import Fit, fit
+from mfvpr.tuning.learning.training import Checkpoints, Fit, Schedule, fit
 
 ROOT = Path(__file__).parents[3]
 RECIPE = {"model": {"scorer": "line", "sizes": (1, 3)}, "data": {"name": "drawn", "images": 100}, "seed": None}
@@ -39,9 +39,11 @@ def validate(parameters):
 
 
 def train(folder: Path | None = None, steps: int = 20, **changes) -> Fit:
-    settings = {"parameters": START, "objective": objective, "batches": batches, "optimizer": optax.adam(0.1),
-                "validate": validate, "every": 5, "recipe": RECIPE}  # fmt: skip
-    return fit(steps=steps, folder=folder, **settings | changes)
+    schedule = {name: changes.pop(name) for name in ("optimizer", "every", "patience") if name in changes}
+    arguments = {"parameters": START, "objective": objective, "batches": batches, "validate": validate,
+                 "schedule": Schedule(**{"optimizer": optax.adam(0.1), "steps": steps, "every": 5} | schedule),
+                 "checkpoints": folder and Checkpoints(folder, changes.pop("recipe", RECIPE))}  # fmt: skip
+    return fit(**arguments | changes)
 
 
 def same(first: Fit, second: Fit) -> bool:

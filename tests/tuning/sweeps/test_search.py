@@ -4,16 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mfvpr
 from mfvpr import InputError
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, hits, statistics
 from mfvpr.report import sweeps
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, search
 from tests.scorers import Wrapped
 from tests.tuning.learning.paths import QUERIES, TOLERANCES, split
+from tests.tuning.sweeps.test_sweep import rank
 
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
 SUM = mfvpr.AggregatedScore()
@@ -29,11 +32,13 @@ def data():
 @pytest.fixture(scope="module")
 def outcome(data):
     axes = Axes(SUM, WEIGHTS, {"weight": "dmf", "c": 2})
-    return sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES, "both"), *data, ks=[5, 1])
+    return sweeping.search_grid(
+        axes, evaluation_protocol(TRUTH, TOLERANCES, "both"), *data, sweeping.SweepOptions(ks=[5, 1])
+    )
 
 
 def test_words_become_values():
-    axes = Axes(mfvpr.HistogramOfShifts(), {"weight": ["fs"], "truncate": [None, 2.0]}, {})
+    axes = Axes(mfvpr.HistogramOfShifts(), {"weight": ["fs"], "truncate": [None, 2.0]})
     plain = {"weight": "dmf", "truncate": None, "max_distance": None, "c": "auto", "sigma": 3.0}
     assert axes.setting(plain) == {
         "weight": mfvpr.DescriptorDistanceWeight(), "truncate": math.inf, "max_distance": math.inf, "c": None,
@@ -52,18 +57,34 @@ def test_one_axis_less():
 
 
 def test_bins_that_do_not_fit_are_refused_before_any_work(data):
-    axes = Axes(mfvpr.HistogramOfShifts(), {"bin_size": [15.0, 0.01]}, {"bin_size": 15.0})
+    axes = Axes(mfvpr.HistogramOfShifts(), {"bin_size": [15.0, 0.01]})
+    options = sweeping.SweepOptions(runtime=mfvpr.Runtime(log=lambda _: pytest.fail("begun")))
     with pytest.raises(InputError, match=r"bin_size=0\.01: expected at most 1024 bins"):
-        sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, track=lambda _: pytest.fail("begun"))
+        sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, options)
 
 
-def test_what_is_no_word_or_has_no_own_value_is_refused(data):
-    words = Axes(SUM, {"weight": [mfvpr.UnitWeight()]}, {"weight": "fs"})
-    with pytest.raises(InputError, match=r"weight=UnitWeight\(\): .*fs, dmf, ratio, unit"):
-        sweeping.search_grid(words, evaluation_protocol(TRUTH, TOLERANCES), *data)
-    without = Axes(SUM, {"weight": ["fs"], "c": [0]}, {"weight": "fs"})
-    with pytest.raises(InputError, match=r"own: .*weight, c, got weight"):
-        sweeping.search_grid(without, evaluation_protocol(TRUTH, TOLERANCES), *data)
+def test_own_values_follow_from_the_scorer_unless_they_are_given():
+    axes = Axes(mfvpr.HistogramOfShifts(), {"sigma": np.array([5, 10]), "truncate": [None], "weight": ["ratio"]})
+    assert axes.values["sigma"] == [5, 10]
+    assert type(axes.values["sigma"][0]) is int
+    assert axes.own == {"sigma": 22.5, "truncate": None, "weight": "fs"}
+    learned = mfvpr.AggregatedScore(weight=NAMED_WEIGHTS["learned_aliked"])
+    assert Axes(learned, {"weight": ["fs"]}).own == {"weight": "learned_aliked"}
+    wrapped = Axes(Wrapped(), {"inner.sigma": [9.0], "c": ["auto"], "max_distance": [0.5]}, {"c": 2, "sigma": 1})
+    assert wrapped.own == {"inner.sigma": 18.0, "c": 2, "max_distance": None}
+
+
+@pytest.mark.parametrize(("values", "words"), [
+    ({"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
+    ({"sigma": [1.0]}, "sigma: expected a parameter of AggregatedScore, of clamp, mean, temperature, weight"),
+    ({"c": 2}, "c=2: expected different values, in a list"),
+    ({"c": [2, 2.0]}, "expected different values, in a list"),
+    ({"weight": "fs"}, "weight='fs': expected different"),
+    ({"c": []}, r"c=\[\]: expected different"),
+])  # fmt: skip
+def test_axes_that_cannot_be_swept_are_refused_in_one_line(values, words):
+    with pytest.raises(InputError, match=words):
+        Axes(SUM, values)
 
 
 def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outcome):
@@ -74,7 +95,7 @@ def test_every_setting_of_the_grid_is_ranked_and_then_the_scorers_own(data, outc
     settings = [
         {"weight": weights[row["weight"]], "c": None if row["c"] == "auto" else row["c"]} for row in outcome.settings
     ]
-    rows = sweeping.sweep(SUM, settings, *data, views=outcome.protocol.views, depth=5)
+    rows = rank(SUM, settings, *data, views=outcome.protocol.views, ks=[5])
     np.testing.assert_array_equal(outcome.rows, rows)
 
 
@@ -111,19 +132,21 @@ def test_optuna_draws_within_the_axes():
     assert len({setting["tolerance"] for setting in drawn}) == 20
 
 
-def test_optuna_proposes_after_the_scorers_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch):
+def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch, tmp_path):
     optuna = pytest.importorskip("optuna")
     values, tell = [], optuna.Study.tell
     monkeypatch.setattr(optuna.Study, "tell", lambda *arguments: values.append(arguments[-1]) or tell(*arguments))
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
     protocol = evaluation_protocol(TRUTH, TOLERANCES, "both")
-    outcome = sweeping.search_optuna(axes, protocol, *data, trials=3, seed=1, ks=[1])
+    outcome = sweeping.search_optuna(axes, protocol, *data, sweeping.SweepOptions(ks=[1]), trials=3, seed=1)
     assert outcome.settings[0] == axes.own
     assert outcome.rows.shape == (3, 4, QUERIES, 1)
     assert outcome.chosen == np.argmax(outcome.protocol.tuning(outcome.rows)[..., 1], axis=1).tolist()
-    assert sweeps.heat_maps(outcome) == []
+    [(name, draw)] = sweeps.sweep_figures(outcome)
+    draw(tmp_path / name)
+    assert np.asarray(Image.open(tmp_path / "trials.png").convert("RGB")).std() > 20
     settings = [axes.setting(plain) for plain in outcome.settings]
-    rows = sweeping.sweep(SUM, settings, *data, views=outcome.protocol.views, depth=1)
+    rows = rank(SUM, settings, *data, views=outcome.protocol.views, ks=[1])
     np.testing.assert_array_equal(outcome.rows, rows)
     tuning = outcome.protocol.tuning(outcome.rows)[:, 1:, outcome.protocol.main].mean(axis=0)
     np.testing.assert_array_equal(values, tuning)
@@ -132,7 +155,7 @@ def test_optuna_proposes_after_the_scorers_own_values_and_learns_from_the_querie
 
 def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
     axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
-    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data, ks=[1])
+    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data)
     assert "neighbors" not in sweeps.sweep_summary(outcome)
     monkeypatch.setattr(sweeps, "TOP", 2)
     assert "The best, and its neighbors in the grid:" in sweeps.sweep_summary(outcome)

@@ -2,7 +2,9 @@
 
 import errno
 import itertools
+import re
 import sys
+import time
 from dataclasses import replace
 
 import jax
@@ -45,6 +47,11 @@ def make_set():
 @pytest.fixture(scope="module")
 def data():
     return make_set()
+
+
+def rank(scorer, settings, *data, views=None, **options):
+    """Rows of the rankings by every setting."""
+    return sweeps.rank_settings(scorer, settings, *data, views=views, options=sweeps.SweepOptions(**options))
 
 
 def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
@@ -90,7 +97,7 @@ CASES = [
 )
 def test_sweep_is_one_evaluation_per_setting(data, scorer, axes):
     settings = axes if isinstance(axes, list) else sweeps.grid(axes)
-    got = sweeps.sweep(scorer, settings, *data, depth=CANDIDATES)
+    got = rank(scorer, settings, *data, ks=[CANDIDATES])
     assert got.shape == (1, len(settings), QUERIES, CANDIDATES)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows, one_by_one(scorer, setting, *data), err_msg=str(setting))
@@ -104,7 +111,7 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
     programs = list(group_by_program(scorer, settings, data[0].image_sizes))
     assert sorted(group.rows.shape for group in programs) == [(1, 5), (2, 4)]
     assert sorted(row for group in programs for row in group.rows.reshape(-1)) == list(range(13))
-    for rows, setting in zip(sweeps.sweep(scorer, settings, *data)[0], settings, strict=True):
+    for rows, setting in zip(rank(scorer, settings, *data)[0], settings, strict=True):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(scorer, setting, *data))
 
 
@@ -112,18 +119,18 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
 @pytest.mark.parametrize("queries_per_block", [1, 4, 100])
 def test_chunks_change_nothing(data, settings_per_block, queries_per_block):
     settings = sweeps.grid(CASES[0][1] | {"c": [None, 1.0]})
-    got = sweeps.sweep(
+    got = rank(
         CASES[0][0], settings, *data,
         settings_per_block=settings_per_block, queries_per_block=queries_per_block,
     )  # fmt: skip
-    np.testing.assert_array_equal(got, sweeps.sweep(CASES[0][0], settings, *data))
+    np.testing.assert_array_equal(got, rank(CASES[0][0], settings, *data))
 
 
 def test_views_hide_candidates_and_ties_may_go_by_index(data):
     _, candidates = data
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
-    got = sweeps.sweep(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
+    got = rank(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
     for seen, rankings in zip((candidates.mask, view), got, strict=True):
         for first_rows, setting in zip(rankings, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
@@ -134,7 +141,7 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
 @pytest.fixture
 def block_scores(monkeypatch):
     """Scores of every block that the test computes."""
-    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.sweep"])
+    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.rankings"])
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
     return computed
@@ -142,32 +149,32 @@ def block_scores(monkeypatch):
 
 def test_finished_blocks_are_read_and_damaged_ones_computed_again(data, tmp_path, block_scores):
     scorer, settings = mfvpr.HistogramOfShifts(), sweeps.grid({"sigma": [9.0, 12.0, 20.0], "c": [None, 0.5]})
-    expected = sweeps.sweep(scorer, settings, *data)
+    expected = rank(scorer, settings, *data)
     block_scores.clear()
     chunks = {"settings_per_block": 1, "queries_per_block": 3, "folder": tmp_path}
     with pytest.raises(KeyboardInterrupt):
-        sweeps.sweep(scorer, settings, *data, track=interrupt_after(4), **chunks)
+        rank(scorer, settings, *data, runtime=mfvpr.Runtime(progress=lambda _: interrupt_after(4)), **chunks)
     assert len(block_scores) == 4
     for file, damage in zip(sorted(tmp_path.iterdir()), ("short", "empty", "flipped", None), strict=True):
         if damage:
             DAMAGE[damage](file)
     for _ in range(2):
-        np.testing.assert_array_equal(sweeps.sweep(scorer, settings, *data, **chunks), expected)
+        np.testing.assert_array_equal(rank(scorer, settings, *data, **chunks), expected)
         assert len(block_scores) == 9 + 3
     other = [{**setting, "sigma": setting["sigma"] + 1} for setting in settings]
-    sweeps.sweep(scorer, other, *data, **chunks)
+    rank(scorer, other, *data, **chunks)
     assert len(block_scores) == 9 + 3 + 9
 
 
 def test_one_program_per_shape_and_capacity(data, compilations):
     match_set, _ = data
     axes = {"sigma": [9.0, 22.5, 30.0], "bin_size": [12.5, 14.9, 15.0], "max_distance": [0.8, 2.0]}
-    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
+    rank(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
     compilations.reset()
     axes = {"sigma": [7.0, 21.5, 33.0], "bin_size": [12.4, 14.8, 15.1], "max_distance": [0.7, 1.0]}
-    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
+    rank(mfvpr.HistogramOfShifts(), sweeps.grid(axes), *data)
     assert compilations.count == 0
-    sweeps.sweep(mfvpr.HistogramOfShifts(), sweeps.grid(axes | {"bin_size": [8.0, 12.0, 12.1]}), *data)
+    rank(mfvpr.HistogramOfShifts(), sweeps.grid(axes | {"bin_size": [8.0, 12.0, 12.1]}), *data)
     assert 1 <= compilations.count <= 2 * len(shapes(match_set))  # two capacities
 
 
@@ -198,7 +205,6 @@ def test_the_largest_size_is_that_of_the_set_whatever_part_is_scored():
 
 def test_memory_is_told_beforehand(data):
     match_set, _ = data
-    assert sweeps.result_bytes(2, 10, 7, 3) == np.zeros((2, 10, 7, 3), np.int32).nbytes
     assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
     uneven, largest = (MatchSet([], np.array(counts), 320) for counts in ([[0, 9], [300, 300], [9, 9]], [[300, 300]]))
     many = 10**7  # settings, for which padding to one size would not pay
@@ -227,8 +233,8 @@ OTHER_DATA = {
 
 def sweep_with_folder(folder, scorer, settings, *data, **options):
     """Rows without a folder of blocks; those with it are the same."""
-    expected = sweeps.sweep(scorer, settings, *data, **options)
-    stored = sweeps.sweep(scorer, settings, *data, **options, folder=folder)
+    expected = rank(scorer, settings, *data, **options)
+    stored = rank(scorer, settings, *data, **options, folder=folder)
     np.testing.assert_array_equal(stored, expected, err_msg=str(options))
     return expected
 
@@ -279,12 +285,12 @@ def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
 
 def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
     settings = [{"place": 0}, {"place": 2}]
-    got = sweeps.sweep(Strongest(), settings, *data, folder=tmp_path)
+    got = rank(Strongest(), settings, *data, folder=tmp_path)
     for rows, setting in zip(got[0], settings, strict=True):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(Strongest(), setting, *data))
     sampled, settings = Sampled(jax.random.key(3)), [{"scale": 10.0}]
     for _ in range(2):
-        got = sweeps.sweep(sampled, settings, *data, folder=tmp_path)
+        got = rank(sampled, settings, *data, folder=tmp_path)
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
 
 
@@ -319,7 +325,7 @@ def test_a_number_named_as_retrievals_share_is_refused(data):
             return self.c * mfvpr.MatchCount()(matches)
 
     with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
-        sweeps.sweep(Score(), [{"c": 0.5}], *data)
+        rank(Score(), [{"c": 0.5}], *data)
 
 
 @pytest.mark.parametrize(
@@ -332,20 +338,54 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, block_scores):
     assert shapes(few) == shapes(match_set)
     for pairs in (match_set, few):
         listed = jax.tree.map(lambda rows: rows[: len(pairs.matches)], candidates)  # noqa: B023
-        sweeps.sweep(scorer, [{"max_distance": 2.0}], pairs, listed)
+        rank(scorer, [{"max_distance": 2.0}], pairs, listed)
     np.testing.assert_array_equal(block_scores[0][..., :2, :], block_scores[1])
 
 
 def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
     """Whoever ends the same sweep first removes the folder of blocks."""
-    settings, expected = [{"c": 0.5}], sweeps.sweep(mfvpr.MatchCount(), [{"c": 0.5}], *data)
+    settings, expected = [{"c": 0.5}], rank(mfvpr.MatchCount(), [{"c": 0.5}], *data)
     error = FileNotFoundError
 
     def write(*_):
         raise error(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sys.modules["mfvpr.tuning.sweeps.sweep"], "write_arrays", write)
-    np.testing.assert_array_equal(sweeps.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
+    monkeypatch.setattr(sys.modules["mfvpr.tuning.sweeps.rankings"], "write_arrays", write)
+    np.testing.assert_array_equal(rank(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
     error = OSError
     with pytest.raises(OSError, match="No space left"):
-        sweeps.sweep(mfvpr.MatchCount(), settings, *data, folder=tmp_path)
+        rank(mfvpr.MatchCount(), settings, *data, folder=tmp_path)
+
+
+@mfvpr.value
+class Slow:
+    """A scorer of another library that takes 20 ms for each call."""
+
+    share: float = 1.0
+
+    def __call__(self, matches):
+        raise NotImplementedError
+
+    def score_pairs(self, matches):
+        time.sleep(0.02)
+        return self.share * matches.mask.sum(axis=-1)
+
+
+def test_long_work_says_how_long_it_takes_and_advances_meanwhile(data):
+    lines, moves, settings = [], [], [{"share": float(share)} for share in range(1, 161)]
+
+    def track(items, total):
+        for item in items:
+            moves.append((time.perf_counter(), item + 1, total))
+            yield item
+
+    runtime = mfvpr.Runtime(log=lambda line: lines.append((time.perf_counter(), line)), progress=lambda _: track)
+    got = rank(Slow(), settings, *data, runtime=runtime)
+    [(start, line)], seconds = lines, time.perf_counter()
+    seconds -= start
+    expected = float(re.fullmatch(r"sweep: about (\d+) s", line)[1])
+    assert expected / 2 - 0.5 <= seconds <= 2 * expected + 0.5
+    times, numbers, totals = zip(*moves, strict=True)
+    assert max(np.diff([start, *times])) < 2
+    assert numbers[-1] == totals[-1]
+    np.testing.assert_array_equal(got, rank(Slow(), settings[:1], *data).repeat(160, axis=1))

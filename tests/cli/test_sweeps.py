@@ -1,0 +1,114 @@
+"""`mfvpr.sweep` as users of the library call it."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.evaluation import statistics
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.reranking import Fusion
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
+from mfvpr.tuning.sweeps import rankings
+
+pytestmark = pytest.mark.thorough
+
+AXES = {"sigma": [5, 10.0, 22.5], "weight": ["fs", "ratio"]}
+
+
+@mfvpr.value
+class MyScorer:
+    """Total weight of the matches, the less, the larger their shifts."""
+
+    sigma: float = 10.0
+    weight: mfvpr.Weight = mfvpr.UnitWeight()
+
+    def __call__(self, matches):
+        shifts, weights = mfvpr.match_shifts(matches), mfvpr.match_weights(self.weight, matches)
+        return (weights / (1 + (shifts**2).sum(axis=-1) / self.sigma**2)).sum()
+
+
+@pytest.fixture(scope="module")
+def sweep(dataset, tmp_path_factory):
+    """Sweeps the small street, whose matches are kept."""
+    cache = FeatureCache(tmp_path_factory.mktemp("store"))
+    return lambda system, **options: mfvpr.sweep(dataset, system, cache=cache, **{"thresholds": [0, 1]} | options)
+
+
+@pytest.fixture(scope="module")
+def swept(sweep, tmp_path_factory):
+    out = tmp_path_factory.mktemp("swept") / "s"
+    return out, sweep(MyScorer(), **AXES, split="both", out=out)
+
+
+def test_the_best_setting_is_honestly_named(swept):
+    _, result = swept
+    outcome = result.outcome
+    assert outcome.own == 6
+    assert outcome.axes.own == {"sigma": 10.0, "weight": "unit"}
+    tuning = outcome.protocol.tuning(outcome.rows)[:, :6, 1].mean(axis=0)
+    assert tuning[outcome.best] == tuning.max()
+    assert result.best == outcome.settings[outcome.best]
+    assert [*result.chosen] == ["first_half", "second_half"]
+    hits = outcome.protocol.reported_hits(outcome.rows, outcome.chosen)[1]
+    assert result.interval == statistics.estimate(hits)
+    assert repr(result).startswith("Sweep(folder, MyScorer: 6 settings of sigma, weight; best sigma = ")
+    assert len(repr(result)) < 200
+
+
+def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, monkeypatch, tmp_path):
+    out, result = swept
+    names = {"blocks", "figures", "results.json", "summary.txt", "table.csv", "table.md", "table.tex"}
+    assert {path.name for path in out.iterdir()} == names
+    assert (out / "table.csv").read_text() == result.table().csv()
+    assert json.loads((out / "results.json").read_text())["axes"] == AXES
+    assert [path.name for path in (out / "figures").iterdir()] == ["sigma_weight.png"]
+    monkeypatch.setattr(rankings, "block_scores", lambda *_: pytest.fail("computed again"))
+    assert str(sweep(MyScorer(), **AXES, split="both", out=out).table()) == str(result.table())
+    figure = result.plot("weight", "sigma")
+    assert [figure.axes[0].get_ylabel(), figure.axes[0].get_xlabel()] == ["weight", "sigma"]
+    assert result.plot("sigma").axes[0].get_xlabel() == "sigma"
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(mfvpr.InputError, match=r"pip install 'mfvpr\[pandas\]'"):
+        result.to_pandas()
+
+
+def test_a_system_that_ranks_by_a_fused_score_is_swept_by_it(sweep):
+    sift = Sift()
+    pipeline = mfvpr.Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+    scorers = {"mine": MyScorer()}
+    fused = mfvpr.System(pipeline, scorers, {"mine": Fusion(c=30.0)}, final="mine + retrieval")
+    by_system = sweep(fused, sigma=[5, 22.5])
+    assert by_system.outcome.axes.own == {"c": 30.0, "sigma": 10.0}
+    explicit = sweep(MyScorer(), c=[30.0], sigma=[5, 22.5])
+    np.testing.assert_array_equal(by_system.outcome.rows[:, :2], explicit.outcome.rows[:, :2])
+    alone = sweep(mfvpr.System(pipeline, scorers), sigma=[5, 22.5])
+    assert "c" not in alone.best
+    assert (alone.outcome.rows[:, :2] != explicit.outcome.rows[:, :2]).any()
+    zscore = mfvpr.System(pipeline, scorers | {"other": MyScorer()})
+    with pytest.raises(mfvpr.InputError, match=r"only scorer, .* got one of mine, other that ranks by mine"):
+        sweep(zscore, sigma=[5])
+
+
+@mfvpr.value
+class Clashing(MyScorer):
+    out: float = 1.0
+
+
+@pytest.mark.parametrize(("scorer", "options", "words"), [
+    (MyScorer(), {}, "sweep: expected at least one axis"),
+    (MyScorer(), {"sgma": [1]}, "sgma: expected a parameter of MyScorer, of sigma, weight, max_distance, c"),
+    (MyScorer(), {"weight": ["ratoi"]}, "weight='ratoi': expected one of fs, dmf, ratio, unit"),
+    (MyScorer, {"sigma": [1]}, r"write MyScorer\(\.\.\.\)"),
+    (Clashing(), {"sigma": [1]}, r"Clashing\.out: mfvpr\.sweep means something else by out"),
+    (MyScorer(), {"sigma": [1], "split": "half"}, "split=half: expected one of"),
+    (MyScorer(), {"sigma": [1], "out": __file__}, "out=.*: expected a new or empty folder"),
+])  # fmt: skip
+def test_mistakes_are_one_line_before_any_work(dataset, monkeypatch, scorer, options, words):
+    monkeypatch.setattr("mfvpr.cli.sweeps.match_sequence", lambda *_, **__: pytest.fail("begun"))
+    with pytest.raises(mfvpr.InputError, match=words) as error:
+        mfvpr.sweep(dataset, scorer, **options)
+    assert "\n" not in str(error.value)
