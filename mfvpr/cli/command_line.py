@@ -58,12 +58,10 @@ def run(config: str) -> None:
             from mfvpr.cli import build  # imported with the job
 
             _set_up_jax(settings.pop("compiled"))
-            interruptible, multirun = (
-                on_interrupt(signal.default_int_handler),
-                is_multirun and _multirun_of(hydra_settings),
-            )
+            interruptible = on_interrupt(signal.default_int_handler)
+            multirun_job = is_multirun and _multirun_of(hydra_settings)
             with interruptible, in_settings(settings), _frozen_imports(), build.cluster(settings) as cluster:
-                job(settings | {"multirun": multirun, "command": command, "cluster": cluster})
+                job(settings | {"multirun": multirun_job, "command": command, "cluster": cluster})
 
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1

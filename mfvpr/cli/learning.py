@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mfvpr.cli import console, run_folder, stages, truth
+from mfvpr.cli import build, console, run_folder, stages, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.cli.stages import Images

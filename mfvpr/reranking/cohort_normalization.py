@@ -2,7 +2,7 @@
 
 Hubs are database images that score high with any query.
 
-    sequence = cohort_sequence(FeatureCache().contents(dataset.database), 5)
+    sequence = cohort_sequence(FeatureCache().recipes.contents(dataset.database), 5)
     cohort = match_sequence(dataset, sequence, system.pipeline)
     scores = score({"histogram": HistogramOfShifts()}, cohort.by_scale, cohort.candidates)["histogram"]
     strengths = hubness(cohort.candidates, scores, len(dataset.database))
