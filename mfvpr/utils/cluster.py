@@ -23,7 +23,7 @@ from mfvpr.utils.versions import versions
 
 BLOCK = 32  # rows of a task at most, which a killed worker loses
 _BLOCKS = 16  # tasks at least, if there are so many rows
-_LOGGING = {"logging": {"distributed.client": "critical", "distributed.scheduler": "critical"}}
+_LOGGING = {"distributed": "warning", "distributed.client": "critical", "distributed.scheduler": "critical"}
 _SETTINGS = {"distributed": {  # defaults of Dask
     "scheduler": {"no-workers-timeout": "30 minutes"},  # then a call ends with an error
     "nanny": {"pre-spawn-environ": {"DASK_LOGGING__DISTRIBUTED": "critical"}},  # the client raises errors of blocks
@@ -148,7 +148,7 @@ def _distributed() -> Any:
     try:
         from dask import config
 
-        config.update_defaults(_LOGGING)  # read by the next import
+        config.update_defaults({"logging": _LOGGING})  # read by the next import
         import distributed
     except ImportError:
         raise InputError("cluster: Dask Distributed is not installed; pip install 'mfvpr[cluster]'") from None
