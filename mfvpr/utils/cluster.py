@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from functools import lru_cache
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ from mfvpr.utils.versions import versions
 
 BLOCK = 32  # rows of a task at most, which a killed worker loses
 _BLOCKS = 16  # tasks at least, if there are so many rows
-_LOGGING = {"logging": {"distributed.client": "critical", "distributed.scheduler": "critical"}}
+_LOGGING = {"distributed": "warning", "distributed.client": "critical", "distributed.scheduler": "critical"}
 _SETTINGS = {"distributed": {  # defaults of Dask
     "scheduler": {"no-workers-timeout": "30 minutes"},  # then a call ends with an error
     "nanny": {"pre-spawn-environ": {"DASK_LOGGING__DISTRIBUTED": "critical"}},  # the client raises errors of blocks
@@ -114,7 +115,8 @@ class Cluster:
 
         try:
             client.wait_for_workers(1)
-            value = client.submit(tuple, shared, pure=False)  # Dask repeats a task if its worker dies; not `scatter`
+            packed = distributed.protocol.pickle.dumps(shared)  # once: networks in use cannot pass between workers
+            value = client.submit(bytes, packed, pure=False)  # Dask repeats a task if its worker dies; not `scatter`
             futures |= {client.submit(_run, versions(), function, value, block, pure=False): block for block in blocks}
             for _ in track(finished_rows(), len(rows)):
                 pass
@@ -131,17 +133,22 @@ class Cluster:
         return results
 
 
-def _run(expected: dict[str, str], function: Callable[..., Any], shared: tuple[Any, ...], block: Sequence[int]) -> Any:
+def _run(expected: dict[str, str], function: Callable[..., Any], packed: bytes, block: Sequence[int]) -> Any:
     if (installed := versions()) != expected:
         raise InputError(f"cluster: expected workers with {expected}, got {installed}; install the same versions")
-    return function(*shared, block)
+    return function(*_unpack(packed), block)
+
+
+@lru_cache(maxsize=1)  # so that all blocks share compiled programs
+def _unpack(packed: bytes) -> tuple[Any, ...]:
+    return _distributed().protocol.pickle.loads(packed)
 
 
 def _distributed() -> Any:
     try:
         from dask import config
 
-        config.update_defaults(_LOGGING)  # read by the next import
+        config.update_defaults({"logging": _LOGGING})  # read by the next import
         import distributed
     except ImportError:
         raise InputError("cluster: Dask Distributed is not installed; pip install 'mfvpr[cluster]'") from None

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,11 +33,12 @@ def die_once(flag):
 
 @dataclass(frozen=True)
 class FatalSift(Sift):
-    """Kills the first worker that describes images, or without a flag every worker."""
+    """Kills the first worker that describes images, or without a flag every worker; in use, it cannot be pickled."""
 
     flag: str | None = None
 
     def __call__(self, images):
+        self.__dict__["program"] = threading.Lock()
         die_once(self.flag) if self.flag else os.kill(os.getpid(), signal.SIGKILL)
         return super().__call__(images)
 
@@ -94,6 +96,7 @@ def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset
 def test_a_killed_worker_costs_time_alone(dataset, cluster, flag, tmp_path, stage):
     fatal = {"describing": {"extractor": FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3, flag=flag)},
              "matching": {"matcher": FatalMatcher(flag)}}  # fmt: skip
+    vars(fatal["describing"]["extractor"])["program"] = threading.Lock()  # as after its use in this process
     cache = FeatureCache(tmp_path / "store", runtime=Runtime(cluster=cluster))
     result = evaluate(dataset, system_of(**fatal[stage]), cache=cache)
     assert not Path(flag).exists()
