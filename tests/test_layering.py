@@ -40,7 +40,7 @@ PERMISSIONS = {
     },
     "cli": {
         "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "report", "reranking",
-        "scoring", "storage", "systems", "tuning", "types", "utils",
+        "retrieval", "scoring", "storage", "systems", "tuning", "types", "utils",
     },
 }  # fmt: skip
 LIBRARIES = {

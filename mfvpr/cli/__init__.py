@@ -10,7 +10,7 @@ systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text, word
 that follow from scorers). Settings are checked and become systems in `mfvpr.systems`; other values in build, truth and
 confidences. Jobs share stages, run_folder, axes, console.
 
-Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, scoring,
+Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, retrieval, scoring,
 storage, systems, tuning, types, utils.
 """
 
