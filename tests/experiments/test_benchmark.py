@@ -99,28 +99,6 @@ def test_report_has_everyone(contest):
         assert wanted in remarks
 
 
-def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, capsys):
-    from experiments.benchmark import scale
-    from experiments.benchmark.synthetic_features import SyntheticSet
-
-    data = SyntheticSet(60, 3, 60, 16)
-    monkeypatch.setattr(scale, "SETS", [data])
-    scale.run(1, tmp_path / "out.json", tmp_path / "stores")
-    stores = {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
-    assert len(stores) == 60 + 3
-    content = json.loads((tmp_path / "out.json").read_text())
-    [row] = content["results"]
-    assert row["images"] == 60
-    assert row["same"] is True
-    assert row["recall"] == 1
-    assert row["rows"] == pytest.approx((60 + 3) / 3, abs=3)  # nearly all are somebody's candidates, and read once
-    assert row["peak"] > 0.1
-    assert 0 < row["steps"]["matching"] < row["total"][0]
-    assert "bit for bit: 60 images, D = 16: yes" in capsys.readouterr().out
-    data.stores(tmp_path / "stores")
-    assert stores == {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
-
-
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_is_a_module(name):
     assert callable(import_module(f"experiments.benchmark.{name}").run)
