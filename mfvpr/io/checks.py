@@ -51,3 +51,18 @@ def with_length(
         raise InputError(f"{where}: expected descriptors with a direction, got zeros at {int(norms.argmin())}")
     scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # unit length in float32: no bit changes
     return (descriptors / scale[:, None]).astype(np.float32)
+
+
+def convert_floats(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
+    """Convert to float32, or to float16 if `half`.
+
+    Raises:
+        InputError: a value is not finite in float16.
+    """
+    if not half:
+        return np.asarray(values, np.float32)
+    with np.errstate(over="ignore"):
+        halves = np.asarray(values, np.float16)
+    if not np.isfinite(halves).all():
+        raise InputError(f"{where}: expected values that float16 holds (up to 65504), got others; write float32")
+    return halves
