@@ -31,13 +31,10 @@ def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -
 def with_length(
     where: str, descriptors: Float[np.ndarray, "rows dimensions"], lengths: Lengths
 ) -> Float[np.ndarray, "rows dimensions"]:
-    """Check or scale the lengths of descriptors; the result is float32.
+    """Check or scale the lengths of finite descriptors, see `open_features`; the result is float32.
 
-    Args:
-        where: place of the descriptors, for messages.
-        descriptors: finite.
-        lengths: `unit`: require unit length within 1 %, and correct its rounding; `normalize`: scale to unit length,
-            which raises an InputError for a length of 0; `keep`: do not change the descriptors.
+    Raises:
+        InputError: a length is not 1, or is 0 where descriptors are scaled.
     """
     if lengths == "keep" or not len(descriptors):
         return descriptors

@@ -16,11 +16,7 @@ STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps
 
 
 class SsmVgg(nnx.Module):
-    """VGG16 to `conv5_2`.
-
-    Args:
-        precision: of products on hardware with less than float32.
-    """
+    """VGG16 to `conv5_2`; `precision` is of products on hardware with less than float32."""
 
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
         self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
