@@ -36,11 +36,7 @@ _FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations, and remove temporary files of a killed process.
-
-    Raises:
-        SettingsError: another process has the lock, or the folder cannot be made.
-    """
+    """Lock a folder for evaluations, and remove temporary files of a killed process; SettingsError if it is in use."""
     in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
         try:
@@ -88,11 +84,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
-    """Whether a run of these inputs is finished there.
-
-    Raises:
-        SettingsError: the finished run has other settings, images, weights or another version, or is damaged.
-    """
+    """Whether a run of these inputs is finished there; SettingsError for one of other inputs, or a damaged one."""
     if not is_finished(folder):
         return False
     for name in ("results.json", "run.json", SIZES):

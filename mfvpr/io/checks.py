@@ -13,11 +13,7 @@ EXACT = 1e-6  # the error of float32
 
 
 def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:
-    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32.
-
-    Raises:
-        InputError: the array has another type, or values that are not finite.
-    """
+    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32; InputError for others."""
     if array.dtype.kind not in kinds:
         raise InputError(f"{where}: expected {'floating-point ' if kinds == 'f' else ''}numbers, got {array.dtype}")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -31,11 +27,7 @@ def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -
 def with_length(
     where: str, descriptors: Float[np.ndarray, "rows dimensions"], lengths: Lengths
 ) -> Float[np.ndarray, "rows dimensions"]:
-    """Check or scale the lengths of finite descriptors, see `open_features`; the result is float32.
-
-    Raises:
-        InputError: a length is not 1, or is 0 where descriptors are scaled.
-    """
+    """Check or scale the lengths of finite descriptors, see `open_features`; the result is float32."""
     if lengths == "keep" or not len(descriptors):
         return descriptors
     norms = np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors, dtype=np.float64))
@@ -51,11 +43,7 @@ def with_length(
 
 
 def convert_floats(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
-    """Convert to float32, or to float16 if `half`.
-
-    Raises:
-        InputError: a value is not finite in float16.
-    """
+    """Convert to float32, or to float16 if `half`; InputError for a value that is not finite in float16."""
     if not half:
         return np.asarray(values, np.float32)
     with np.errstate(over="ignore"):

@@ -31,11 +31,7 @@ Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the n
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the page of a run folder, by default into it; returns its path.
-
-    Raises:
-        InputError: the folder is no run folder.
-    """
+    """Write the page of a run folder, by default into it, and return its path; InputError for other folders."""
     path, results = path or folder / PAGE, read_results(folder)
     if isinstance(results, dict):
         _write_search_page(folder, results, path)
