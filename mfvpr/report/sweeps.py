@@ -79,11 +79,7 @@ class Sweep:
         return settings_table(self.outcome)
 
     def to_pandas(self) -> "DataFrame":
-        """A row per setting: its values, and recall as fractions.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
+        """A row per setting: its values, and recall as fractions; InputError if pandas is not installed."""
         header, recalls = _recalls(self.outcome, range(len(self.outcome.settings)))
         rows = zip(self.outcome.settings, recalls.tolist(), strict=True)
         return data_frame([{**setting, **dict(zip(header, recall, strict=True))} for setting, recall in rows])
