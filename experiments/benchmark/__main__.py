@@ -8,15 +8,14 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from mfvpr.cli.launch import Parser, refuse, run_command
+from mfvpr.cli.launch import Parser, run_command
 
 PROGRAM = "python -m experiments.benchmark"
-# Module -> what it measures. A module's `run(rounds, out, **options)` prints tables and writes them as JSON to `out`.
+# Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
-    "scale": "databases of 1,000 to 10,000 images on disk: time per query and peak memory (3 rounds)",
 }
 
 
@@ -32,20 +31,14 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("benchmark", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")
     parser.add_argument("--rounds", type=positive_int, help="timed calls of each implementation (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default: runs/benchmark_BENCHMARK.json)")
-    parser.add_argument(
-        "--stores", type=Path, help="for scale: folder that keeps its features (default: 6 GB, deleted)"
-    )
     parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
-def run(benchmark: str, rounds: int | None, out: Path | None, stores: Path | None) -> None:
-    """Run a benchmark with the options that it takes."""
-    if stores and benchmark != "scale":
-        refuse(f"--stores is for scale alone; see {PROGRAM} --help")
+def run(benchmark: str, rounds: int | None, out: Path | None) -> None:
+    """Run a benchmark."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module = import_module(f"experiments.benchmark.{benchmark}")
-    options = {"stores": stores} if stores else {}
-    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"), **options)
+    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"))
 
 
 def positive_int(text: str) -> int:

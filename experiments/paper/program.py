@@ -115,11 +115,7 @@ def evaluate_all(
     settings: Mapping[str, Any],
     write_tables: Callable[[Mapping[str, Dataset]], None],
 ) -> tuple[dict[str, Dataset], list[str]]:
-    """Evaluate, and write tables of the data sets so far after each that has new evaluations.
-
-    Returns:
-        The data sets that could be read, and a line for each evaluation that failed.
-    """
+    """Evaluate, writing tables after each data set; return readable data sets, and a line per failed evaluation."""
     names = _names(rows)
     total, finished = len(places) * len(names), 0
     datasets: dict[str, Dataset] = {}

@@ -9,13 +9,17 @@ from typing import Any
 import jax
 from omegaconf import OmegaConf
 
-from experiments.paper.sizes import bytes_of_an_image
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder
 from mfvpr.cli.overrides import compose_program
+from mfvpr.cli.stages import Tools
+from mfvpr.datasets import ImageFolder
+from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
+from mfvpr.features.windows import WindowExtractor
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import write_json
+from mfvpr.retrieval import fit_to_database
 from mfvpr.systems.settings import SettingsError, check
 from mfvpr.utils.files import remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
@@ -25,16 +29,14 @@ from mfvpr.utils.versions import versions
 FIGURES = 2  # queries that each run draws
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
 _SHARED = ("cache", "memory", "devices")  # settings of both programs
+_FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
+_GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 _FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change no number
 
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations, and remove temporary files of a killed process.
-
-    Raises:
-        SettingsError: another process has the lock, or the folder cannot be made.
-    """
+    """Lock a folder for evaluations, and remove temporary files of a killed process; SettingsError if it is in use."""
     in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
         try:
@@ -82,11 +84,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
-    """Whether a run of these inputs is finished there.
-
-    Raises:
-        SettingsError: the finished run has other settings, images, weights or another version, or is damaged.
-    """
+    """Whether a run of these inputs is finished there; SettingsError for one of other inputs, or a damaged one."""
     if not is_finished(folder):
         return False
     for name in ("results.json", "run.json", SIZES):
@@ -115,6 +113,24 @@ def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
 
         run_folder.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
+
+
+def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
+    """Average bytes in float32 of what was already extracted: `local` features, and the `descriptor` of retrieval.
+
+    They are counted as in the paper: with detected keypoints, without those of a grid.
+    """
+    cache, pipeline = tools.cache, tools.pipeline
+    sources = cache.local(database, fit_to_database(pipeline.extractor, database, cache), [])  # extracts nothing
+    keypoint = 0 if isinstance(pipeline.extractor, _GRIDS) else _KEYPOINT
+    local = 0.0
+    for features in sources:
+        counts = features.source.counts
+        known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
+        local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
+    describer: Any = fit_to_database(pipeline.retriever, database, cache)  # all of the paper's have one
+    vectors = cache.vectors(database, describer.describer, database).values
+    return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}
 
 
 def read_json(path: Path) -> Any:

@@ -65,10 +65,7 @@ def convert(
 ) -> dict[str, np.ndarray]:
     """Convert a checkpoint's tensors to parameters by dotted path, float32 (float64 is rounded).
 
-    Args:
-        source: tensors by their keys in the checkpoint.
-        table: table of the network.
-        shapes: shapes of the network's parameters, by dotted path.
+    `source` has the tensors by their keys, `shapes` those of the network's parameters by dotted path.
 
     Raises:
         InputError: keys are missing or unknown, or a tensor has another shape or type.

@@ -116,14 +116,9 @@ def save(
     rounded: int = 0,
     folder: Path | None = None,
 ) -> Path:
-    """Write the arrays, then the manifest; `load` raises an error for a file without a manifest.
+    """Write the arrays by dotted path, then the manifest; `load` raises an error for a file without a manifest.
 
-    Args:
-        entry: of the weights.
-        arrays: arrays by dotted path.
-        source: the checkpoint of the arrays.
-        parameters, rounded: see `Manifest`.
-        folder: `weights_folder()` by default.
+    `source` is the checkpoint of the arrays; `parameters` and `rounded` are those of the manifest.
 
     Raises:
         InputError: values are not finite.

@@ -80,11 +80,7 @@ class Blueprint:
     _state: Any
 
     def build(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
-        """Build the network with these values, in evaluation mode.
-
-        Raises:
-            InputError: a path is missing or unknown, or a shape differs.
-        """
+        """Build the network with these values, in evaluation mode; InputError if paths or shapes differ."""
         import jax
         from flax import nnx
         from flax.traverse_util import unflatten_dict
@@ -114,9 +110,8 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
 
 def blueprint(entry: Entry) -> Blueprint:
     """Blueprint of the entry's network."""
-    return plan_network(
-        NETWORKS[entry.like or entry.name].builder()
-    )  # imports first: tracing would trace the module's constants
+    build = NETWORKS[entry.like or entry.name].builder()  # imports first: tracing would trace the module's constants
+    return plan_network(build)
 
 
 def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:

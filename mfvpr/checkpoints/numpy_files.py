@@ -14,12 +14,7 @@ _EXPECTED = "a dictionary of layers"
 
 
 def read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
-    """Read arrays by `layer.name`, read-only, in the file's own types.
-
-    Raises:
-        InputError: the file holds other content.
-        LookupError, TypeError, ValueError: the file is damaged.
-    """
+    """Read arrays by `layer.name`, read-only, in the file's own types; errors are those of `read_objects`."""
     match read_objects(file, _EXPECTED):
         case [dict() as layers] if layers:
             return _arrays(layers, file_size(file))

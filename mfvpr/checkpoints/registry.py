@@ -20,7 +20,6 @@ class Entry:
     sha256: str | None  # None where not published
     code_license: str
     weights_license: str
-    cite: str
     parameters: int  # without the running statistics of batch normalization
     like: str | None = None  # weights of one's own: the published entry of the same network
 
@@ -30,30 +29,18 @@ class Entry:
         return f"code {self.code_license}, weights {self.weights_license}"
 
 
-# fmt: off
-_PAPERS = {  # network -> licenses of the code and of the weights, and the paper
-    "d2net": ("BSD-3-Clause-Clear", "none stated", "Dusmanu et al., D2-Net: A Trainable CNN for Joint Description and "
-              "Detection of Local Features, CVPR 2019"),
-    "mixvpr": ("none stated", "none stated", "Ali-bey, Chaib-draa, Giguere, MixVPR: Feature Mixing for Visual Place "
-               "Recognition, WACV 2023"),
-    "aliked": ("BSD-3-Clause", "BSD-3-Clause", "Zhao et al., ALIKED: A Lighter Keypoint and Descriptor Extraction "
-               "Network via Deformable Transformation, IEEE TIM 2023"),
-    "lightglue": ("Apache-2.0", "Apache-2.0", "Lindenberger, Sarlin, Pollefeys, LightGlue: Local Feature Matching at "
-                  "Light Speed, ICCV 2023"),
-    "ssm": ("MIT (SSM-VPR)", "CC BY (Places365)", "Zhou et al., Places: A 10 Million Image Database for Scene "
-            "Recognition, TPAMI 2017"),
-    "netvlad": ("MIT", "MIT", "Arandjelovic et al., NetVLAD: CNN Architecture for Weakly Supervised Place Recognition, "
-                "CVPR 2016"),
-    "patch_netvlad": ("MIT", "MIT", "Hausler et al., Patch-NetVLAD: Multi-Scale Fusion of Locally-Global Descriptors "
-                      "for Place Recognition, CVPR 2021"),
-    "gem": ("MIT", "MIT", "Berton, Masone, Caputo, Rethinking Visual Geo-localization for Large-Scale Applications, "
-            "CVPR 2022"),
-    "dinov2": ("Apache-2.0", "Apache-2.0", "Oquab et al., DINOv2: Learning Robust Visual Features without Supervision, "
-               "TMLR 2024"),
-    "selavpr": ("MIT, Apache-2.0", "none stated", "Lu et al., Towards Seamless Adaptation of Pre-trained Models for "
-                "Visual Place Recognition, ICLR 2024"),
+_LICENSES = {  # network -> of the code and of the weights
+    "d2net": ("BSD-3-Clause-Clear", "none stated"),
+    "mixvpr": ("none stated", "none stated"),
+    "aliked": ("BSD-3-Clause", "BSD-3-Clause"),
+    "lightglue": ("Apache-2.0", "Apache-2.0"),
+    "ssm": ("MIT (SSM-VPR)", "CC BY (Places365)"),
+    "netvlad": ("MIT", "MIT"),
+    "patch_netvlad": ("MIT", "MIT"),
+    "gem": ("MIT", "MIT"),
+    "dinov2": ("Apache-2.0", "Apache-2.0"),
+    "selavpr": ("MIT, Apache-2.0", "none stated"),
 }
-# fmt: on
 _VGG16 = 14_714_688  # parameters of its convolutions
 _HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
 _NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
@@ -73,10 +60,9 @@ def _entry(
     published: tuple[int | None, str | None] = (None, None),
     license: str | None = None,
 ) -> Entry:
-    """Entry with the paper's licenses, or with `license` for both; size and sha256 if they are published."""
-    code_license, weights_license, cite = _PAPERS[network]
-    licenses = (license or code_license, license or weights_license)
-    return Entry(name, network, file, source, *published, *licenses, cite, parameters)
+    """Entry with the network's licenses, or with `license` for both; size and sha256 if they are published."""
+    licenses = (license, license) if license else _LICENSES[network]
+    return Entry(name, network, file, source, *published, *licenses, parameters)
 
 
 def _d2net(name: str) -> Entry:
@@ -182,7 +168,7 @@ def own_entry(name: str, like: str) -> Entry:
     """Entry of weights of one's own, for the network of the published weights `like`."""
     if not re.fullmatch(rf"{OWN}[\w-]+", name):
         raise InputError(f"{name.removeprefix(OWN)}: expected a name of letters, digits, - and _")
-    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-", "cite": "-"}
+    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-"}
     return replace(entry_of(like), name=name, file="FILE", like=like, **none)
 
 

@@ -39,7 +39,7 @@ def sweep(settings: dict[str, Any]) -> None:
         heading = _heading(settings, images, outcome)
         results = _results(settings, images, outcome, watch.seconds)
         run_folder.write_results(
-            folder, settings, truth.describe(settings, images.dataset), text=sweeps.summary_text(outcome, heading),
+            folder, settings, truth.describe(settings, images.dataset), text=sweeps.sweep_summary(outcome, heading),
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results), figures=sweeps.sweep_figures(outcome),
         )  # fmt: skip
     if blocks is not None:

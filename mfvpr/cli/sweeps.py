@@ -17,8 +17,6 @@ from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
 from mfvpr.utils import InputError, Runtime
 
-_TOLERANCES, _RADIUS = (1, 2, 5), 25.0  # frames, meters; as in conf/common.yaml
-
 
 def sweep(
     dataset: Dataset, system: System | Scorer, /, *, split: Split | None = None,
@@ -60,7 +58,7 @@ def sweep(
     if sequence.truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth to choose by, got none")
     if thresholds is None:
-        thresholds = sequence.truth.thresholds(tolerances=_TOLERANCES, radius=_RADIUS)
+        thresholds = sequence.truth.thresholds()
     protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
     runtime = runtime or cache.runtime
     kind = system.fused[name].retrieval_score if name in system.fused else "cosine"

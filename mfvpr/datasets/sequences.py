@@ -21,15 +21,10 @@ def own_rows(queries: Contents, database: Contents) -> OwnRows:
 
 
 def without_neighbors(sequence: QuerySequence, num_database: int, query_rows: OwnRows, neighbors: int) -> QuerySequence:
-    """Exclude each query and its neighbors within `neighbors` frames from the query's candidates.
+    """Exclude each query and its neighbors within `neighbors` frames from the query's candidates; 0 = the query alone.
 
-    Excluded images are not correct either: a query without other correct images counts as a failure.
-
-    Args:
-        sequence: queries from the database, which is a sequence.
-        num_database: N.
-        query_rows: `own_rows` of queries and database.
-        neighbors: in frames; 0 = exclude the query itself only.
+    Excluded images are not correct either: a query without other correct images counts as a failure. `query_rows` are
+    `own_rows` of queries and database, which is a sequence of `num_database` images.
 
     Raises:
         InputError: no query is among the database images, so that their frame numbers are unknown.

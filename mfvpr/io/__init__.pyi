@@ -10,6 +10,5 @@ __all__ = [
 ]
 
 from .descriptors import read_global_descriptors, write_global_descriptors
-from .feature_files import write_features
-from .features import ImportedFeatures, open_features
+from .features import ImportedFeatures, open_features, write_features
 from .shortlists import read_shortlist, reranked_shortlist, write_shortlist

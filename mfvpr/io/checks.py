@@ -13,11 +13,7 @@ EXACT = 1e-6  # the error of float32
 
 
 def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:
-    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32.
-
-    Raises:
-        InputError: the array has another type, or values that are not finite.
-    """
+    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32; InputError for others."""
     if array.dtype.kind not in kinds:
         raise InputError(f"{where}: expected {'floating-point ' if kinds == 'f' else ''}numbers, got {array.dtype}")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -31,14 +27,7 @@ def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -
 def with_length(
     where: str, descriptors: Float[np.ndarray, "rows dimensions"], lengths: Lengths
 ) -> Float[np.ndarray, "rows dimensions"]:
-    """Check or scale the lengths of descriptors; the result is float32.
-
-    Args:
-        where: place of the descriptors, for messages.
-        descriptors: finite.
-        lengths: `unit`: require unit length within 1 %, and correct its rounding; `normalize`: scale to unit length,
-            which raises an InputError for a length of 0; `keep`: do not change the descriptors.
-    """
+    """Check or scale the lengths of finite descriptors, see `open_features`; the result is float32."""
     if lengths == "keep" or not len(descriptors):
         return descriptors
     norms = np.sqrt(np.einsum("nd,nd->n", descriptors, descriptors, dtype=np.float64))
@@ -51,3 +40,14 @@ def with_length(
         raise InputError(f"{where}: expected descriptors with a direction, got zeros at {int(norms.argmin())}")
     scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # unit length in float32: no bit changes
     return (descriptors / scale[:, None]).astype(np.float32)
+
+
+def convert_floats(where: str, values: Shaped[np.ndarray, "*shape"], half: bool) -> Float[np.ndarray, "*shape"]:
+    """Convert to float32, or to float16 if `half`; InputError for a value that is not finite in float16."""
+    if not half:
+        return np.asarray(values, np.float32)
+    with np.errstate(over="ignore"):
+        halves = np.asarray(values, np.float16)
+    if not np.isfinite(halves).all():
+        raise InputError(f"{where}: expected values that float16 holds (up to 65504), got others; write float32")
+    return halves

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mfvpr.io.checks import Lengths, as_float32, with_length
+from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
-from mfvpr.io.feature_files import convert_floats
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz

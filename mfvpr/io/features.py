@@ -1,4 +1,4 @@
-"""Read local features that other programs extracted.
+"""Read local features that other programs extracted, and write features for other programs.
 
     features = open_features(Path("feats-d2net-ss.h5"), dataset.database.names)
     for row, image_features in features.read([3, 14]):
@@ -19,17 +19,17 @@ extracts them from a smaller one. float16 becomes float32; positions that hloc r
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from mfvpr.io.checks import Lengths, as_float32, with_length
+from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import Container, Contents, FileEntry, choose_reader, shorten
-from mfvpr.io.h5 import H5File
-from mfvpr.io.names import match_names, require_all
-from mfvpr.io.npz import NpzFile, NpzFolder
+from mfvpr.io.h5 import H5File, write_h5
+from mfvpr.io.names import match_names, require_all, require_different
+from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError, require_word
 
@@ -162,6 +162,38 @@ def open_features(
     )
 
 
+def write_features(
+    path: Path | str, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
+) -> None:
+    """Write features without padding, one image after the other; `open_features` reads them back.
+
+    Each file is written completely or not at all.
+
+    Args:
+        path: `.h5` or `.hdf5`: as hloc, descriptors `[D, N]`; `.npz`: one file with arrays named `image/part`,
+            descriptors `[N, D]`; another name: a folder with `image.npz` for each image, arrays named by their part.
+        names: `[M]` names of the images; hloc expects paths below its image folder.
+        rows: (row, features) pairs, as from `ImportedFeatures.read`.
+        half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
+
+    Raises:
+        InputError: a value is too large for float16, a name is no path below a folder, or two images share a name.
+    """
+    path = Path(path)
+    require_different(path, names)
+    parts = ((names[row], _arrays_of(names[row], features, half)) for row, features in rows)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        write_h5(path, ((name, arrays | {"descriptors": arrays["descriptors"].T}) for name, arrays in parts))
+    elif path.suffix.lower() == ".npz":
+        write_npz(path, ((f"{name}/{part}", array) for name, arrays in parts for part, array in arrays.items()))
+    else:
+        for name, arrays in parts:
+            inside = PurePosixPath(name)
+            if not inside.parts or inside.is_absolute() or ".." in inside.parts:
+                raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
+            write_npz(path / f"{name}.npz", arrays.items())
+
+
 def open_container(path: Path) -> Container:
     """Open a folder, or a file by its suffix."""
     if path.is_dir():
@@ -251,3 +283,12 @@ def _require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None
         x, y = keypoints[int(outside.argmax())].tolist()
         raise InputError(f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, "
                          f"got ({x:g}, {y:g}); check image_size (width, height)")  # fmt: skip
+
+
+def _arrays_of(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:
+    mask, size = np.asarray(features.mask), np.asarray(features.image_size)
+    arrays = {
+        part: convert_floats(f"{shorten(name)}: {part}", np.asarray(getattr(features, part))[mask], half)
+        for part in ("keypoints", "descriptors", "scores")
+    }
+    return arrays | {"image_size": size.astype(np.int64) if (size == np.round(size)).all() else size}

@@ -65,10 +65,8 @@ def require_one_image(
 ) -> None:
     """Raise an InputError if an entry of a file stands for two images, unless both paths lead to one file.
 
-    Args:
-        path: file or folder, for messages.
-        images, entries: `[M]` paths of a folder's images, and their entries; None = the file lacks the image.
-        known: images of the entries of earlier folders; the images of this folder are added.
+    `images` and `entries` `[M]` are of a folder; None = the file lacks the image. They are added to `known`, the images
+    of the entries of earlier folders.
     """
     for image, entry in zip(images, entries, strict=True):
         if entry is None:

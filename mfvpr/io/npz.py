@@ -81,11 +81,7 @@ class NpzFolder(Container):
 
 
 def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the arrays among `parts` that the archive has.
-
-    Raises:
-        InputError: the file is no archive or damaged, or an array holds objects.
-    """
+    """Read the arrays among `parts` that the archive has; InputError if it is damaged, or holds objects."""
     with _open_archive(path) as archive:
         return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
 

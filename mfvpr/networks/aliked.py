@@ -110,10 +110,9 @@ class Aliked(nnx.Module):
     def __call__(
         self, images: Images
     ) -> tuple[Float[Array, "batch height width dimensions"], Float[Array, "batch height width"]]:
-        """Features of unit length and scores in (0, 1) of all pixels.
+        """Features of unit length and scores in (0, 1) of all pixels of RGB images, 0 .. 1.
 
-        Args:
-            images: RGB, 0 .. 1. Border pixels are repeated to make the sides multiples of 32.
+        Border pixels are repeated to make the sides multiples of 32.
         """
         levels, scores = self.levels(images)
         return jax.vmap(lambda levels: field(levels, *_inside(images)).dense())(levels), scores

@@ -62,12 +62,7 @@ class Conv3x3(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width inputs"], uniform: bool | Bool[Array, ""] = False
     ) -> Float[Array, "batch height width outputs"]:
-        """Convolve a map.
-
-        Args:
-            x: the input.
-            uniform: whether equal neighborhoods must give equal bits, which takes 1.5 times as long.
-        """
+        """Convolve a map; if `uniform`, equal neighborhoods give equal bits, which takes 1.5 times as long."""
         kernel, options = self.kernel[...], {"dilation": self.dilation, "precision": self.precision}
         direct, on_cpu = partial(_convolve, above=self.dilation, **options), partial(winograd, **options)
 

@@ -1,7 +1,8 @@
-"""The networks of SSM-VPR (Camara et al., ICRA 2020): two maps of one VGG16, trained on Places365.
+"""The networks of SSM-VPR (Camara et al., ICRA 2020): two maps of one VGG16.
 
-The first stage, which chooses the shortlist, uses `conv5_2`; the second stage, which ranks it, uses `conv4_2`; both
-before their ReLU. Pooling rounds sizes up, so a map has ceil(H / stride) x ceil(W / stride) positions.
+It was trained on Places365 (Zhou et al., TPAMI 2017). The first stage, which chooses the shortlist, uses `conv5_2`;
+the second stage, which ranks it, uses `conv4_2`; both before their ReLU. Pooling rounds sizes up, so a map has
+ceil(H / stride) x ceil(W / stride) positions.
 """
 
 from flax import nnx
@@ -16,11 +17,7 @@ STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps
 
 
 class SsmVgg(nnx.Module):
-    """VGG16 to `conv5_2`.
-
-    Args:
-        precision: of products on hardware with less than float32.
-    """
+    """VGG16 to `conv5_2`; `precision` is of products on hardware with less than float32."""
 
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
         self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)

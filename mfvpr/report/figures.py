@@ -46,15 +46,10 @@ def histogram_figure(
     pixel_aspect: float = 1.0,
     about: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the figure of one query.
+    """Write the figure of one query, with candidates one below the other, their histograms in the same colors.
 
-    Args:
-        path: PNG file to write.
-        query_image: at the size that the points refer to.
-        candidates: one below the other, their histograms in the same colors.
-        title: above everything.
-        pixel_aspect: height of a pixel by its width, so that images are drawn in the shape that they were taken in.
-        about: what it shows, for programs: text by keyword, in the file itself.
+    The query's image has the size that the points refer to. `pixel_aspect` is the height of a pixel by its width, so
+    that images are drawn in the shape that they were taken in. `about` is text by keyword in the file, for programs.
     """
     count = len(candidates)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))

@@ -21,7 +21,7 @@ from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.file_names import file_names
 from mfvpr.report.runs import claim_run_folder, write_table
-from mfvpr.report.tables import Table
+from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import Runtime
@@ -129,11 +129,7 @@ class Result:
 
     def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
         """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold."""
-        try:
-            import pandas
-        except ImportError:
-            raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
-        return pandas.DataFrame([
+        return data_frame([
             {"data set": dataset, "system": system, "score": score, "decides": score == report.headline}
             | {name: value for name, value in row.items() if name != "recall_at"}
             | {f"R@{k}": recall for k, recall in row["recall_at"].items()}

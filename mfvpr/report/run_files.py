@@ -1,24 +1,31 @@
 """Files of the run folder of an evaluation: of `mfvpr evaluate`, and of `save` of a result in Python."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
 
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.features.extractor import Source
 from mfvpr.report.confidences import CalibratedPredictions, write_confidence
 from mfvpr.report.differences import write_gains
 from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings, write_skipped
+from mfvpr.report.rankings import format_number, write_csv
 from mfvpr.report.runs import write_about, write_json, write_table, writing
-from mfvpr.report.shifts import write_shifts
 from mfvpr.reranking.fusion import FinalScore, Fusion
+from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.storage.extraction import open_sinks
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.versions import versions
+
+SHIFTS = ("query", "prediction", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale")  # of shifts.csv
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,38 @@ def write_run_folder(folder: Path, calibrated: CalibratedPredictions, descriptio
     if report.histogram is not None:
         write_shifts(folder, report, report.histogram, refused)
     write_skipped(folder, report.ranked)
+
+
+def write_shifts(
+    folder: Path,
+    evaluation: EvaluationReport,
+    scorer: HistogramOfShifts,
+    refused: Sequence[Bool[np.ndarray, " _"]] | None = None,
+) -> None:
+    """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
+
+    A line has the refined dominant shift of the query's middle in the images that the detector saw, its 95 % interval,
+    and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
+    `refused` are queries of each sequence, which have no line; None = no query is refused.
+    """
+    names = evaluation.ranked.dataset.database.names
+    sequences = zip(evaluation.ranked.matched, evaluation.ranked.systems[evaluation.headline], strict=True)
+    for place, (matched, ranked) in enumerate(sequences):
+        match_set = matched.by_scale
+        if isinstance(match_set, Scales):
+            continue
+        predictions = ranked.rows[:, 0]
+        has_prediction = predictions >= 0
+        queries = np.flatnonzero(has_prediction if refused is None else has_prediction & ~refused[place])
+        places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
+        shifts, intervals, scales = dominant_shifts(scorer, match_set, queries, places)
+        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None]], axis=1)
+        lines = [
+            [matched.sequence.images.names[query], names[predictions[query]],
+             *("" if np.isnan(value) else format_number(value) for value in row)]
+            for query, row in zip(queries, numbers, strict=True)
+        ]  # fmt: skip
+        write_csv(evaluation.folder(folder, place) / "shifts.csv", SHIFTS, lines)
 
 
 def ground_truth(report: EvaluationReport, description: RunDescription) -> dict[str, Any]:

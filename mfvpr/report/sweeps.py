@@ -18,14 +18,14 @@ from mfvpr.report import runs
 from mfvpr.report.file_names import file_names
 from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
 from mfvpr.report.runs import Figure
-from mfvpr.report.tables import Table, format_value
+from mfvpr.report.tables import Table, data_frame, format_value
 from mfvpr.tuning.sweeps.outcome import Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions
 
 if TYPE_CHECKING:
-    import pandas
+    from pandas import DataFrame
 
 TOP = 10
 MAX_HEAT_MAPS = 6
@@ -78,19 +78,11 @@ class Sweep:
         """Recall in % by every setting."""
         return settings_table(self.outcome)
 
-    def to_pandas(self) -> "pandas.DataFrame":
-        """A row per setting: its values, and recall as fractions.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError:
-            raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
-        header, recall = _recalls(self.outcome, range(len(self.outcome.settings)))
-        frames = [pandas.DataFrame(self.outcome.settings), pandas.DataFrame(recall, columns=header)]
-        return pandas.concat(frames, axis="columns")
+    def to_pandas(self) -> "DataFrame":
+        """A row per setting: its values, and recall as fractions; InputError if pandas is not installed."""
+        header, recalls = _recalls(self.outcome, range(len(self.outcome.settings)))
+        rows = zip(self.outcome.settings, recalls.tolist(), strict=True)
+        return data_frame([{**setting, **dict(zip(header, recall, strict=True))} for setting, recall in rows])
 
     def plot(self, *names: str) -> Canvas:
         """A heat map of recall@1 over one or two axes, the other axes at the best setting: `plot("sigma", "weight")`.
@@ -117,13 +109,8 @@ class Sweep:
 def write_sweep(folder: Path, outcome: Outcome, heading: str, results: Mapping[str, Any]) -> None:
     """Write table, summary.txt and results.json of a sweep."""
     runs.write_table(folder, settings_table(outcome), heading)
-    write_text(folder / "summary.txt", f"{summary_text(outcome, heading)}\n")
+    write_text(folder / "summary.txt", f"{sweep_summary(outcome, heading)}\n")
     runs.write_json(folder / "results.json", results)
-
-
-def summary_text(outcome: Outcome, heading: str) -> str:
-    """The summary below a heading."""
-    return f"{heading}\n\n{sweep_summary(outcome)}"
 
 
 def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Table:
@@ -176,13 +163,14 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
     return json.loads(json.dumps(values, default=str))  # weights that are no words
 
 
-def sweep_summary(outcome: Outcome) -> str:
-    """The best settings, the chosen ones, and their recall on the queries to report on."""
+def sweep_summary(outcome: Outcome, heading: str) -> str:
+    """The best settings below a heading, the chosen ones, and their recall on the queries to report on."""
     protocol, defaults = outcome.protocol, outcome.own
     best = np.argsort(-outcome.recall[:, protocol.main], kind="stable")[:TOP].tolist()
     note = "" if defaults in best else "; last: the scorer's own values"
     shown = list(dict.fromkeys([*best, defaults]))
     parts = [
+        f"{heading}\n",
         f"Best settings by {protocol.label(1, protocol.thresholds[protocol.main])}, all queries{note}.",
         settings_table(outcome, shown).text(),
     ]

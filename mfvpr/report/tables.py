@@ -2,11 +2,16 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from mfvpr.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,15 @@ class Table:
         columns = "l" * self.text_columns + "r" * (len(self.header) - self.text_columns)
         body = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
         return "\n".join([*body, r"\end{tabular}", ""])
+
+
+def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
+    """Rows by column as a `DataFrame`; InputError if pandas is not installed."""
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
+    return pandas.DataFrame(rows)
 
 
 def format_value(value: Any) -> str:

@@ -153,7 +153,6 @@ def test_version(succeed, program):
     ("localize", ["map=a", "images=b", "route=-2000"], "route=-2000: expected a number from -1000 to 1000, or null"),
     ("benchmark.__main__", ["foo"], "invalid choice: 'foo'"),
     ("benchmark.__main__", ["--rounds", "0"], "expected a whole number above 0, got 0; see python -m experiments.ben"),
-    ("benchmark.__main__", ["--stores", "a"], "--stores is for scale alone; see python -m experiments.benchmark --he"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_leave_nothing(refuse_at_once, program, arguments, words):
     error = refuse_at_once(program, *arguments)

@@ -1,4 +1,4 @@
-"""The networks of the benchmark do the same on both sides, so that equals are compared."""
+"""The networks of the benchmark do the same in torch, so that equals are compared."""
 
 import json
 from functools import partial
@@ -26,7 +26,7 @@ def contest(tmp_path_factory):
     torch.set_num_threads(1)  # several wait for each other when other processes take their cores
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
-        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",), "BLOCKS": 2,
+        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",),
                  "PLACES_SIZE": (160, 128), "SELAVPR_SIZE": (42, 28)}  # fmt: skip
         narrow = Network(lambda: partial(SelaVpr, 128, 2, 2), SELAVPR)
         patch.setitem(NETWORKS, networks.SELAVPR, narrow)
@@ -46,9 +46,8 @@ def peers(contest, step):
     return ours, by_name.values()
 
 
-@pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
-def test_keypoints_are_the_same(contest, step):
-    ours, all_theirs = peers(contest, f"{step} features")
+def test_keypoints_are_the_same(contest):
+    ours, all_theirs = peers(contest, "D2-Net features")
     assert len(ours) == 2
     for theirs in all_theirs:
         for features, expected in zip((image.features for image in ours), theirs, strict=True):
@@ -70,24 +69,10 @@ def test_dense_maps_are_the_same(contest):
         np.testing.assert_allclose(ours, np.stack([np.asarray(dense) for dense in theirs]), atol=1e-4 * ours.max())
 
 
-@pytest.mark.parametrize("step", ["MixVPR descriptor", "NetVLAD descriptor", "generalized mean of ResNet-50"])
-def test_global_descriptors_are_the_same(contest, step):
-    ours, all_theirs = peers(contest, step)
+def test_global_descriptors_are_the_same(contest):
+    ours, all_theirs = peers(contest, "MixVPR descriptor")
     for theirs in all_theirs:
         np.testing.assert_allclose([image.vector for image in ours], theirs, atol=1e-5)
-
-
-@pytest.mark.parametrize("step", [
-    "Patch-NetVLAD features, sizes 5, 512 dimensions", "Patch-NetVLAD features, sizes 2, 5, 8, 4096 dimensions",
-    "SelaVPR features",
-])  # fmt: skip
-def test_local_descriptors_are_the_same(contest, step):
-    ours, all_theirs = peers(contest, step)
-    for theirs in all_theirs:
-        for description, (vector, *local) in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(description.vector, vector, atol=1e-5)
-            for features, expected in zip(description.local, local, strict=True):
-                np.testing.assert_allclose(features.descriptors.ravel(), expected.ravel(), atol=2e-5)
 
 
 def test_report_has_everyone(contest):
@@ -97,28 +82,6 @@ def test_report_has_everyone(contest):
     remarks = "\n".join(written["remarks"])
     for wanted in ("detection adds", "aliked-n16 features, batch 2: keypoints per image: mfvpr", "RTX 2080 Ti"):
         assert wanted in remarks
-
-
-def test_a_small_database_is_ranked_in_its_own_process(tmp_path, monkeypatch, capsys):
-    from experiments.benchmark import scale
-    from experiments.benchmark.synthetic_features import SyntheticSet
-
-    data = SyntheticSet(60, 3, 60, 16)
-    monkeypatch.setattr(scale, "SETS", [data])
-    scale.run(1, tmp_path / "out.json", tmp_path / "stores")
-    stores = {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
-    assert len(stores) == 60 + 3
-    content = json.loads((tmp_path / "out.json").read_text())
-    [row] = content["results"]
-    assert row["images"] == 60
-    assert row["same"] is True
-    assert row["recall"] == 1
-    assert row["rows"] == pytest.approx((60 + 3) / 3, abs=3)  # nearly all are somebody's candidates, and read once
-    assert row["peak"] > 0.1
-    assert 0 < row["steps"]["matching"] < row["total"][0]
-    assert "bit for bit: 60 images, D = 16: yes" in capsys.readouterr().out
-    data.stores(tmp_path / "stores")
-    assert stores == {path: path.stat().st_mtime_ns for path in (tmp_path / "stores").rglob("*.npz")}
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)

@@ -10,7 +10,7 @@ from mfvpr import HistogramOfShifts
 from mfvpr.cli import evaluation, stages
 from mfvpr.evaluation.stages import dominant_shifts
 from mfvpr.matching import MatchSet
-from mfvpr.report.shifts import HEADER
+from mfvpr.report.run_files import SHIFTS
 from mfvpr.utils import Stopwatch
 from tests.builders import make_matches, of_query
 from tests.programs import composed, csv_rows, shared, small
@@ -33,7 +33,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     lines, first = csv_rows(tmp_path / "out" / "shifts.csv"), {}
     for line in reversed(csv_rows(tmp_path / "out" / "predictions.csv")):
         first[line["query"]] = line
-    assert list(lines[0]) == list(HEADER)
+    assert list(lines[0]) == list(SHIFTS)
     assert [(line["query"], line["prediction"]) for line in lines] == [
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
@@ -45,7 +45,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     for row, line in enumerate(lines):
         place = list(candidates.indices[row]).index(names.index(line["prediction"]))
         pair = jax.tree.map(lambda leaf: leaf[place], matches[row])  # noqa: B023
-        numbers = [float(line[name]) for name in HEADER[2:]]
+        numbers = [float(line[name]) for name in SHIFTS[2:]]
         fitted = scorer.with_capacity(pair.image_size0, pair.image_size1)
         np.testing.assert_allclose(numbers[:2], fitted.dominant_shift(pair, refine=True), atol=0.02)
         np.testing.assert_allclose(np.reshape(numbers[2:6], (2, 2)).T, fitted.shift_interval(pair), atol=0.02)

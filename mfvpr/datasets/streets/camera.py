@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.datasets.streets.types import Floats, Rng
+from mfvpr.datasets.streets.colors import Floats, Rng
 
 NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 CAMERA_HEIGHT = 1.6  # meters

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera
-from mfvpr.datasets.streets.colors import ACCENTS, CARS, pick, tone
+from mfvpr.datasets.streets.colors import ACCENTS, CARS, Color, Rng, pick, tone
 from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, draw_glyphs, move, texture
-from mfvpr.datasets.streets.types import Color, Rng
 
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
 TRAFFIC = (

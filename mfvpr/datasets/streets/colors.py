@@ -1,9 +1,12 @@
-"""Palettes of the street, and arithmetic with colors."""
+"""Types of arrays and colors, palettes of the street, and arithmetic with colors."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from mfvpr.datasets.streets.types import Color, Rng
+Image = UInt8[np.ndarray, "_ _ _"]  # rows, columns, channels
+Floats = Float[np.ndarray, "..."]
+Color = tuple[int, int, int]  # RGB, 0..255
+Rng = np.random.Generator
 
 WALLS = ((226, 205, 160), (214, 170, 130), (196, 120, 96), (170, 184, 160), (176, 188, 200), (232, 224, 208),
          (205, 150, 140), (186, 160, 120), (150, 92, 78), (216, 190, 190))  # fmt: skip

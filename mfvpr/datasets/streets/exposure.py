@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.types import Floats, Image, Rng
+from mfvpr.datasets.streets.colors import Floats, Image, Rng
 from mfvpr.datasets.streets.weather import Weather
 
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.colors import ACCENTS, DARK, GLASS, ROOFS, TRIMS, WALLS, WARM, pick, tone
+from mfvpr.datasets.streets.colors import ACCENTS, DARK, GLASS, ROOFS, TRIMS, WALLS, WARM, Color, Rng, pick, tone
 from mfvpr.datasets.streets.sheets import Sheet, blotches, draw_glyphs
-from mfvpr.datasets.streets.types import Color, Rng
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from mfvpr.datasets.streets.colors import tone
+from mfvpr.datasets.streets.colors import Rng, tone
 from mfvpr.datasets.streets.sheets import Sheet, blotches, draw_glyphs
-from mfvpr.datasets.streets.types import Rng
 
 
 def draw_ground(rng: Rng, half_width: float, length: float) -> Sheet:

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from mfvpr.datasets.streets.camera import NEAR, Camera
+from mfvpr.datasets.streets.colors import Floats, Image
 from mfvpr.datasets.streets.sheets import Panel, Prop
-from mfvpr.datasets.streets.types import Floats, Image
 from mfvpr.datasets.streets.weather import Weather
 
 OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges

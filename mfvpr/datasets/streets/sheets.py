@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mfvpr.datasets.streets.colors import DARK, as_array, tone
-from mfvpr.datasets.streets.types import Color, Floats, Image, Rng
+from mfvpr.datasets.streets.colors import DARK, Color, Floats, Image, Rng, as_array, tone
 from mfvpr.datasets.streets.weather import Weather
 
 Texture = Callable[[Weather], Image]  # colors and opacity (RGBA) in a weather

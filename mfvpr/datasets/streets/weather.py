@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mfvpr.datasets.streets.types import Color
+from mfvpr.datasets.streets.colors import Color
 
 
 @dataclass(frozen=True)

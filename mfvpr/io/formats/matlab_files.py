@@ -38,9 +38,7 @@ class _Element(NamedTuple):
 def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
     """Read arrays by path: `variable.field.0.field`, with 0, 1, ... for elements of a cell or an array of structures.
 
-    Args:
-        file: an open file at its start.
-        text: also return lines of text, as arrays of one string.
+    If `text`, lines of text are read as well, as arrays of one string.
 
     Raises:
         InputError: the file has another version, is nested too deeply, or decompresses to too many bytes.

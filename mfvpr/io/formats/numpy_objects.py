@@ -97,13 +97,9 @@ class _ArrayUnpickler(DataUnpickler):
 
 
 def read_objects(file: BinaryIO, expected: str) -> list[Any]:
-    """Objects of an array with one axis, or the only object of an array without axes.
+    """Objects of an array with one axis, or the only object of an array without axes; `expected` is for messages.
 
     Arrays among the objects are `Array`; lists, dictionaries, text and numbers are themselves.
-
-    Args:
-        file: an open file at its start.
-        expected: the expected content, for messages.
 
     Raises:
         InputError: the file holds other content.

@@ -59,9 +59,8 @@ class Gains:
 class Prediction:
     """The first prediction of a system for a query, as texts of the files.
 
-    `outcome` is "correct", "incorrect", or "best" without ground truth. Without a prediction, `prediction`
-    and `score` are empty.
-    `rank` is of the first correct candidate, empty if there is none or if it is unknown.
+    `outcome` is "correct", "incorrect", or "best" without ground truth. Without a prediction, `prediction` and `score`
+    are empty. `rank` is of the first correct candidate, empty if there is none or if it is unknown.
     """
 
     system: str
@@ -171,11 +170,7 @@ def read_results(folder: Path, name: str = LAST) -> Any:
 
 
 def read_run(folder: Path) -> Run:
-    """Read and check the files of a run folder.
-
-    Raises:
-        InputError: there is no such folder, or its files are not those of an evaluation.
-    """
+    """Read and check the files of a run folder; InputError if they are not those of an evaluation."""
     results, about = read_results(folder), read_results(folder, "run.json")
     with errors_as_input_errors(folder):
         _check(results, about)

@@ -1,8 +1,10 @@
-"""The page of one run."""
+"""The page of one run: an evaluation, a sweep, a learning comparison, or the jobs of a multirun."""
 
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +12,9 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.evaluation.precision import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
-from mfvpr.report.pages.files import Gains, Run, read_results, read_run
+from mfvpr.report.pages.files import Gains, Run, errors_as_input_errors, read_results, read_run, read_table
 from mfvpr.report.pages.pictures import pictures
 from mfvpr.report.pages.rendering import PAGE, Gallery, Section, values_table, write_page
-from mfvpr.report.pages.searches import write_search_page
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
 
@@ -23,25 +24,43 @@ _CURVE_POINTS = 200
 _SIZES = {"queries": "queries", "database": "database images", "candidates": "candidates of a query",
           "bytes_per_image": "bytes on disk of an image's features, about"}  # fmt: skip
 _P_VALUES = (4, 7)  # columns of differences.csv
+_SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
+_IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
-    """Write the page of a run folder, by default into it; returns its path.
-
-    Raises:
-        InputError: the folder is no run folder.
-    """
+    """Write the page of a run folder, by default into it, and return its path; InputError for other folders."""
     path, results = path or folder / PAGE, read_results(folder)
     if isinstance(results, dict):
-        write_search_page(folder, results, path)
+        _write_search_page(folder, results, path)
         return path
     run = read_run(folder)
     sections = [_recall_section(run), *_differences_section(run)] if run.gains else []
     sections += [*_confidence_section(run), _predictions_section(run), _costs_section(run), _settings_section(run)]
     write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
     return path
+
+
+def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> None:
+    """Write the page of a sweep, of a learning comparison, or of the jobs of a multirun."""
+    with errors_as_input_errors(folder):
+        caption = next((caption for name, caption in _SEARCH_TABLES.items() if name in results), None)
+        if caption is None:
+            raise ValueError(f"results.json has no {', '.join(_SEARCH_TABLES)}")
+        heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
+        summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
+        figures = {file.stem: f"data:image/png;base64,{b64encode(file.read_bytes()).decode()}"
+                   for file in sorted((folder / "figures").glob("*.png"))}  # fmt: skip
+        tables = {caption: read_table(folder / "table.csv", None)}
+        about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
+    title, _, words = heading.partition(": ")
+    sections = [
+        Section("results", "Results", text=summary.removeprefix(heading).strip(), images=figures, tables=tables),
+        Section("settings", "Settings and versions", tables={"Run": about}),
+    ]
+    write_page(path, title=title, words=words, facts={}, sections=sections)
 
 
 def _title(run: Run) -> str:

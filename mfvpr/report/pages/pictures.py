@@ -29,11 +29,7 @@ class Picture:
 
 
 def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
-    """Figures of queries in a run folder, by the names of their files; evenly chosen if there are more than `most`.
-
-    Raises:
-        InputError: a figure cannot be read.
-    """
+    """Figures of queries in a run folder, by the names of their files; evenly chosen if there are more than `most`."""
     paths = sorted((run / "figures").rglob("*_[0-9]*.png"))
     step = max(1, -(-len(paths) // most))
     return [picture for path in paths[::step] for picture in _pictures(path)]

@@ -24,11 +24,7 @@ from mfvpr.utils.errors import InputError
 
 
 def write_comparison(folders: Sequence[Path], path: Path) -> None:
-    """Write a page of several runs side by side.
-
-    Raises:
-        InputError: a folder is named twice, or is no run folder of an evaluation.
-    """
+    """Write a page of several runs side by side; InputError for a folder twice, or of no evaluation."""
     runs = dict(zip(_labels(folders), map(read_run, folders), strict=True))
     evaluation = {label: run for label, run in runs.items() if run.gains}
     sections = [_overview(runs), *([_recall(evaluation), _pairs(runs)] if evaluation else []), _settings(runs)]
