@@ -12,7 +12,7 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
-from mfvpr.cli import build
+from mfvpr.systems import assembly
 from mfvpr.cli.launch import one_line
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
@@ -160,9 +160,9 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
     assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (
         "tiny", "no", "own/mine", ["yours,", "as", "tiny"], "yes"
     )  # fmt: skip
-    assert build._network("features", ("tiny",), "own/mine").conv is not None
+    assert assembly._network("features", ("tiny",), "own/mine").conv is not None
     with pytest.raises(InputError, match=r"features.weights=tiny\b.*|tiny: not installed"):
-        build._network("features", ("tiny",), "tiny")
+        assembly._network("features", ("tiny",), "tiny")
 
 
 def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypatch):

@@ -39,7 +39,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     ]
     tools, images = stages.prepare(settings, Stopwatch())
     matches, candidates = stages.match_data_set(tools, images, Stopwatch())
-    weight = evaluation.parts.scorers(settings["scorer"])["histogram"].weight
+    weight = evaluation.assembly.scorers(settings["scorer"])["histogram"].weight
     scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
     names = images.dataset.database.names
     for row, line in enumerate(lines):
