@@ -30,14 +30,7 @@ class Retriever(Protocol):
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """Best candidates of each query, without database images that the sequence excludes.
-
-        Args:
-            sequence: Q queries.
-            database: N images.
-            num_candidates: C.
-            cache: cache of features of the images.
-        """
+        """Best candidates of each query, without database images that the sequence excludes."""
         ...
 
 
