@@ -46,14 +46,9 @@ class Resident:
         self._arrays: Features | None = None
 
     def hold(self, rows: Sequence[int], query: Features, total: int) -> tuple[Features, Int[np.ndarray, " rows"]]:
-        """Put rows on the device; return all slots `[S, N, ...]` and the slots of the rows.
+        """Put distinct rows on the device; return all slots `[S, N, ...]` and those of the rows, until the next call.
 
-        Both are valid until the next call.
-
-        Args:
-            rows: distinct.
-            query: unpadded features, which must fit into the capacity as well.
-            total: rows of the map.
+        The unpadded features of the `query` must fit into the capacity as well; `total` is the number of rows.
         """
         counts = self._rows.counts(range(total) if self._arrays is None else rows)
         arrays = self._grow(int(max(counts, default=0)), query, total)
