@@ -71,7 +71,7 @@ class TrainingSplit:
 
     @cached_property
     def width(self) -> int:
-        """Number of candidates of a batch, at least the number of usable candidates of every query."""
+        """Number of candidates of a batch, which holds the usable candidates of every query."""
         most = int(self.usable[self.half.tune].sum(axis=1).max())
         return min(round_up(most, 8), self.usable.shape[1])
 

@@ -51,8 +51,6 @@ class Fit(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The state of a training, without its history."""
-
     parameters: Any
     best: Any
     optimizer: Any
