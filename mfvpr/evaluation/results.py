@@ -49,8 +49,6 @@ class RankedDataset:
     """Rankings of one data set by one system.
 
     Attributes:
-        dataset: of S sequences.
-        system: that ranks.
         matched: candidates and matches of each sequence.
         systems: rankings of each sequence, by name of the final score: retrieval alone, each scorer, combined scores.
         seconds: by stage.

@@ -141,7 +141,6 @@ class Explanation:
         score: the tallest bin.
         shift: its center (x, y), px.
         peak: the refined peak between bin centers, px.
-        weights: of the matches.
         agrees: whether a match's shift lies within two standard deviations of the peak along both axes.
         scale: the dominant one of the scorer's scales, to which all of this belongs.
         direction: of the shifts, as the scorer defines it.

@@ -29,9 +29,8 @@ Described = tuple[Features, np.ndarray]
 class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map.
 
-    Attributes:
-        extractor: of the local features, of one scale.
-        describer: of the global descriptor: the same extractor, another, or an aggregation of the local features.
+    The extractor gives local features of one scale. The describer of the global descriptor is the same extractor,
+    another, or an aggregation of the local features.
     """
 
     extractor: Extractor

@@ -31,13 +31,13 @@ class Resident:
     """
 
     def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
-        """Read nothing yet.
+        """Read nothing yet; there will be at least two slots for each of a query's candidates.
 
         Args:
             rows: of the map.
             typical: keypoints of a typical image; if the detector limits the number, the largest capacity.
             candidates: of a query, which must be on the device at the same time.
-            memory: GB that slots may take; None = a third of what is free. There are at least two slots per candidate.
+            memory: GB that slots may take; None = a third of what is free.
         """
         self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())

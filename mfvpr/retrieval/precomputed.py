@@ -78,7 +78,6 @@ class DescriptorFiles:
     Attributes:
         files: by the root of the folder of images.
         lengths: see `mfvpr.io.read_global_descriptors`.
-        search: search among the descriptors.
     """
 
     files: Mapping[Path, File]

@@ -36,12 +36,7 @@ class Retriever(Protocol):
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Candidates by global descriptors.
-
-    Attributes:
-        describer: computes descriptors from pixels or from local features.
-        search: search among the descriptors.
-    """
+    """Candidates by search among global descriptors, which are computed from pixels or from local features."""
 
     describer: Extractor | Aggregated
     search: Search = EXACT

@@ -169,7 +169,7 @@ class FeatureCache:
             sizes: number of queries, and of candidates of each.
             rows: the queries that are going to be matched, while other processes match others; None = all.
             typical: number of matches of a pair, about.
-            label: names the matches in messages.
+            label: stands in messages.
         """
         if self.root is None:
             raise ValueError("nothing is kept on disk: this cache has no root")

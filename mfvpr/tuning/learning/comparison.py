@@ -34,7 +34,6 @@ class Row:
 
     Attributes:
         half: name of the half to choose or learn on.
-        name: of the score.
         hits: of the queries of the other half.
         values: chosen or learned parameters, as plain values.
         fitted: the training; None if nothing was trained.

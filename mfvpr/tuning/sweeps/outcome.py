@@ -35,7 +35,6 @@ class Outcome:
     """All rankings of a sweep, and their evaluation.
 
     Attributes:
-        axes: of the sweep.
         protocol: the ground truth, with the views of the shortlist.
         settings: in plain values; those of a complete grid come first, in its order.
         rows: of the database, best first.
