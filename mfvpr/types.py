@@ -122,15 +122,14 @@ class Features:
     def of(
         cls, keypoints: Any, descriptors: Any, *, scores: Any = None, mask: Any = None, image_size: Any = None
     ) -> "Features":
-        """Features of arrays or lists, NumPy's, JAX's, torch's or of any library with DLPack.
+        """Features of arrays or lists, NumPy's, JAX's, torch's or of any library with DLPack; shapes as above.
 
         Args:
-            keypoints: `[..., N, 2]` (x, y), px.
-            descriptors: `[..., N, D]`; the weight 2 - distance expects unit length.
-            scores: `[..., N]`; None = 1 each.
-            mask: `[..., N]`; None = all are keypoints.
-            image_size: `[..., 2]` (width, height), px. None = unknown: the size of the bounding box would change
-                scores, so a scorer that needs the size raises an `InputError`, such as the histogram of shifts.
+            keypoints: (x, y), px.
+            descriptors: the weight 2 - distance expects unit length.
+            scores: None = 1 each.
+            mask: None = all are keypoints.
+            image_size: (width, height), px. None = unknown: a scorer that needs the size raises an `InputError`.
 
         Raises:
             InputError: the arrays have different lengths.

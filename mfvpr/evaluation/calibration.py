@@ -151,10 +151,7 @@ def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recip
 
 
 def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str, Any]]:
-    """Read the file of `write_confidences`: confidences by name of the system, and the recipe.
-
-    Raises `InputError` if there is no such file, or a file of another format.
-    """
+    """Read the file of `write_confidences`: confidences by name of the system, and the recipe."""
     path = Path(path)
     expected = "the confidence.json that an evaluation wrote"
     require_file(path, expected)

@@ -93,8 +93,8 @@ def reliability(
     return Reliability(mean, share, count)
 
 
-def chance_calibration_error(probability: Float[np.ndarray, " queries"], *, bins: int = BINS, seed: int = 0) -> float:
+def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> float:
     """Mean `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     draws = (rng.random(len(probability)) < probability for _ in range(_DRAWS))
-    return float(np.mean([reliability(probability, correct, bins=bins).calibration_error for correct in draws]))
+    return float(np.mean([reliability(probability, correct).calibration_error for correct in draws]))

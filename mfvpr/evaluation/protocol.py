@@ -27,8 +27,6 @@ class EvaluationProtocol:
 
     Attributes:
         thresholds: largest distances of a correct prediction, frames or meters, ascending.
-        unit: of the thresholds.
-        positives: at each threshold.
         places: images of a query's place at the widest threshold, also those that are no positives.
         halves: where to choose and where to report; none = both on all queries.
         views: candidates that are ranked: all, and for each half those that choosing may see.

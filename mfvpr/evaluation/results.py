@@ -21,11 +21,7 @@ Reason = Literal["no candidates", "too few features", "too few matches", "low co
 
 @dataclass(frozen=True, repr=False)
 class Recall:
-    """Recall of one system.
-
-    Attributes:
-        tallies: counts `[S][T]` for each sequence, and in it for each threshold.
-    """
+    """Recall of one system, from counts for each sequence, and in it for each threshold."""
 
     tallies: Sequence[Sequence[Tally]]
 
@@ -53,8 +49,6 @@ class RankedDataset:
     """Rankings of one data set by one system.
 
     Attributes:
-        dataset: of S sequences.
-        system: that ranks.
         matched: candidates and matches of each sequence.
         systems: rankings of each sequence, by name of the final score: retrieval alone, each scorer, combined scores.
         seconds: by stage.
@@ -70,11 +64,7 @@ class RankedDataset:
         return f"RankedDataset({self.dataset!r} by {', '.join(self.systems)})"
 
     def positives(self, threshold: float) -> list[Positives]:
-        """Positives at a threshold, by sequence.
-
-        Raises:
-            InputError: a sequence has no ground truth, or its ground truth has another number of images.
-        """
+        """Positives at a threshold, by sequence; an InputError without a ground truth of all images."""
         if not threshold >= 0:
             raise InputError(f"threshold={threshold}: expected a number from 0")
         truths = [sequence.truth for sequence in self.dataset.sequences]

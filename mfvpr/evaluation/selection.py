@@ -44,11 +44,7 @@ def halves(positives: Positives) -> tuple[Half, Half]:
 def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
     """Split several sequences of one database, in any order of places, into two halves of the places.
 
-    Queries without a place are split by their order in each sequence.
-
-    Args:
-        parts: of each sequence, as in `halves`.
-        unit: of the widest threshold.
+    Queries without a place are split by their order in each sequence. The `parts` are as in `halves`.
     """
     together = stack_positives(parts)
     places = places_along_path(together, unit)

@@ -61,17 +61,8 @@ def match_sequence(
 ) -> Matched:
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    If the cache has a root, matches are kept below it. If they are all there, nothing else is read.
-
-    Args:
-        dataset: of the sequence.
-        sequence: Q queries.
-        pipeline: how candidates are found and matched.
-        cache, runtime: see `evaluate`.
-        watch: gets the seconds of the stages.
-
-    Raises:
-        InputError: as `evaluate`.
+    If the cache has a root, matches are kept below it. If they are all there, nothing else is read. `watch` gets the
+    seconds of the stages; the other arguments and the errors are those of `mfvpr.evaluate`.
     """
     cache = cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime)
@@ -81,8 +72,7 @@ def match_sequence(
         if matched is None:
             retrieved = _find_candidates(work)
             matches, remarks = _match(work, retrieved, stores)
-            bad = remarks["queries"], remarks["database"]
-            matched = Matched(sequence, retrieved.candidates, matches, *bad)
+            matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
     _warn_of_queries_without_candidates(matched, cache)
     return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.extractor.scales))
 
@@ -130,15 +120,12 @@ def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Featur
     rows = np.unique(retrieved.candidates.indices[retrieved.candidates.mask])
     database = work.cache.local(dataset.database, extractor, rows.tolist(), label="database")
     queries = work.cache.local(sequence.images, extractor, label=f"query {sequence.name}")
-    bad = {
-        "queries": _by_row(retrieved.bad_queries, queries[0].bad),
-        "database": _by_row(retrieved.bad_database, database[0].bad),
-    }
-    warnings = [
-        *image_warnings(dataset.database, database[0], bad["database"]),
-        *image_warnings(sequence.images, queries[0], bad["queries"]),
-    ]
-    return list(zip(queries, database, strict=True)), bad | {"warnings": warnings}
+    bad_queries = _by_row(retrieved.bad_queries, queries[0].bad)
+    bad_database = _by_row(retrieved.bad_database, database[0].bad)
+    warnings = [*image_warnings(dataset.database, database[0], bad_database)]
+    warnings += image_warnings(sequence.images, queries[0], bad_queries)
+    remarks = {"queries": bad_queries, "database": bad_database, "warnings": warnings}
+    return list(zip(queries, database, strict=True)), remarks
 
 
 def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -> None:

@@ -29,12 +29,7 @@ SOME = 20  # shards that a line names
 
 @dataclass(frozen=True)
 class Shard:
-    """One shard of an evaluation.
-
-    Attributes:
-        index: of this shard, from 0.
-        count: number of shards.
-    """
+    """One shard of an evaluation: its index, from 0, and the number of shards."""
 
     index: int
     count: int
@@ -68,11 +63,7 @@ def shard_of(name: str, count: int) -> int:
 
 
 def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Shard) -> str:
-    """Do the part of a shard, and say in one line what is done, and what to do next.
-
-    Raises:
-        InputError: as `mfvpr.evaluate`.
-    """
+    """Do the part of a shard, and say in one line what is done, and what to do next."""
     if cache.root is None:
         raise InputError(f"shard={shard}: expected a cache with a root, the folder that all shards fill")
     database, pipeline, sequences = dataset.database, system.pipeline, dataset.sequences

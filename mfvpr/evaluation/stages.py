@@ -110,14 +110,8 @@ def stored_matches(
 ) -> tuple[MatchSet, Shortlist]:
     """Read matches and their shortlist from a store, NumPy; features are not needed.
 
-    Args:
-        store: of matches.
-        rows: of the queries; None = all.
-        memory: GB that all matches may take in memory; None = a third of what is free. If that is not enough, none are
-            kept in memory, and they are read from the store whenever they are used.
-
-    Raises:
-        InputError: matches of some queries are missing or damaged.
+    If all matches take more than `memory` GB, by default a third of what is free, none are kept in memory, and they are
+    read from the store whenever they are used.
     """
     rows = range(len(store.done)) if rows is None else rows
     if not (done := store.done[[*rows]]).all():
@@ -147,7 +141,6 @@ class Explanation:
         score: the tallest bin.
         shift: its center (x, y), px.
         peak: the refined peak between bin centers, px.
-        weights: of the matches.
         agrees: whether a match's shift lies within two standard deviations of the peak along both axes.
         scale: the dominant one of the scorer's scales, to which all of this belongs.
         direction: of the shifts, as the scorer defines it.
@@ -182,12 +175,6 @@ def dominant_shifts(
     queries: Int[np.ndarray, " pairs"], places: Int[np.ndarray, " pairs"],
 ) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:  # fmt: skip
     """Shifts from the center of a query to the same point in a candidate, px, with their intervals; one program.
-
-    Args:
-        scorer: computes the histogram.
-        match_set: of all queries.
-        queries: rows of the queries.
-        places: of the candidates in their shortlists.
 
     Returns:
         Refined dominant shifts (candidate minus query), their 95 % intervals (low, high), and the scales; NaN if no

@@ -61,11 +61,9 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
     which is reduced because it is an estimate (Korn & Graham, Survey Methodology 24, 1998). It never has zero width:
     100 hits of 100 give [82.8 %, 100 %].
 
-    Coverage of the 95 % interval in simulations with recalls of 0.5 to 1. Markov chains of 50 to 500 queries: at least
-    96 % without autocorrelation and 92 % with 0.8 from query to query; with 0.9 at least 91 % from 300 queries, but
-    down to 77 % for 50 or 101 queries, which are worth 3 to 6 independent ones. Thresholded Gaussian sequences, with
-    longer memory: with 0.8 between latent neighbors 91 to 98 % for 101 queries, at least 89 % for 50; with 0.9 at least
-    79 % for 50, 85 % for 101, 88 % for 300.
+    In simulations with recalls of 0.5 to 1 and 50 to 500 queries, the 95 % interval covers the recall in at least 96 %
+    without autocorrelation, and in at least 89 % with 0.8 from query to query; with 0.9 in at least 88 % from 300
+    queries, but down to 77 % for 50 or 101 queries, which are worth 3 to 6 independent ones.
 
     Args:
         hits: `[Q]` bool, in the order of the path.
@@ -73,9 +71,6 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
 
     Returns:
         (low, high), fractions; (0, 1) without queries.
-
-    Raises:
-        InputError: hits of another rank.
     """
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
@@ -107,9 +102,8 @@ def design_effect(hits: np.ndarray) -> float:
 def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
     """Exact test of two systems' hits `[Q]` bool (McNemar, 1947): a fair coin for every query in which they differ.
 
-    The test assumes independent queries. Along a path they are not, and the p-value is too small: with an
-    autocorrelation of 0.8 between neighbors of latent Gaussian sequences it is at most 5 % in 7 to 44 % of the
-    simulations of two equally good systems. See `block_sign_flips`.
+    The test assumes independent queries. Along a path they are not, and the p-value is too small; see
+    `block_sign_flips`.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
@@ -143,9 +137,6 @@ def block_sign_flips(
         places: `[Q]` whole numbers in the order of the path, if several queries show the same places, for example on
             several drives. Then blocks are made of places. Without `places`, p is below 5 % in up to 58 % of the
             simulations of equally good systems on several drives.
-
-    Raises:
-        InputError: arrays of different shapes, sequences that do not add up to Q, or `block` below 1.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     sequences = [len(first)] if sequences is None else [*sequences]

@@ -50,12 +50,7 @@ class Pipeline:
     candidates: int | Literal["all"] = 50
 
     def __post_init__(self) -> None:
-        """Check the parts.
-
-        Raises:
-            InputError: the extractor gives no local features, the matcher cannot be called or does not suit the
-                extractor, or a number is out of its range.
-        """
+        """Raise an InputError unless the parts fit together."""
         number: Any = self.candidates
         is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
         if not (number >= 1 if is_whole else isinstance(number, str) and number == "all"):
@@ -102,11 +97,7 @@ class System:
     settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the scorers and the names of their combinations.
-
-        Raises:
-            InputError: a scorer is not callable or out of its bounds, a name is taken, or a combination has no scorer.
-        """
+        """Raise an InputError for scorers out of their bounds, or names that are taken or unknown."""
         require_word("ties", self.ties, Ties)
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
@@ -129,11 +120,8 @@ class System:
         Programs depend on the number of features in steps, so that other images may compile a few more. A map compiles
         programs of its own: see `Map.warm_up`.
 
-        Args:
-            image_size: (width, height) px, before images are resized to the size of the extractor.
-
-        Raises:
-            InputError: the extractor does not extract, but reads features.
+        `image_size` is (width, height) px, before images are resized to the size of the extractor. An extractor that
+        reads features raises an `InputError`.
         """
         extractor, candidates = self.pipeline.extractor, self.pipeline.candidates
         if isinstance(extractor, Source):

@@ -16,12 +16,7 @@ from mfvpr.utils.errors import InputError
 def validate_candidates(
     retrieved: Any, name: str, num_queries: int, num_database: int, num_candidates: int
 ) -> RetrievalResult:
-    """Check the candidates of a retrieval, which may be user-defined; return them padded with -1 and 0.
-
-    Raises:
-        InputError: no RetrievalResult, or no Shortlist of the expected shape in it, rows that the database lacks, or a
-            row twice for one query. The error has the `name` of the retrieval.
-    """
+    """Check the candidates of the retrieval `name`, which may be user-defined; return them padded with -1 and 0."""
     if not isinstance(retrieved, RetrievalResult):
         raise InputError(f"{name}: expected a RetrievalResult, got {type(retrieved).__name__}; return "
                          "RetrievalResult(shortlist, {}, {})")  # fmt: skip
@@ -69,11 +64,7 @@ def require_finite(name: str, scores: np.ndarray) -> None:
 def score_warnings(
     matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
-    """Warnings of NaN and infinite scores of every sequence, for example if a user-defined scorer divides by 0.
-
-    Raises:
-        InputError: every score of a scorer is NaN, infinite, or 0, the score of pairs without matches.
-    """
+    """Warnings of NaN and infinite scores of every sequence; see also `require_finite`."""
     for name in scorers:
         values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
         require_finite(name, values)

@@ -28,14 +28,10 @@ class AlikedFeatures:
 
     Keypoints are in row order, or by falling score if an image has more than `max_keypoints`.
 
-    Attributes:
-        model: the network with its weights.
-        image_size: (width, height) px.
-        interpolation: see `mfvpr.datasets.images.resize`.
+    Attributes, beside those of `Extractor`:
         threshold: of the detection score, in (0, 1). 0.1 is that of Pivonka & Preucil (IEEE T-IV 2024); its authors'
             default is 0.2. If no score of an image is above it, keypoints above the image's mean score are taken.
         max_keypoints: the keypoints of the highest scores are kept; None = all.
-        batch_size: images per call.
 
     Raises:
         InputError: images of this size have no room for a keypoint.
@@ -61,20 +57,14 @@ class AlikedFeatures:
         return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Local features of each image, RGB, 0 .. 255.
-
-        Raises:
-            InputError: the images do not have `image_size`.
-        """
         require_size("ALIKED", images, self.image_size)
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         extracted = in_batches(self._program(usual), images, self.batch_size)
         counts = [int(detections.count) for detections, _ in extracted]
         crowded = [row for row, count in enumerate(counts) if count > usual]
         if crowded and usual < self._limit:
-            capacity = min(
-                self._limit, 1 << (max(counts) - 1).bit_length()
-            )  # powers of two: few programs for all images
+            # Powers of two: few programs for all images.
+            capacity = min(self._limit, 1 << (max(counts) - 1).bit_length())
             again = in_batches(self._program(capacity), images[crowded], self.batch_size)
             for row, result in zip(crowded, again, strict=True):
                 extracted[row] = result

@@ -25,14 +25,10 @@ class D2NetFeatures:
 
     Scores are activations, which are not comparable between images.
 
-    Attributes:
-        model: the network with its weights.
-        image_size: (width, height) px.
-        interpolation: see `mfvpr.datasets.images.resize`.
+    Attributes, beside those of `Extractor`:
         preprocessing: "caffe" as published, or "torch".
         multiscale: detect at half, full and double size as well, in this order.
         max_keypoints: the keypoints of the highest scores are kept, in the same order; None = all.
-        batch_size: images per call.
 
     Raises:
         InputError: images of this size are too small for the network.
@@ -63,11 +59,6 @@ class D2NetFeatures:
         return (Scale(512, usual if self.max_keypoints is None else min(usual, self.max_keypoints)),)
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Local features of each image, RGB, 0 .. 255.
-
-        Raises:
-            InputError: the images do not have `image_size`.
-        """
         require_size("D2-Net", images, self.image_size)
         results = in_batches(self._program(_SHARE), images, self.batch_size)
         crowded = [row for row, levels in enumerate(results) if any(level.count > len(level.mask) for level in levels)]

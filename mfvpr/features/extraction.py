@@ -28,17 +28,8 @@ def describe_folder(
 ) -> Iterator[dict[int, Description]]:
     """Extract descriptions of the images in `rows`, by row, batch by batch.
 
-    Args:
-        folder: the images.
-        extractor: images -> descriptions.
-        rows: of the images.
-        bad: images that are not used are added to it, row -> reason: images that cannot be read (if they are skipped),
-            and images whose description is not finite.
-        skip_bad: skip images that cannot be read, instead of raising.
-        track: progress.
-
-    Raises:
-        InputError: an image cannot be read (unless `skip_bad`).
+    Images that are not used are added to `bad`, row -> reason: images whose description is not finite, and with
+    `skip_bad` images that cannot be read. Without `skip_bad` these raise an `InputError`.
     """
     images = _readable_images(folder, rows, extractor, skip_bad, bad, track)
     while batch := list(itertools.islice(images, extractor.batch_size)):
@@ -53,11 +44,7 @@ def describe_folder(
 
 
 def describe_images(images: Num[np.ndarray, "images height width 3"], extractor: Extractor) -> list[Description | None]:
-    """Extract descriptions of images of the extractor's size; None if a description is not finite.
-
-    Raises:
-        InputError: the extractor returns something else than its `scales` and `vector_size` promise.
-    """
+    """Extract descriptions of images of the extractor's size; None if a description is not finite."""
     descriptions = list(extractor(images))
     _check_descriptions(descriptions, extractor, len(images))
     unpadded = (Description(vector, tuple(map(without_padding, local))) for vector, local in descriptions)

@@ -96,7 +96,9 @@ class Extractor(Protocol):
         """Scales of the local features; () = no local features."""
         ...
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]: ...
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptions of images of `image_size`; networks raise an `InputError` for images of another size."""
+        ...
 
 
 class Aggregation(Protocol):

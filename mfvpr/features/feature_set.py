@@ -164,11 +164,7 @@ class Recent:
         self._slots: OrderedDict[int, int] = OrderedDict()
 
     def take(self, rows: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Assign distinct rows to slots; return their slots, and the rows that were in no slot before.
-
-        Raises:
-            ValueError: more rows than slots.
-        """
+        """Assign distinct rows, at most `number`, to slots; return their slots, and the rows that were in none."""
         if len(rows) > self.number:
             raise ValueError(f"expected at most {self.number} rows at the same time, got {len(rows)}")
         new = [row for row in rows if row not in self._slots]
@@ -189,14 +185,7 @@ class Slots:
     """
 
     def __init__(self, features: FeatureSet, wanted: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
-        """Plan the slots; all are empty.
-
-        Args:
-            features: source of the rows.
-            wanted: distinct rows that will be staged.
-            budget: bytes for the slots and the rows on their way to them; a few slots are used in any case.
-            device: of the slots.
-        """
+        """Plan empty slots for the distinct rows `wanted`, with `budget` bytes for them and for rows on their way."""
         self._features, self._device = features, device
         counts = features.counts
         capacities = _capacities(counts[wanted])
@@ -271,11 +260,7 @@ def without_padding(image: Features) -> Features:
 
 
 def check_features(image: Features, name: str, *, unit_length: bool) -> None:
-    """Check Features of one image that come from user code; errors begin with `name`.
-
-    Raises:
-        InputError: arrays of several images, no image size, or descriptors not of unit length if `unit_length`.
-    """
+    """Check Features of one image that come from user code; errors begin with `name`."""
     shapes = np.shape(image.mask), np.shape(image.image_size)
     if len(shapes[0]) != 1 or shapes[1] != (2,):
         raise InputError(f"{name}: expected a mask [N] and an image_size [2] of one image, got shapes {shapes[0]} and "

@@ -44,12 +44,9 @@ class DescriptorNetwork(Protocol):
 class GlobalDescriptor:
     """A network's global descriptors, as the public code extracts them.
 
-    Attributes:
-        model: the network with its weights.
+    Attributes, beside those of `Extractor`:
         image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
-        interpolation: see `mfvpr.datasets.images.resize`.
         components: number of principal components that are kept, scaled to unit length again; None = all.
-        batch_size: images per call.
 
     Raises:
         InputError: the network cannot take images of this size, or has fewer principal components.
@@ -71,15 +68,10 @@ class GlobalDescriptor:
 
     @property
     def vector_size(self) -> int:
-        """Length of a descriptor."""
         return self.components or self.model.dimension
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32.
-
-        Raises:
-            InputError: the images do not have `image_size`.
-        """
+        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32."""
         require_size(type(self.model).__name__, images, self.image_size)
         return [Description(vector) for vector in in_batches(self._program, images, self.batch_size)]
 

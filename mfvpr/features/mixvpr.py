@@ -18,11 +18,10 @@ from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
 class MixVprDescriptor:
     """MixVPR's global descriptors, as the public code extracts them.
 
-    Attributes:
+    Attributes, beside those of `Extractor`:
         model: the network with its weights, which are for 320 x 320 px only.
-        interpolation: see `mfvpr.datasets.images.resize`. The authors' demonstration and OpenVPRLab use "pil_bicubic",
-            the authors' training "pil_bilinear", VPR-methods-evaluation "torch_bilinear".
-        batch_size: images per call.
+        interpolation: the authors' demonstration and OpenVPRLab use "pil_bicubic", the authors' training
+            "pil_bilinear", VPR-methods-evaluation "torch_bilinear".
     """
 
     image_size = IMAGE_SIZE
@@ -37,11 +36,7 @@ class MixVprDescriptor:
         return self.model.dimension
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32.
-
-        Raises:
-            InputError: the images have another size.
-        """
+        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32."""
         require_size("MixVPR", images, IMAGE_SIZE)
         return [Description(vector) for vector in in_batches(self._program, images, self.batch_size)]
 

@@ -25,13 +25,9 @@ class PatchNetVladFeatures:
 
     Patches are in row order; their scores are 1.
 
-    Attributes:
-        model: the network with its weights.
-        image_size: (width, height) px.
-        interpolation: see `mfvpr.datasets.images.resize`.
+    Attributes, beside those of `Extractor`:
         patch_sizes: sides of the patches, in positions of the map; each size is a scale.
         scale_weights: weight of each scale's score, see `mfvpr.reranking.fuse_scales`; None = equal weights.
-        batch_size: images per call.
 
     Raises:
         InputError: another network; no patch sizes, duplicates, or a patch that is larger than the map; another number
@@ -77,11 +73,7 @@ class PatchNetVladFeatures:
         return width // STRIDE, height // STRIDE
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of images, RGB, 0 .. 255, uint8 or float32.
-
-        Raises:
-            InputError: the images do not have `image_size`.
-        """
+        """Descriptors of images, RGB, 0 .. 255, uint8 or float32."""
         require_size("Patch-NetVLAD", images, self.image_size)
         pairs = in_batches(self._program, images, self.batch_size)
         return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in pairs]

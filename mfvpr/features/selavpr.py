@@ -26,11 +26,9 @@ class SelaVprFeatures:
     Local features are in row order; their scores are 1. Their keypoints are interpolated between the middles of the
     network's patches; the public code has no keypoints, because its score does not depend on them.
 
-    Attributes:
-        model: the network with its weights.
+    Attributes, beside those of `Extractor`:
         image_size: (width, height) px, multiples of 14; 224 x 224 is published.
-        interpolation: see `mfvpr.datasets.images.resize`; published without antialiasing and without rounding.
-        batch_size: images per call.
+        interpolation: published without antialiasing and without rounding.
 
     Raises:
         InputError: another network, or an image size that is no multiple of 14.
@@ -61,11 +59,7 @@ class SelaVprFeatures:
         return width, height
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of images, RGB, 0 .. 255, uint8 or float32.
-
-        Raises:
-            InputError: the images do not have `image_size`.
-        """
+        """Descriptors of images, RGB, 0 .. 255, uint8 or float32."""
         require_size("SelaVPR", images, self.image_size)
         pairs = in_batches(self._program, images, self.batch_size)
         return [Description(vector, (self._features(local),)) for vector, local in pairs]

@@ -15,9 +15,7 @@ from mfvpr.types import Features
 class Sift:
     """RootSIFT of the gray image, 128 dimensions; scores are the detector's responses (of order 0.01 to 0.2).
 
-    Attributes:
-        image_size: (width, height) px.
-        interpolation: see `mfvpr.datasets.images.resize`.
+    Attributes, beside those of `Extractor`:
         max_keypoints: the keypoints of the highest scores are kept; None = all.
         contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
         clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
@@ -37,7 +35,6 @@ class Sift:
         return (Scale(128, self.max_keypoints or self.image_size[0] * self.image_size[1] // 100),)
 
     def __call__(self, images: UInt8[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Local features of each RGB image."""
         return [Description(local=(self._extract(image),)) for image in images]
 
     def _extract(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:

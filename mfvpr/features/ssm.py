@@ -29,13 +29,9 @@ _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its mid
 class SsmMaps:
     """Feature maps of one stage as global descriptors, of unit length at every position.
 
-    Attributes:
-        model: the network with its weights.
+    Attributes, beside those of `Extractor`:
         stage: 1 or 2.
-        image_size: (width, height) px.
-        interpolation: see `mfvpr.datasets.images.resize`.
         preprocessing: "torch" as the public code, or "caffe", which the weights are for.
-        batch_size: images per call.
     """
 
     scales = ()  # no local features
@@ -54,11 +50,9 @@ class SsmMaps:
 
     @property
     def vector_size(self) -> int:
-        """Length of a map as a vector."""
         return int(np.prod(self.shape))
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Maps of images, RGB, 0 .. 255."""
         return [Description(maps.reshape(-1)) for maps in in_batches(self._program, images, self.batch_size)]
 
     def compute(
@@ -91,12 +85,8 @@ class SsmWindows:
 
     Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
 
-    Attributes:
-        model: the network with its weights.
-        interpolation: see `SsmMaps`.
-        preprocessing: see `SsmMaps`.
+    Attributes, beside those of `SsmMaps`:
         whitening: settings to learn it from the database, or the learned whitening.
-        batch_size: images per call.
     """
 
     image_size = STAGE1_SIZE
@@ -123,11 +113,7 @@ class SsmWindows:
         return self.windows.count * self.whitening.dimension
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Whitened windows of images, RGB, 0 .. 255, `[36 * D']` float32 each.
-
-        Raises:
-            InputError: the whitening was not learned yet.
-        """
+        """Whitened windows of images, `[36 * D']` float32 each; an `InputError` if the whitening was not learned."""
         return [Description(vectors.reshape(-1)) for vectors in in_batches(self._program, images, self.batch_size)]
 
     _program = cached_property(_whitening_program)
@@ -140,14 +126,10 @@ class SsmCells:
     Descriptors are of any length. Match each cell of the candidate to the cell of the largest dot product
     (`cross_check="candidate"` of `mfvpr.match`), and score with `GridAnchors`, `side` as in `windows.grid`.
 
-    Attributes:
-        model: the network with its weights.
+    Attributes, beside those of `SsmMaps`:
         image_size: (width, height) px: 336 x 336 as the paper, 224 x 224 as the public program, 448 x 448.
-        interpolation: see `SsmMaps`.
-        preprocessing: see `SsmMaps`.
         stride: positions from cell to cell.
         whitening: settings to learn it from the database, or the learned whitening.
-        batch_size: images per call.
 
     Raises:
         InputError: images of this size have no cells.
@@ -183,11 +165,7 @@ class SsmCells:
         return (Scale(self.whitening.dimension, self.windows.count),)
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Cells of images, RGB, 0 .. 255, in row order; scores are 1.
-
-        Raises:
-            InputError: the whitening was not learned yet.
-        """
+        """Cells of images in row order; scores are 1. An `InputError` if the whitening was not learned."""
         middles = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
         return [
             Description(local=(local_features(middles, descriptors, self.image_size),))

@@ -26,8 +26,7 @@ _CHUNK = 2**23  # numbers of an array at a time: few large products, which do no
 class VladFitting:
     """Settings of a vocabulary, the centers of a mixture of round Gaussians of equal size, from a few steps of EM.
 
-    This is k-means with soft memberships, which are smooth in the descriptors. Plain k-means is not: a change of the
-    last bit, or one keypoint more, moves a descriptor to another word, and every step multiplies the difference.
+    This is k-means with soft memberships, so that a change of the last bit of a descriptor hardly changes the words.
 
     Attributes:
         num_words: of the vocabulary.
@@ -50,11 +49,7 @@ class VladFitting:
                              f"num_words={self.num_words} words")  # fmt: skip
 
     def fit(self, database: FeatureSet) -> "Vlad":
-        """Learn the vocabulary from random images of the database, or from all if they have few descriptors.
-
-        Raises:
-            InputError: the database has fewer descriptors than words.
-        """
+        """Learn the vocabulary from random images of the database, or from all if they have few descriptors."""
         counts = database.counts
         if counts.sum() < self.num_words:
             raise InputError(

@@ -101,15 +101,9 @@ class WindowFitting:
         windows: Windows,
         rows: list[int],
     ) -> Whitening:
-        """Learn the whitening from maps, which come by row in batches.
+        """Learn the whitening from maps of the images in `rows` (`sample_rows`), which come by row in batches.
 
-        Args:
-            maps: of the images in `rows`; unreadable images may be missing.
-            windows: of these maps.
-            rows: from `sample_rows`.
-
-        Raises:
-            InputError: the windows do not fit into memory, or there are fewer windows than dimensions.
+        Unreadable images may be missing. Too few windows, or more than fit into memory, raise an `InputError`.
         """
         total = len(rows) * windows.count
         chosen = np.arange(total)
@@ -154,11 +148,7 @@ class WindowExtractor(Protocol):
 
 
 def learned_whitening(extractor: WindowExtractor) -> Whitening:
-    """The extractor's learned whitening.
-
-    Raises:
-        InputError: the whitening was not learned yet, or from other windows, another network or other preprocessing.
-    """
+    """The extractor's learned whitening; an `InputError` if it was not learned yet, or from something else."""
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fit_to_database(...) of it")

@@ -21,11 +21,7 @@ _SCORE_ALONE = {"fusion": {"c": "auto", "weights": None, "retrieval_score": "cos
 
 
 def read_declaration(folder: Path) -> dict[str, Any]:
-    """The settings that the map in a folder was made with.
-
-    Raises:
-        InputError: there is no map, or it was made with a system that no settings describe.
-    """
+    """The settings of the map in a folder; an InputError without one, or for a system that no settings describe."""
     path = folder / _FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

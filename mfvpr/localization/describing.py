@@ -29,9 +29,8 @@ Described = tuple[Features, np.ndarray]
 class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map.
 
-    Attributes:
-        extractor: of the local features, of one scale.
-        describer: of the global descriptor: the same extractor, another, or an aggregation of the local features.
+    The extractor gives local features of one scale. The describer of the global descriptor is the same extractor,
+    another, or an aggregation of the local features.
     """
 
     extractor: Extractor
@@ -43,11 +42,7 @@ class Describing:
         return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
 
     def image(self, image: Image) -> Described:
-        """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
-
-        Raises:
-            InputError: the image cannot be read or has another format, or its features are not finite.
-        """
+        """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
         pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
         descriptions = [_extract(extractor, pixels, name) for extractor in self._extractors]
         features = round_as_stored(descriptions[0].features)
@@ -57,7 +52,7 @@ class Describing:
     def folder(
         self, images: ImageFolder, rows: Sequence[int], track: Track = no_progress
     ) -> Iterator[dict[int, Described]]:
-        """Describe some images of a folder: batches of descriptions by row; raises as `image`."""
+        """Describe some images of a folder: batches of descriptions by row."""
         for batch in _batches(images, self.extractor, rows, track):
             features = [round_as_stored(description.features) for description in batch.values()]
             descriptions = [*batch.values()]

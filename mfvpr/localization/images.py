@@ -206,15 +206,7 @@ class MapImages:
 
     @exclusive
     def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
-        """Add images with features and global descriptors that `describing` has computed.
-
-        Args:
-            entries: names, places and descriptors.
-            features: local ones, as a store gives them back.
-
-        Raises:
-            InputError: as `add`.
-        """
+        """Add images with features and global descriptors that `describing` has computed; errors are those of `add`."""
         if len(entries) != len(features):
             raise InputError(f"expected features of each of {len(entries)} images, got {len(features)}")
         for name, place, _ in entries:

@@ -163,8 +163,7 @@ class Map(MapImages):
     def warm_up(self) -> None:
         """Compile what the first `localize` needs, so that no image of a drive waits for it; the map stays as it is.
 
-        Raises:
-            InputError: the map is empty.
+        An empty map raises an `InputError`.
         """
         described = self._refresh_images()
         _, vector = described.describing.image(noise_image())
@@ -230,15 +229,15 @@ class Map(MapImages):
         return None if math.isnan(p) else p
 
 
-def _whole_number(name: str, value: Any, least: int = 0) -> int:
-    """An argument as int; NumPy's whole numbers are allowed."""
+def _whole_number(name: str, value: Any) -> int:
+    """An argument from 0 as int; NumPy's whole numbers are allowed."""
     try:
-        if (number := operator.index(value)) >= least:
+        if (number := operator.index(value)) >= 0:
             return number
     except TypeError:
         pass
     got = clip_middle(" ".join(repr(value).split()), 80)
-    raise InputError(f"{name}: expected a whole number from {least}, got {got}. Use an `int`.")
+    raise InputError(f"{name}: expected a whole number from 0, got {got}. Use an `int`.")
 
 
 def _extractor(system: System) -> Extractor:

@@ -11,14 +11,7 @@ from mfvpr.types import Matches
 
 @dataclass(frozen=True)
 class Alternative:
-    """A candidate.
-
-    Attributes:
-        row: of the map.
-        name: of the image in this row.
-        place: where the image was taken.
-        score: larger = more similar.
-    """
+    """A candidate: the name and the place of the image in a row of the map, and its score; larger = more similar."""
 
     row: int
     name: str

@@ -31,13 +31,13 @@ class Resident:
     """
 
     def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
-        """Read nothing yet.
+        """Read nothing yet; there will be at least two slots for each of a query's candidates.
 
         Args:
             rows: of the map.
             typical: keypoints of a typical image; if the detector limits the number, the largest capacity.
             candidates: of a query, which must be on the device at the same time.
-            memory: GB that slots may take; None = a third of what is free. There are at least two slots per candidate.
+            memory: GB that slots may take; None = a third of what is free.
         """
         self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())
@@ -46,14 +46,9 @@ class Resident:
         self._arrays: Features | None = None
 
     def hold(self, rows: Sequence[int], query: Features, total: int) -> tuple[Features, Int[np.ndarray, " rows"]]:
-        """Put rows on the device; return all slots `[S, N, ...]` and the slots of the rows.
+        """Put distinct rows on the device; return all slots `[S, N, ...]` and those of the rows, until the next call.
 
-        Both are valid until the next call.
-
-        Args:
-            rows: distinct.
-            query: unpadded features, which must fit into the capacity as well.
-            total: rows of the map.
+        The unpadded features of the `query` must fit into the capacity as well; `total` is the number of rows.
         """
         counts = self._rows.counts(range(total) if self._arrays is None else rows)
         arrays = self._grow(int(max(counts, default=0)), query, total)

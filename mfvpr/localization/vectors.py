@@ -42,12 +42,9 @@ class Vectors:
     def nearest(
         self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
     ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
-        """The most similar rows and their products with the query, best first; the lowest row wins a tie.
+        """At most `number` rows `before` a row, and their products with the query, most similar first.
 
-        Args:
-            query: a descriptor; the zero descriptor of an image without features has no similar rows.
-            number: of rows, at most.
-            before: rows from this one on are left out; None = no such limit.
+        The lowest row wins a tie. The zero descriptor of an image without features has no similar rows.
         """
         total = self.total if before is None else max(0, min(self.total, before))
         rows = np.flatnonzero(self._is_candidate[:total])

@@ -56,11 +56,7 @@ class VocabularyFile:
                              "or none. Open the map again.")  # fmt: skip
 
     def learn(self, features: FeatureSet, settings: Mapping[str, Any]) -> None:
-        """Learn and write the vocabulary of a map with these settings, within `lock_map`.
-
-        Raises:
-            InputError: there are too few features, or the disk is full.
-        """
+        """Learn and write the vocabulary of a map with these settings, within `lock_map`."""
         vocabulary = self._fitting.fit(features)
         write_settings(self._folder, settings)
         with disk_errors_as_input_errors(self._folder, MAP.content):

@@ -29,7 +29,6 @@ class Part(NamedTuple):
     """Pairs of a batch of queries with candidates that fit on the device at the same time.
 
     pairs: row of the query, position of the candidate in its shortlist, row of the database.
-    device: matches these pairs.
     ends: rows of the queries without further pairs.
     """
 
@@ -88,13 +87,7 @@ def match_queries(
 
     A thread reads features while the devices work.
 
-    Args:
-        queries, database: Q and M images.
-        candidates: `[Q, C]` rows of the database.
-        todo: rows of the queries to match.
-        matcher: of one pair.
-        memory: GB for features of the database, see `mfvpr.features.feature_set.memory_budget`.
-        devices: share the queries.
+    `memory` in GB is for features of the database, see `mfvpr.features.feature_set.memory_budget`.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)

@@ -86,11 +86,8 @@ class MatchSet:
     ) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros.
 
-        Args:
-            queries: rows of the queries.
-            places: positions of the candidates in their shortlists.
-            capacity: K, at least the matches of any of the pairs.
-            total: number of pairs with padding; padding has no matches, and the images of the last pair.
+        `places` are positions of the candidates in their shortlists, and `capacity` is K. There are `total` pairs with
+        padding, which has no matches, and the images of the last pair.
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
@@ -177,10 +174,8 @@ class Batch(NamedTuple):
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
     """Slots of the batch of each pair: few sizes to compile, with little padding.
 
-    Args:
-        match_set: the largest size is its capacity, so that subsets have the same sizes.
-        settings: number of settings that every program scores. There are fewer sizes for few settings or a small set,
-            because padding then costs less time than compiling for another size.
+    The largest size is the set's capacity, so that subsets have the same sizes. There are fewer sizes for few settings
+    or a small set, because padding then costs less time than compiling for another size.
     """
     sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
@@ -213,11 +208,7 @@ def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf
 def batches(
     match_set: MatchSet, queries: range, *, settings: float = math.inf
 ) -> Iterator[tuple[Int[np.ndarray, " pairs"], Matches]]:
-    """Padded matches of all batches of `partition`.
-
-    Returns:
-        (places `[n]` in the flattened `[queries, C]`, Matches `[P, K, ...]` of P >= n pairs); padding has no matches.
-    """
+    """Padded Matches `[P, K, ...]` of all batches of `partition`, with their places `[n]`, n <= P."""
     part = match_set.take(queries)
     for places, size, pairs in partition(match_set, queries, settings=settings):
         query, place = np.divmod(places, match_set.counts.shape[1])

@@ -166,15 +166,7 @@ def make_matches(
     real: Bool[Array, " keypoints0"],
     **optional: Float[Array, " keypoints0"] | None,
 ) -> Matches:
-    """Matches with N0 slots, one for every keypoint of the query.
-
-    Args:
-        features0: query, `ready`.
-        features1: candidate, `ready`, with one slot or more.
-        index1: the candidate's keypoint of each match, int32.
-        real: the mask.
-        **optional: further fields of the matches.
-    """
+    """Matches with N0 slots, one for every keypoint of the query, of `ready` features; the candidate has slots."""
     return Matches(
         points0=features0.keypoints,
         points1=features1.keypoints[index1],

@@ -32,11 +32,8 @@ def score(
     All scorers together are one program for each shape of a batch, which is reused for other parameter values
     (histograms: up to the next multiple of 8 bins). A pair without matches scores 0.
 
-    Args:
-        scorers: by name.
-        match_set: matches of Q queries with C candidates; several scales are scored one by one and fused.
-        candidates: shortlist of the queries.
-        runtime: devices that share the batches, without effect on the bits of the scores; progress over batches.
+    Several scales are scored one by one and fused. The devices of `runtime` share the batches, without effect on the
+    bits of the scores.
     """
     if not scorers:
         return {}
@@ -76,11 +73,8 @@ def run_batches(
 ) -> Iterator[tuple[np.ndarray, Any]]:
     """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy.
 
-    Args:
-        program: function of Matches `[P, K, ...]` and the inputs that returns arrays `[..., P]`.
-        inputs: pytrees, copied to every device.
-        batches: of few shapes; only a few batches are in memory at the same time.
-        devices: take turns; None = JAX's default device.
+    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`. Devices take turns; only a few
+    batches are in memory at the same time.
     """
     to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
     device_inputs = [put(inputs) for put in to_device]

@@ -29,14 +29,9 @@ PRIOR = 10
 
 
 def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
-    """The database images as queries; the database images of the same place are excluded.
+    """The database images, in the order of the drive, as queries; database images of the same place are excluded.
 
-    Args:
-        database: M images in the order of the drive.
-        neighbors: frames on both sides of an image that show the same place; images of equal content do, too.
-
-    Raises:
-        InputError: `neighbors` is no integer from 0, or so large that no other images remain.
+    The `neighbors` on both sides of an image show the same place, and images of equal content do, too.
     """
     number = len(database.folder)
     if not isinstance(neighbors, int | np.integer) or isinstance(neighbors, bool) or neighbors < 0:
@@ -57,13 +52,8 @@ def hubness(
     The hubness is the mean score of the image with other places, over the mean of all scores. `PRIOR` average scores
     are added to the scores of each image. The hubness is 1 for an image without scores, and if all scores are 0.
 
-    Args:
-        candidates: of the cohort's images.
-        scores: of the candidates; scores that are not finite are ignored.
-        num_database: number of database images.
-
-    Raises:
-        InputError: a score of the scorer `name` is below 0.
+    `candidates` and their `scores` are those of the cohort's images. Scores that are not finite are ignored; a score
+    below 0 of the scorer `name` raises an `InputError`.
     """
     known = np.asarray(candidates.mask) & np.isfinite(scores)
     rows, values = np.asarray(candidates.indices)[known], np.asarray(scores, np.float64)[known]
@@ -80,9 +70,7 @@ def by_hubness(
     """Scores divided by the hubness of the candidates, float32.
 
     A hubness below 1 does not count: an image that hardly matches anything would gain by every match. NaN stays NaN.
-
-    Raises:
-        InputError: a score of the scorer `name` is below 0; division would increase it.
+    A score below 0, which division would increase, raises an `InputError`.
     """
     _require_positive(scores, name)
     return (scores / np.maximum(hubness, 1)[candidates.indices]).astype(np.float32)

@@ -55,15 +55,7 @@ class Fusion:
         return " + ".join([*self.members(main), RETRIEVAL])
 
     def check(self, main: str, scorers: Collection[str]) -> None:
-        """Check the settings and the names of scorers.
-
-        Args:
-            main: name of the main scorer.
-            scorers: names of all scorers.
-
-        Raises:
-            InputError: a setting is out of bounds, or a name is not among the scorers.
-        """
+        """Raise an InputError if a setting is out of bounds, or a name is not among those of all `scorers`."""
         require_word("retrieval_score", self.retrieval_score, RetrievalScore)
         known = ", ".join(scorers) or "there are none"
         if main not in scorers:
@@ -118,11 +110,7 @@ def final_scores(
     scorers: Iterable[str], cohort: int | None, fused: Mapping[str, Fusion],
     correlated: Mapping[str, FrameCorrelation],
 ) -> dict[str, FinalScore]:  # fmt: skip
-    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`.
-
-    Raises:
-        InputError: a name is taken, or a combination is not one of known scores.
-    """
+    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
     known = {RETRIEVAL: FinalScore(RETRIEVAL)}
 
     def add(name: str, *of: Any) -> None:
@@ -153,14 +141,10 @@ def rank_by_scores(
     candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of queries by name of the final score.
+    """Rankings of queries by name of the final score, in the order of `final_scores`.
 
-    Args:
-        candidates: of the queries, which are a sequence if scores are correlated.
-        scores: `[Q, C]` by name of the scorer.
-        final_scores: those that are made of other ones come behind them.
-        ties: see `mfvpr.System`.
-        hubness: by name of the scorer, for score normalization with a cohort.
+    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. The queries are a
+    sequence if scores are correlated.
     """
     known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
     for score in final_scores:

@@ -122,14 +122,13 @@ def score_settings(
     """Scores `[G, W, C]` of candidates for every combination of G settings and W weightings.
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
-    so that other values cost no compilation.
+    so that other values cost no compilation. A histogram needs a capacity that suffices for every `bin_size`.
 
     Args:
-        scorer: its other parameters stay; a histogram needs a capacity that suffices for every `bin_size`.
+        scorer: its other parameters stay.
         matches: `[C, K, ...]`.
         settings: G values of the scorer's numeric parameters; none: G = 1.
-        weightings: W values of `max_distance` (larger distances do not count) and `weight` (the index of the scorer's
-            `ChosenWeight`), which are cheap to vary; none: W = 1.
+        weightings: W values of `max_distance` and of `weight`, the index of the scorer's `ChosenWeight`; none: W = 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
     require_real("scorer", scores)

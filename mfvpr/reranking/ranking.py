@@ -129,24 +129,13 @@ def fuse(
 def fuse_shortlist(
     candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
 ) -> Scores:
-    """Combined scores of retrieval and re-ranking; NaN without a candidate.
-
-    Args:
-        candidates: shortlist with cosine similarities.
-        scores: re-ranking scores.
-        c: weight of the retrieval score; None is `balancing_c` of each query.
-        retrieval_score: kind of retrieval score, see `retrieval_scores`.
-    """
+    """Combined scores of retrieval and re-ranking, see `fuse`; NaN without a candidate."""
     fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
     return np.asarray(or_nan(fused, candidates.mask))
 
 
 def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
-    """Retrieval scores: cosine similarity, or minus the Euclidean distance.
-
-    Raises:
-        InputError: `kind` is unknown, or `negative_euclidean` of scores above 1.
-    """
+    """Retrieval scores: cosine similarity, or minus the Euclidean distance, for scores up to 1 only."""
     require_word("retrieval_score", kind, RetrievalScore)
     cosine = candidates.scores
     if kind == "cosine":
@@ -207,11 +196,7 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
 
 
 def breaks_ties_by_row(ties: Ties) -> bool:
-    """Whether ties are broken by the database row.
-
-    Raises:
-        InputError: unknown word.
-    """
+    """Whether ties are broken by the database row."""
     require_word("ties", ties, Ties)
     return ties == "index"
 

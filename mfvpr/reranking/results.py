@@ -18,11 +18,9 @@ COHORT = "cohort"  # in names of rankings by scores that are normalized with a c
 
 @dataclass(frozen=True, repr=False)
 class Matched:
-    """Candidates of Q queries and their matches.
+    """Candidates of the Q queries of a sequence, and their matches.
 
     Attributes:
-        sequence: of the queries.
-        candidates: `[Q, C]` database rows.
         matches: of each scale.
         bad_queries, bad_database: row -> reason, of images that could not be used.
         weights: of the scales; None = 1 each.

@@ -34,13 +34,8 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
     If the cache has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
     and of all settings; this hash is part of the recipe of everything that is computed with it.
 
-    Args:
-        tool: parts that are learned already stay the same, even if they were learned from another database.
-        database: images to learn from.
-        cache: see `FeatureCache`.
-
-    Returns:
-        A copy of the tool, or the tool itself if there is nothing to learn.
+    Parts that are learned already stay the same, even if they were learned from another database. If there is nothing
+    to learn, the tool itself is returned.
 
     Raises:
         InputError: images cannot be read, are too few or too many, or a stored file is damaged or of another kind.

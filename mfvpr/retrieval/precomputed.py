@@ -62,12 +62,7 @@ class FeatureFiles:
     )
 
     def open(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
-        """Open the features of a folder's images; `partial` allows missing images.
-
-        Raises:
-            InputError: the folder has no file, an entry also matches an image of another folder, or see
-                `open_features`.
-        """
+        """Open the features of a folder's images; `partial` allows missing images."""
         file = _file_of(self.files, folder)
         features = open_features(
             file.path, file.names(folder), image_size=self.image_size, lengths=self.lengths, partial=partial
@@ -83,7 +78,6 @@ class DescriptorFiles:
     Attributes:
         files: by the root of the folder of images.
         lengths: see `mfvpr.io.read_global_descriptors`.
-        search: search among the descriptors.
     """
 
     files: Mapping[Path, File]

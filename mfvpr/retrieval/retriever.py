@@ -30,25 +30,13 @@ class Retriever(Protocol):
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """Best candidates of each query, without database images that the sequence excludes.
-
-        Args:
-            sequence: Q queries.
-            database: N images.
-            num_candidates: C.
-            cache: cache of features of the images.
-        """
+        """Best candidates of each query, without database images that the sequence excludes."""
         ...
 
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Candidates by global descriptors.
-
-    Attributes:
-        describer: computes descriptors from pixels or from local features.
-        search: search among the descriptors.
-    """
+    """Candidates by search among global descriptors, which are computed from pixels or from local features."""
 
     describer: Extractor | Aggregated
     search: Search = EXACT

@@ -60,11 +60,7 @@ class ExactSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """See `Search`; dot products are cosine similarities if descriptors have unit length.
-
-        Raises:
-            InputError: dimensions or numbers of rows do not fit, or there are no descriptors.
-        """
+        """See `Search`; dot products are cosine similarities if descriptors have unit length."""
         if queries.shape[1] != database.shape[1]:
             raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
                              f"queries and {database.shape[1]} for the database")  # fmt: skip
@@ -114,11 +110,7 @@ class WhitenedSearch:
             raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
     def fit(self, database: Database) -> Search:
-        """Search with the principal components of a database.
-
-        Raises:
-            InputError: there are fewer finite descriptors, or fewer dimensions, than components.
-        """
+        """Search with the principal components of a database."""
         usable = database[np.isfinite(database).all(axis=1)]
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
         sample = usable[rows].astype(np.float64)

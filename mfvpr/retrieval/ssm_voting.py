@@ -55,12 +55,8 @@ def vote(
 ) -> Shortlist:
     """Candidates by votes, NumPy: most votes first, then the lowest row.
 
-    Args:
-        queries: their windows; a query with a window that is not finite has no candidates.
-        database: its windows; an image with a window that is not finite is no candidate.
-        num_candidates: also the number of nearest windows that each query window votes for.
-        excluded: images that must not appear for each query; their windows get no votes.
-        search: search for the nearest windows.
+    Each query window votes for `num_candidates` windows. A query with a window that is not finite has no candidates; a
+    database image with such a window is no candidate. Windows of `excluded` images get no votes.
     """
     usable0, usable1 = (np.asarray(np.isfinite(side).all(axis=(1, 2))) for side in (queries, database))
     windows = np.where(usable1[:, None, None], database, np.nan).reshape(-1, database.shape[2])

@@ -86,8 +86,7 @@ class AnchorPoints:
     def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
         """Cells of the first image that may be anchors; all occupied cells are among them.
 
-        Returns:
-            `[n]` each: row-major number, displacement in rows and in columns, occupancy, and weight of the cells.
+        `[n]` each: row-major number, displacement in rows and in columns, occupancy, and weight of the cells.
         """
         num_cells = self.num_bins**2
         weights = match_weights(self.weight, matches)

@@ -114,9 +114,9 @@ def flag(default: bool, note: str = "") -> Any:
     return _field(default, Parameter(default, note=note, choices=(True, False)), static=True)
 
 
-def table_value(values: Mapping[str, Any], default: str, note: str = "", *, file: str = "") -> Any:
+def table_value(values: Mapping[str, Any], default: str, *, file: str = "") -> Any:
     """Declare a value of a table, written as its name, or as a file with the suffix `file`."""
-    return _field(values[default], Parameter(default, note=note, choices=tuple(values), named=values, file=file))
+    return _field(values[default], Parameter(default, choices=tuple(values), named=values, file=file))
 
 
 def parameters_of(method: Any) -> dict[str, Parameter]:

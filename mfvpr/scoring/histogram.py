@@ -194,11 +194,7 @@ class HistogramOfShifts:
         return replace(self, max_bins=round_up(self._count_bins(image_size0, image_size1, most=MAX_BINS), multiple))
 
     def fit_capacity(self, image_size0: Array, image_size1: Array, multiple: int = 1) -> "HistogramOfShifts":
-        """`with_capacity` if `max_bins` is not set; unchanged if values are traced.
-
-        Raises:
-            InputError: see `with_capacity`, or `max_bins` is too small.
-        """
+        """`with_capacity` if `max_bins` is not set, else an InputError if it is too small; unchanged if traced."""
         require_sizes(image_size0, image_size1)
         if not is_concrete((self.bin_size, self.shift_range, image_size0, image_size1)):
             return self
@@ -229,11 +225,9 @@ class HistogramOfShifts:
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Histogram of the scale that has the tallest bin.
+        """Histogram of the scale that has the tallest bin: bin scores, bins, whether they are usable, and the scale.
 
-        Returns:
-            Bin scores `[B, B]` (y, x), -inf beyond the range of shifts; the bins; whether the scores are usable, `[]`;
-            the index of the scale, `[]`.
+        Scores are `[B, B]` (y, x), -inf beyond the range of shifts.
         """
         lattice, capacity = self._lattice(matches), self._capacity(matches)
         shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
@@ -325,15 +319,10 @@ def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, s
 def _mass_interval(
     scores: Float[Array, "bins bins"], lattice: Lattice, level: float | Array, sharpness: float | Array
 ) -> Float[jax.Array, "2 2"]:
-    """Interval (low, high) of (x, y) with the central mass along each axis.
+    """Interval (low, high) of (x, y) with the central share `level` of the mass along each axis.
 
-    The mass of a bin is s_ij^sharpness. Mass is spread evenly within a bin. Without votes all bins have the same mass.
-
-    Args:
-        scores: (y, x) s_ij, -inf beyond the range of shifts; scores below 0 count as 0.
-        lattice: positions of the bins.
-        level: share of the mass, between 0 and 1; the rest is split between both sides.
-        sharpness: exponent; the larger, the less mass the lower bins have.
+    The mass of a bin is s_ij^sharpness, for s_ij below 0 as for 0, and spread evenly within the bin. Without votes all
+    bins in the range of shifts have the same mass; beyond it s_ij is -inf.
     """
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)

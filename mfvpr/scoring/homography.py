@@ -24,10 +24,9 @@ _ROUNDS = 8  # the search ends after so many times the rounds that samples witho
 
 
 class Estimate(NamedTuple):
-    """Result of RANSAC for one pair.
+    """Result of RANSAC for one pair, after a number of samples.
 
     matrix: maps (x, y, 1) of the candidate to the query, px, last entry 1; NaN = no homography.
-    samples: number of samples before the search stopped.
     """
 
     matrix: Float[Array, "3 3"]

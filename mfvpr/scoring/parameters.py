@@ -53,13 +53,8 @@ def with_capacity(
     """The scorer with the capacities that pairs of these image sizes need.
 
     Call it before `vmap` or `jit` hide the sizes. Capacities are set by the method `fit_capacity(image_size0,
-    image_size1, multiple)` of a part, if it has one; see `HistogramOfShifts`.
-
-    Args:
-        scorer: any scorer, or a structure of scorers; parts are looked up at any depth.
-        image_size0: px, of queries.
-        image_size1: px, of candidates.
-        multiple: capacities are rounded up to a multiple of it, so that many values share few programs.
+    image_size1, multiple)` of parts at any depth; see `HistogramOfShifts`. They are rounded up to a `multiple`, so that
+    many values share few programs.
     """
     has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731
 

@@ -16,10 +16,7 @@ _TRIANGLE = np.tri(_BLOCK, dtype=np.float32).T
 
 
 def canonical_order(points: Float[Array, "slots 4"], real: Bool[Array, " slots"]) -> Int[Array, " slots"]:
-    """Slots of the real matches, sorted by a hash of their coordinates, then padding.
-
-    The order of the matches in the input has no effect.
-    """
+    """Slots of the real matches, sorted by a hash of their coordinates whatever their order, then padding."""
     bits = jax.lax.bitcast_convert_type(points.astype(jnp.float32) + 0.0, jnp.uint32)  # 0 and -0 are equal
     code = jnp.zeros(real.shape, jnp.uint32)
     for column in range(4):
@@ -48,13 +45,8 @@ def draw_samples(
     """Draw samples: (x1, y1, x0, y0) of four matches each, and their number.
 
     Only so many of the entries are samples. As in OpenCV's findHomography, a draw is rejected if no camera can see
-    it: three of the points lie on a line in one image, or some but not all triangles change their orientation.
-
-    Args:
-        points: coordinates, the real matches first.
-        key: of all rounds.
-        round_number: from 0.
-        count: number of real matches, at least 4.
+    it: three of the points lie on a line in one image, or some but not all triangles change their orientation. The
+    first `count` of the points, at least 4, are real matches.
     """
     index = jax.lax.optimization_barrier(draw_four(key, round_number, count))  # each coordinate would draw again
     number = _running_count(~_is_degenerate(_gather(points, index)))

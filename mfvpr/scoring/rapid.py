@@ -35,11 +35,7 @@ class RapidSpatialScore:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32.
-
-        Raises:
-            InputError: `per_feature` is set, and the matches have no `count0`.
-        """
+        """Score of one pair, float32; an InputError if `per_feature` is set and the matches have no `count0`."""
         confidence, shifts = match_confidence(matches), match_shifts(matches)
         residuals = jnp.abs(shifts - masked_mean(shifts, matches.mask, confidence)[None])
         closeness = self._reach(matches, shifts, confidence > 0)[None] - residuals

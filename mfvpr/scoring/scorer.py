@@ -50,11 +50,7 @@ def check_host(scorer: Any) -> None:
 
 
 def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
-    """Scores of pairs `[P, K, ...]`, float32, by the method `score_pairs` of a scorer.
-
-    Raises:
-        InputError: the method does not return a real number for each pair.
-    """
+    """Scores of pairs `[P, K, ...]`, float32, by the method `score_pairs` of a scorer."""
     scores = np.asarray(scorer.score_pairs(matches))
     require_scores(f"{type(scorer).__name__}.score_pairs", scores, len(matches.mask))
     return scores.astype(np.float32)

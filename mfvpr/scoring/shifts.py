@@ -59,11 +59,7 @@ def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Arra
 
 
 def query_features(matches: Matches) -> Float[jax.Array, ""]:
-    """Number of the query's keypoints, at least 1, float32: divisor of scores per feature.
-
-    Raises:
-        InputError: the matches have no `count0`.
-    """
+    """Number of the query's keypoints, at least 1, float32: divisor of scores per feature."""
     if matches.count0 is None:
         raise InputError("per_feature=True: expected matches that know how many keypoints the query has (count0), got "
                          "None")  # fmt: skip

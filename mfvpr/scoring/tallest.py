@@ -43,15 +43,9 @@ def tallest_bins(
     lattice: Lattice,
     capacity: int,
 ) -> Float[Array, "candidates weightings"]:
-    """Scores of the tallest bins of pairs, with several weights of each match.
+    """Scores of the tallest bins of pairs, with several weights of each match; a weight not finite scores NaN.
 
-    The derivative is the one of the maximum over all bins.
-
-    Args:
-        shifts: along x and along y.
-        weights: 0 on padding; a weight that is not finite makes its score NaN.
-        lattice: `[C, ...]`, of at most `capacity` bins along each axis.
-        capacity: static.
+    The derivative is the one of the maximum over all bins, of which there are at most `capacity` along each axis.
     """
     pairs, num_weights = (shifts, weights, lattice), weights.shape[1]
     if capacity**2 * num_weights <= WORTHWHILE:

@@ -18,22 +18,14 @@ _FORMAT = "mfvpr match weight 1"
 
 
 def write_weight(path: Path | str, weight: LearnedWeight, provenance: Mapping[str, Any]) -> None:
-    """Write a weight as JSON, exact to the last bit, with its provenance (JSON values).
-
-    Raises:
-        ValueError: a number is not finite.
-    """
+    """Write a weight of finite numbers as JSON, exact to the last bit, with its provenance (JSON values)."""
     arrays = {f.name: np.asarray(getattr(weight, f.name)).tolist() for f in fields(weight) if f.name != "names"}
     content = {"format": _FORMAT, "made": provenance, "inputs": list(weight.names), **arrays}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
-    """Weight and provenance from a file of `write_weight`, exact to the last bit.
-
-    Raises:
-        InputError: the file does not exist, or is not a file of `write_weight`.
-    """
+    """Weight and provenance from a file of `write_weight`, exact to the last bit; an InputError for other files."""
     path = Path(path)
     require_file(path, "a match weight that mfvpr learn wrote")
     try:

@@ -26,10 +26,8 @@ class Sink:
 
     Attributes:
         pick: the part of a description.
-        store: None = in memory.
-        keys: of the images.
+        store: None = in memory, in `items` by key.
         forecast: number of images -> bytes on disk.
-        items: by key, without a store.
     """
 
     pick: Callable[[Description], Any]
@@ -70,7 +68,6 @@ class Extraction:
     """The state of one extractor on one folder of images.
 
     Attributes:
-        extractor: of the descriptions.
         sinks: of the parts of its descriptions: the global descriptor, if it gives one, and each scale.
         bad: row -> reason, for images without features.
         is_announced: whether the user was told where the features are.

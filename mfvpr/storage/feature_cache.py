@@ -25,8 +25,7 @@ from mfvpr.storage import matches as match_stores
 from mfvpr.storage.disk import lock_store
 from mfvpr.storage.extraction import Extraction, describe_rows, open_sinks
 from mfvpr.storage.manifest import LOCKS, MATCHES, store_path
-from mfvpr.storage.memo import Memo, Value, states
-from mfvpr.storage.recipes import Recipes
+from mfvpr.storage.recipes import Memo, Recipes, Value, states
 from mfvpr.storage.rows import require_space
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint
@@ -132,11 +131,7 @@ class FeatureCache:
     def describe(
         self, folder: ImageFolder, extractor: Extractor, rows: Iterable[int] | None = None, *, label: str = "image"
     ) -> Extraction:
-        """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages.
-
-        Raises:
-            InputError: an image cannot be read (unless `skip_bad`), or a store cannot be used.
-        """
+        """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages."""
         requested = range(len(folder)) if rows is None else [*rows]
         state = self.once("extraction", lambda: self._open(folder, extractor), folder, extractor)
         with ExitStack() as stack:
@@ -174,7 +169,7 @@ class FeatureCache:
             sizes: number of queries, and of candidates of each.
             rows: the queries that are going to be matched, while other processes match others; None = all.
             typical: number of matches of a pair, about.
-            label: names the matches in messages.
+            label: stands in messages.
         """
         if self.root is None:
             raise ValueError("nothing is kept on disk: this cache has no root")

@@ -30,13 +30,11 @@ class Kind:
     """A kind of store, in the words of its manifest and of its messages.
 
     Attributes:
-        store: its name.
         version: of its arrays on disk.
         content: of a row.
         rows: the things that rows belong to.
         remake: verb for making a row again; None = no run can make it again, so that nothing is removed, and no
             message advises it.
-        compress: whether files are compressed.
     """
 
     store: str

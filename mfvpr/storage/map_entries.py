@@ -20,12 +20,7 @@ DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more fu
 
 
 class Entry(NamedTuple):
-    """The data of an image in a map, without its features.
-
-    name: of the image.
-    place: of the image: any JSON value.
-    vector: global descriptor, float32.
-    """
+    """The data of an image in a map, without its features; the place is any JSON value."""
 
     name: str
     place: Any

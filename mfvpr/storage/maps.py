@@ -104,8 +104,6 @@ class _Segment:
     """Both stores of a segment, and its tokens, when they were opened.
 
     Attributes:
-        features: local features.
-        entries: names, places and global descriptors.
         tokens: `[SEGMENT]` of the rows that exist; 0 = no row.
         stamp: `file_stamp` of the file of tokens.
         known: `[SEGMENT]` bool, rows that `MapRows.new` gave.
@@ -243,12 +241,7 @@ class MapRows:
 
     @contextmanager
     def adding(self) -> Iterator[Callable[[Sequence[MapImage]], None]]:
-        """Lock the rows; yields a function that writes images to disk, behind all other rows.
-
-        Raises:
-            InputError: another process has the lock, the map has another recipe, or its folder cannot be written; or
-                the disk is full: earlier rows stay.
-        """
+        """Lock the rows; yields a function that writes images to disk, behind all other rows, which stay."""
         with ExitStack() as stack:
             self._lock_last(stack)
             yield partial(self._add, stack)

@@ -37,13 +37,7 @@ Parts = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class RowFormat(Generic[Item]):
-    """Content of a row.
-
-    Attributes:
-        kind: of the store.
-        pack: item -> arrays by name; the first has a value for each of the row's entries.
-        unpack: arrays by name -> item.
-    """
+    """Content of a row: the first of the packed arrays has a value for each of the row's entries."""
 
     kind: Kind
     pack: Callable[[Item], Parts]
@@ -75,7 +69,7 @@ class RowStore(Generic[Item]):
         tokens: np.ndarray | None = None,
         lock: Callable[[Path, str], AbstractContextManager[None]] = lock_store,
     ) -> None:
-        """Open the store, and find the rows that are done.
+        """Open the store, and find the rows that are done; an InputError if it was made from something else.
 
         Args:
             folder: see `manifest.store_path`.
@@ -86,9 +80,6 @@ class RowStore(Generic[Item]):
             tokens: `[M]` a number of each row that its file knows as well: a file of the same name that was written
                 with another number is a damaged one. None = names alone tell rows apart.
             lock: of the folder while rows are written, with the content for messages.
-
-        Raises:
-            InputError: made from something else, or no store at all.
         """
         self.folder = folder.absolute()  # the working directory may change
         self.kind, self.sizes, self.is_writable = form.kind, sizes, False
@@ -160,16 +151,13 @@ class RowStore(Generic[Item]):
     def write(self, items: Mapping[int, Item]) -> None:
         """Store a batch of items by row. When this returns they are done, and on disk.
 
-        Raises:
-            InputError: the disk is full, or cannot be written: rows done before stay intact. Or a row has other arrays
-                than the rows before it.
-            ValueError: a row is done or does not exist, an item cannot be stored, or the store is not entered.
+        If the disk is full or cannot be written, an InputError is raised, and rows done before stay intact.
         """
         if items:
             self.write_parts(self.pack(items))
 
     def pack(self, items: Mapping[int, Item]) -> dict[int, Parts]:
-        """Check a batch of rows and pack it for `write_parts`, without a write; raises as `write`."""
+        """Check a batch of rows and pack it for `write_parts`, without a write."""
         if refused := [row for row in items if not 0 <= row < len(self.counts) or self.counts[row] >= 0]:
             raise ValueError(f"{self.folder}: row {refused[0]} is done or does not exist")
         if not self.is_writable:
@@ -195,11 +183,8 @@ class RowStore(Generic[Item]):
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Item]]:
         """(row, item) of rows that are done, by default of all; threads read ahead.
 
-        Raises:
-            InputError: rows are damaged on disk, or the disk cannot be read. All rows are read before the error is
-                raised, but none is yielded after the first damaged one. Damaged rows are removed if a run can make
-                them again.
-            ValueError: a row is not done.
+        If rows are damaged, all rows are read before the InputError is raised, but none is yielded after the first
+        damaged one. Damaged rows are removed if a run can make them again.
         """
         rows = np.flatnonzero(self.done).tolist() if rows is None else list(rows)
         if missing := [row for row in rows if self.counts[row] < 0]:

@@ -4,6 +4,7 @@ A row store (`mfvpr.storage.rows`). A row holds one `vector` float32 `[D]`, or s
 """
 
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,10 @@ VectorStore = RowStore[np.ndarray]
 
 def open_vector_store(folder: Path, recipe: Mapping[str, Any], *, num_images: int, **options: Any) -> VectorStore:
     """The store in `folder`; see `features.open_store`."""
-    return RowStore(folder, RowFormat(VECTORS, _pack, _unpack), recipe, {"num_images": num_images}, **options)
+    form = RowFormat(VECTORS, lambda vector: {"vector": np.asarray(vector, np.float32)}, itemgetter("vector"))
+    return RowStore(folder, form, recipe, {"num_images": num_images}, **options)
 
 
 def forecast_bytes(num_images: int, size: int) -> int:
     """Bytes on disk, at most, of one vector of `size` numbers per image."""
     return num_images * row_bytes(4 * size, 1)
-
-
-def _pack(vector: np.ndarray) -> dict[str, np.ndarray]:
-    return {"vector": np.asarray(vector, np.float32)}
-
-
-def _unpack(parts: Mapping[str, np.ndarray]) -> np.ndarray:
-    return parts["vector"]

@@ -24,17 +24,10 @@ _PARSING = threading.Lock()
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
-    """Write arrays by name. When this returns they are on disk; until then, the file before stays.
+    """Write arrays of numbers, flags or text by name. When this returns they are on disk; until then, the file stays.
 
-    Args:
-        path: `.npz`.
-        arrays: of numbers, flags or text.
-        about: label of the arrays; `read_arrays` must get the same, so exchanged files are noticed.
-        compress: for values that repeat; numbers that look random shrink by a tenth only.
-
-    Raises:
-        OSError: the disk is full, or cannot be written.
-        ValueError: there is an array of Python objects.
+    `read_arrays` must get the same label `about`, so exchanged files are noticed. Use `compress` for values that
+    repeat; numbers that look random shrink by a tenth only.
     """
     buffer = io.BytesIO()
     kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
@@ -86,11 +79,7 @@ def _array(member: bytes | memoryview) -> np.ndarray:
 
 @lru_cache(256)
 def _header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """The header of an array, cached: rows of one store have few different ones, and NumPy reads them slowly.
-
-    Raises:
-        ValueError: another version of the format, or an array of Python objects.
-    """
+    """The header of an array, cached: rows of one store have few different ones, and NumPy reads them slowly."""
     if header[6:8] != b"\x01\x00":
         raise ValueError(f"expected an array in version 1.0 of NumPy's format, got {header[6]}.{header[7]}")
     with _PARSING:

@@ -76,11 +76,7 @@ def canonical_name(path: Path | str) -> str:
 
 
 def path_inside(root: Path, name: str) -> Path:
-    """The path of a name from elsewhere below a folder; the file may be missing, links are followed.
-
-    Raises:
-        InputError: the name leads out of the folder: absolute, with "..", or by a link.
-    """
+    """The path of a name from elsewhere below a folder; an InputError if the name leads out, also by a link."""
     try:
         path = (root / name).resolve()
         if ".." not in Path(name).parts and path.is_relative_to(root.resolve()):

@@ -19,12 +19,9 @@ Tree = TypeVar("Tree")
 def pad_rows(
     rows: Sequence[Row], capacity: int, *, total: int | None = None
 ) -> tuple[dict[str, Shaped[np.ndarray, "rows slots ..."]], Bool[np.ndarray, "rows slots"]]:
-    """Rows as padded arrays by name, 0 beyond the ends of the rows, and the mask.
+    """At least one row as padded arrays by name, 0 beyond the ends of the rows, and the mask.
 
-    Args:
-        rows: at least one, of the same names; none longer than `capacity`.
-        capacity: slots of a row.
-        total: number of rows of the arrays, those beyond `rows` are empty. By default the number of `rows`.
+    No row is longer than `capacity`. The arrays have `total` rows; those beyond `rows` are empty.
     """
     total = len(rows) if total is None else total
     arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}

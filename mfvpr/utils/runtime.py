@@ -13,7 +13,7 @@ from mfvpr.utils.progress import Track, no_progress
 
 @dataclass(frozen=True)
 class Runtime:
-    """Devices, memory, progress, messages and cluster of a call.
+    """Settings of a call that change no result.
 
     Attributes:
         devices: that share the work; None = the default device of JAX.

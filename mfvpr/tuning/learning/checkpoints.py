@@ -27,11 +27,7 @@ _KEPT = 2
 
 @contextmanager
 def lock_checkpoints(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, which is made if it is missing.
-
-    Raises:
-        InputError: another process trains in it, it is no folder of checkpoints, or it cannot be made.
-    """
+    """Lock a folder of checkpoints, which is made if it is missing."""
     _holds_checkpoints(folder)
     in_use = InputError(f"{folder}: another process trains here; wait until it ends, or choose another folder")
     with ExitStack() as stack:
@@ -46,10 +42,8 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
 def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
     """Write the checkpoint of a step above all earlier ones, and remove all but the last two.
 
-    `state` is a pytree of arrays; `recipe` and `progress` are JSON values.
-
-    Raises:
-        InputError: the disk is full, or cannot be written. Earlier checkpoints stay.
+    `state` is a pytree of arrays; `recipe` and `progress` are JSON values. If the disk is full, earlier checkpoints
+    stay.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     arrays = {str(place): leaf for place, leaf in enumerate(leaves)}

@@ -34,7 +34,6 @@ class Row:
 
     Attributes:
         half: name of the half to choose or learn on.
-        name: of the score.
         hits: of the queries of the other half.
         values: chosen or learned parameters, as plain values.
         fitted: the training; None if nothing was trained.
@@ -49,14 +48,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The scores of all halves.
-
-    Attributes:
-        protocol: the ground truth.
-        match_set: of all queries.
-        candidates: their shortlist.
-        halves: the rows of each half, in the same order.
-    """
+    """The scores of all halves: `halves` has the rows of each half, in the same order."""
 
     protocol: EvaluationProtocol
     match_set: MatchSet
@@ -86,9 +78,7 @@ def compare(
         protocol: the ground truth, with halves.
         match_set: matches of Q queries with C candidates, with their ratio.
         candidates: their shortlist.
-        options: of the learning.
         checkpoints: where an interrupted training is continued; None = nowhere.
-        runtime: progress.
 
     Raises:
         InputError: the scorer has nothing to learn or no match weight, a setting cannot be scored, a half has too few

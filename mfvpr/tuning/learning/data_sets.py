@@ -18,14 +18,7 @@ from mfvpr.utils.ragged import repeat_last
 
 @dataclass(frozen=True)
 class Part:
-    """One data set.
-
-    Attributes:
-        name: of the data set.
-        protocol: ground truth of all queries.
-        match_set: matches of Q queries with C candidates.
-        candidates: their shortlist.
-    """
+    """One data set: ground truth, matches and shortlist of all queries."""
 
     name: str
     protocol: EvaluationProtocol

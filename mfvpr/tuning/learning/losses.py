@@ -1,7 +1,8 @@
 """Losses of one query's ranking: scores, positives and mask of the candidates -> a number, smaller = better.
 
 Positives are the correct candidates. Scores of padding may be anything. A query without a positive has the loss 0 and
-the gradient 0. For `mean_loss`, set a temperature with `functools.partial`.
+the gradient 0. For `mean_loss`, set a temperature with `functools.partial`. A temperature is in units of the scores; a
+temperature not above 0 makes the loss NaN.
 """
 
 from collections.abc import Callable
@@ -35,9 +36,6 @@ def smooth_recall_at_1(
     """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
 
     It tends to 1 - R@1 as the temperature tends to 0.
-
-    Args:
-        temperature: above 0, in units of the scores; else the loss is NaN.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)
     probability = jax.nn.softmax(scores / positive(temperature, scores.dtype), where=real)
@@ -53,9 +51,6 @@ def smooth_average_precision(
     The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
     far their score is above its own. The loss tends to 1 - average precision as the temperature tends to 0; a tie
     counts half.
-
-    Args:
-        temperature: above 0, in units of the scores; else the loss is NaN.
     """
     scores, positives, real, teaches = _usable(scores, positives, mask)
     lead = jax.nn.sigmoid((scores[None] - scores[:, None]) / positive(temperature, scores.dtype))  # [i, j] of j over i

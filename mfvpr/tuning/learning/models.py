@@ -44,12 +44,9 @@ class Model:
 
     @classmethod
     def of(cls, scorer: Any, unit: float, *, c: float | None = None, weight: LearnedWeight | None = None) -> "Model":
-        """A model that starts from the values of a hard scorer.
+        """A model that starts from the values of a hard scorer, whose scores have the spread `unit`.
 
-        Args:
-            scorer: the hand-set one; `unit` is the spread of its scores.
-            c: the retrieval's weight to start with; None = not fused.
-            weight: the match weight to start with; None = that of the scorer, which is not learned.
+        It also learns the retrieval's weight c and the match weight, if they are given, from these values on.
         """
         start: Parameters = {
             "numbers": to_logarithms(starts(scorer, unit)),

@@ -34,17 +34,14 @@ class Batch:
 
 @dataclass(frozen=True)
 class TrainingSplit:
-    """One half of the path to learn on.
+    """One half of the path to learn on; matches, candidates and ground truth are those of all queries.
 
     Attributes:
-        match_set: matches of all queries.
-        candidates: of all queries; their scores are the retrieval's part of a combined score.
-        protocol: the ground truth.
+        candidates: their scores are the retrieval's part of a combined score.
         half: queries to choose on and to report on.
         train: queries of the losses.
         validation: queries that decide when learning stops.
         seen: candidates that learning may use.
-        name: of the half.
     """
 
     match_set: MatchSet
@@ -71,7 +68,7 @@ class TrainingSplit:
 
     @cached_property
     def width(self) -> int:
-        """Number of candidates of a batch, at least the number of usable candidates of every query."""
+        """Number of candidates of a batch, which holds the usable candidates of every query."""
         most = int(self.usable[self.half.tune].sum(axis=1).max())
         return min(round_up(most, 8), self.usable.shape[1])
 

@@ -27,7 +27,7 @@ class Options:
 
     Attributes:
         c: the retrieval's weight if it is set by hand; None = balanced.
-        retrieval_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.fuse_shortlist`.
+        retrieval_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.retrieval_scores`.
         ties: as in `mfvpr.reranking.ranking.rank_shortlist`.
         loss: of one query.
         steps: updates of a training, at most.
@@ -59,9 +59,7 @@ def start(
 ) -> Model:
     """The model that learns from rankings, starting from a hard scorer.
 
-    Args:
-        fused: learn the retrieval's weight as well.
-        learned_weight: learn the match weight as well, starting from 1 for every match.
+    It learns the retrieval's weight as well (`fused`), and the match weight, starting from 1 (`learned_weight`).
     """
     weight = None
     if learned_weight:

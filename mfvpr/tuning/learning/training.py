@@ -51,8 +51,6 @@ class Fit(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The state of a training, without its history."""
-
     parameters: Any
     best: Any
     optimizer: Any
@@ -75,7 +73,6 @@ class Schedule:
     """The schedule of a training.
 
     Attributes:
-        optimizer: of optax.
         steps: total number of updates, also of a resumed training.
         every: steps from one validation, and checkpoint, to the next; the last step has both as well.
         patience: validations without a gain after which to stop; None = do all steps.

@@ -80,19 +80,11 @@ class Axes:
         return Axes(self.scorer, {key: value for key, value in self.values.items() if key != name}, self.own)
 
     def setting(self, plain: Mapping[str, Any]) -> Setting:
-        """Convert plain values to a setting of `mfvpr.tuning.sweeps.rank_settings`.
-
-        Raises:
-            InputError: a word that its parameter does not have.
-        """
+        """Convert plain values to a setting of `mfvpr.tuning.sweeps.rank_settings`."""
         return {name: self._value(name, value) for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        """Raise an InputError before any work if a histogram has too many bins.
-
-        Args:
-            image_sizes: `[n, 2]` all sizes of queries and of database images (`MatchSet.image_sizes`).
-        """
+        """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
             with_capacity(with_parameters(self.scorer, setting), *image_sizes)
 

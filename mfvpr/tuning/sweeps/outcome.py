@@ -15,11 +15,9 @@ from mfvpr.tuning.sweeps.axes import Axes
 
 
 class Verdict(NamedTuple):
-    """Comparison of the chosen settings with the scorer's own values, at one threshold.
+    """Comparison of the recall@1 of the chosen settings with the scorer's own values, at one threshold.
 
-    threshold: largest distance of a correct prediction.
     queries: number of queries that are reported on.
-    chosen, own: recall@1.
     mcnemar: test of their difference; the chosen settings are first.
     sign_flips: the same test by blocks of the path.
     """
@@ -37,7 +35,6 @@ class Outcome:
     """All rankings of a sweep, and their evaluation.
 
     Attributes:
-        axes: of the sweep.
         protocol: the ground truth, with the views of the shortlist.
         settings: in plain values; those of a complete grid come first, in its order.
         rows: of the database, best first.

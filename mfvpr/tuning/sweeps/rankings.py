@@ -36,7 +36,6 @@ SETTINGS_PER_BLOCK = 64
 _ALONE = "alone"  # the c of a score that is not fused
 _STEP = 1.0  # seconds of the settings that one batch is scored with, about
 _MEASURED = 64  # settings x batches: less work is done before its time is measured
-_PROBES = 3  # programs whose time is measured; the others lie between them
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class SweepOptions:
     Attributes:
         ks: depths of the recall; the largest is the number of rows of a ranking.
         ties: see `mfvpr.reranking.ranking.rank_shortlist`.
-        retrieval_score: see `mfvpr.reranking.ranking.fuse_shortlist`.
+        retrieval_score: see `mfvpr.reranking.ranking.retrieval_scores`.
         settings_per_block: None = 64.
         queries_per_block: None = as many as fit into 256 MB.
         folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
@@ -225,31 +224,24 @@ def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Bl
 
 
 def _compute(blocks: Sequence[Block], options: SweepOptions) -> Iterator[tuple[Block, np.ndarray]]:
-    """Rows of the blocks; long work logs its expected time, and advances its progress about every second."""
-    paces = _measure(blocks)
-    if sum(block.amount for block in blocks) > _MEASURED:
-        seconds = sum(block.amount * paces[block.number][0] for block in blocks)
-        options.runtime.log(f"{options.label}: {duration(seconds + sum(pace[1] for pace in paces.values()))}")
-    sizes = {number: max(1, int(_STEP / seconds)) for number, (seconds, _) in paces.items()}
-    total = sum(block.part.num_batches * len([*block.group.blocks(sizes[block.number])]) for block in blocks)
+    """Rows of the blocks; long work logs its expected time, and advances its progress about every second.
+
+    The time is that of the first, the middle and the last program, on average.
+    """
+    size, amount = SETTINGS_PER_BLOCK, sum(block.amount for block in blocks)
+    if amount > _MEASURED:
+        programs = list({block.number: block for block in blocks if block.amount}.values())
+        probes = {0, len(programs) // 2, len(programs) - 1}
+        pace, compilation = np.mean([_seconds(programs[place]) for place in probes], axis=0)
+        options.runtime.log(f"{options.label}: {duration(amount * pace + len(programs) * compilation)}")
+        size = max(1, int(_STEP / pace))
+    total = sum(block.part.num_batches * len([*block.group.blocks(size)]) for block in blocks)
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
     for part, of_part in itertools.groupby(blocks, lambda block: block.part):
         batches = list(all_batches(part.match_set, part.queries, settings=part.settings))
         for block in of_part:
-            yield block, block.rows(batches, sizes[block.number], ticks)
+            yield block, block.rows(batches, size, ticks)
     next(ticks, None)
-
-
-def _measure(blocks: Sequence[Block]) -> dict[int, tuple[float, float]]:
-    """`_seconds` by program, measured for some and interpolated for the others; a guess for little work."""
-    if sum(block.amount for block in blocks) <= _MEASURED:
-        return {block.number: (_STEP / SETTINGS_PER_BLOCK, 0.0) for block in blocks}
-    examples = {block.number: block for block in reversed(blocks) if block.amount}
-    numbers = sorted(examples)
-    measured = sorted({numbers[place] for place in np.linspace(0, len(numbers) - 1, _PROBES).round().astype(int)})
-    columns = zip(*(_seconds(examples[number]) for number in measured), strict=True)
-    paces = zip(*(np.interp(numbers, measured, column).tolist() for column in columns), strict=True)
-    return dict(zip(numbers, paces, strict=True))
 
 
 def _seconds(block: Block) -> tuple[float, float]:

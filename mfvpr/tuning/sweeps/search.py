@@ -26,18 +26,7 @@ def search_grid(
     axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist,
     options: SweepOptions = DEFAULT_OPTIONS,
 ) -> Outcome:  # fmt: skip
-    """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them.
-
-    Args:
-        axes: of the grid.
-        protocol: the ground truth, and the queries to choose on.
-        match_set: matches of Q queries with C candidates.
-        candidates: their shortlist.
-        options: depths of the recall, ties, blocks and runtime.
-
-    Raises:
-        InputError: a setting cannot be scored.
-    """
+    """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them."""
     axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), axes.grid()
     settings += [] if dict(axes.own) in settings else [dict(axes.own)]
@@ -53,16 +42,7 @@ def search_optuna(
     """Rank with the scorer's own values, and with settings that Optuna's sampler (TPE) proposes from a seed.
 
     Numbers are drawn between the smallest and the largest value of an axis, words among its values. If the protocol has
-    halves, Optuna gets the mean recall of the queries to choose on. Arguments not listed here are those of
-    `search_grid`.
-
-    Args:
-        axes: bounds, or words to choose from.
-        trials: number of settings that Optuna proposes.
-        seed: of the sampler.
-
-    Raises:
-        InputError: Optuna is not installed, or a setting cannot be scored.
+    halves, Optuna gets the mean recall of the queries to choose on.
     """
     require_optuna()
     import optuna

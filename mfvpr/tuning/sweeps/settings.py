@@ -62,13 +62,7 @@ def distinct(settings: Sequence[Setting]) -> tuple[list[dict[str, Any]], list[li
 def group_by_program(
     scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
 ) -> Iterator[Group]:
-    """Group settings by program.
-
-    Args:
-        scorer: its other parameters stay.
-        settings: the same names in each. Each value of a static parameter, and None, has its own program.
-        image_sizes: `[n, 2]` all sizes of queries and of database images.
-    """
+    """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
     static, integers = parameters.static_names(scorer), parameters.whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
