@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import mfvpr
-from mfvpr.evaluation import Pipeline, System, evaluate
+from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.reranking import Fusion
 from mfvpr.retrieval import Retrieval
@@ -87,8 +87,8 @@ def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset
         return track
 
     runtime = Runtime(cluster=cluster, progress=progress)
-    result = evaluate(dataset, system, cache=FeatureCache(tmp_path / "store"), runtime=runtime)
-    assert_same(result, evaluate(dataset, system, cache=FeatureCache(tmp_path / "plain")))
+    result = rank_dataset(dataset, system, cache=FeatureCache(tmp_path / "store"), runtime=runtime)
+    assert_same(result, rank_dataset(dataset, system, cache=FeatureCache(tmp_path / "plain")))
     assert {"database descriptors", "query folder descriptors", "matching"} <= labels
 
 
@@ -98,9 +98,9 @@ def test_a_killed_worker_costs_time_alone(dataset, cluster, flag, tmp_path, stag
              "matching": {"matcher": FatalMatcher(flag)}}  # fmt: skip
     vars(fatal["describing"]["extractor"])["program"] = threading.Lock()  # as after its use in this process
     cache = FeatureCache(tmp_path / "store", runtime=Runtime(cluster=cluster))
-    result = evaluate(dataset, system_of(**fatal[stage]), cache=cache)
+    result = rank_dataset(dataset, system_of(**fatal[stage]), cache=cache)
     assert not Path(flag).exists()
-    assert_same(result, evaluate(dataset, system_of(), cache=FeatureCache(tmp_path / "plain")))
+    assert_same(result, rank_dataset(dataset, system_of(), cache=FeatureCache(tmp_path / "plain")))
 
 
 def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path):
@@ -131,4 +131,4 @@ def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(datas
 
 def test_a_cluster_needs_a_folder(dataset, cluster):
     with pytest.raises(InputError, match="cluster: expected a cache with a root"):
-        evaluate(dataset, system_of(), runtime=Runtime(cluster=cluster))
+        rank_dataset(dataset, system_of(), runtime=Runtime(cluster=cluster))

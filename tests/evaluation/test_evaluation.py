@@ -24,7 +24,7 @@ from mfvpr.report.evaluations import EvaluationReport, recall_table, write_ranki
 from mfvpr.reranking import Fusion
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
-from mfvpr.storage import FeatureCache, feature_cache
+from mfvpr.storage import FeatureCache, extraction
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
@@ -310,7 +310,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
         clock[0] += 10
         yield from describe_folder(*arguments, **options)
 
-    monkeypatch.setattr(feature_cache, "describe_folder", slow)
+    monkeypatch.setattr(extraction, "describe_folder", slow)
     seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}
