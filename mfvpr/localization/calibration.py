@@ -16,6 +16,7 @@ from mfvpr.evaluation.system import System
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 _FILE = "confidence.json"
 TOLERANCES, RADIUS = (1, 2, 5), 25.0  # of the programs: a prediction is correct within 2 frames, or 25 m
@@ -33,11 +34,31 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     return fit_confidence(confidence_inputs(ranked, by_retrieval), positives.contains(ranked.rows)[:, 0])
 
 
-def write_confidence(folder: Path, name: str, confidence: Confidence) -> None:
+def write_confidence(folder: Path, system: System, confidence: Confidence) -> None:
     """Keep the confidence of the ranking that decides in the folder of a map."""
-    write_confidences(folder / _FILE, {name: confidence}, {})
+    write_confidences(folder / _FILE, {system.headline: confidence}, {"system": _fingerprint(system)})
 
 
-def read_confidence(folder: Path, name: str) -> Confidence | None:
-    """The confidence of a map for the ranking that decides; None if it was never calibrated."""
-    return read_confidences(folder / _FILE)[0].get(name) if (folder / _FILE).exists() else None
+def read_confidence(folder: Path, system: System) -> Confidence | None:
+    """The confidence of a map for the ranking that decides; None if it was never calibrated.
+
+    Raises:
+        InputError: it was calibrated with another system.
+    """
+    if not (folder / _FILE).exists():
+        return None
+    confidences, made = read_confidences(folder / _FILE)
+    if system.headline not in confidences or made.get("system") != _fingerprint(system):
+        raise InputError(f"{folder / _FILE}: expected the confidence of this map's system, got that of another one; "
+                         "remove the file, then calibrate again")  # fmt: skip
+    return confidences[system.headline]
+
+
+def _fingerprint(system: System) -> str | None:
+    """A hash of everything that scores depend on; None if a part has no recipe."""
+    pipeline = system.pipeline
+    parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
+    try:
+        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
+    except TypeError:
+        return None

@@ -77,7 +77,7 @@ class Map(MapImages):
         """
         extractor, describer, candidates = _extractor(system), _describer(system), system.pipeline.candidates
         check_declaration(Path(folder), system)
-        self.confidence = confidence or read_confidence(Path(folder), system.headline)
+        self.confidence = confidence or read_confidence(Path(folder), system)
         if threshold is not None and self.confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.system, self.threshold = system, threshold
@@ -130,7 +130,7 @@ class Map(MapImages):
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
         self.confidence = fit_on_drive(dataset, self.system, cache)
-        write_confidence(self.folder, self.system.headline, self.confidence)
+        write_confidence(self.folder, self.system, self.confidence)
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0) -> Prediction:

@@ -22,6 +22,7 @@ from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, printable, write_text
 
 if TYPE_CHECKING:
@@ -140,6 +141,8 @@ def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
 def recall_table(evaluation: EvaluationReport) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
     truth, ks, main = evaluation.sequences[0].truth, evaluation.ks, len(evaluation.thresholds) // 2
+    if not evaluation.thresholds:
+        raise InputError(f"{evaluation.ranked.dataset.name}: there is no ground truth, so no recall; see `predictions`")
     cells = [(place, 0) for place in range(len(evaluation.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
     unit = "exact" if truth is None else truth.unit
     labels = [f"R@{ks[depth]}{threshold_words(unit, evaluation.thresholds[place])}" for place, depth in cells]

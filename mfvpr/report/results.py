@@ -107,10 +107,15 @@ class Result:
         return next(iter(self.parts.values()))
 
     def table(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> Table:
-        """Recall in %: of every final score of a single system, or of those that decide of several systems."""
+        """Recall in %: of every final score of a single system, or of those that decide of several systems.
+
+        Data sets without ground truth are left out; an InputError if there is no other.
+        """
         several_data, several_systems = (len(self._names(place)) > 1 for place in (0, 1))
         rows: list[dict[str, str]] = []
-        for (dataset, system), report in self._reports(thresholds, ks):
+        reports = [*self._reports(thresholds, ks)]
+        known = [(names, report) for names, report in reports if report.thresholds] or reports
+        for (dataset, system), report in known:
             table = recall_table(report)
             for line in table.rows:
                 row = ({"data set": dataset} if several_data else {}) | dict(zip(table.header, line, strict=True))
@@ -169,7 +174,7 @@ class Result:
             for (dataset, system), report in self._reports(thresholds, ks):
                 folders.append(root / files[0][dataset] / files[1][system] if several else root)
                 save_run(folders[-1], report, self.cache)
-            if several:
+            if several and any(report.thresholds for _, report in self._reports(thresholds, ks)):
                 write_table(root, self.table(thresholds, ks), f"recall in %, {self!r}")
         return folders
 

@@ -220,7 +220,7 @@ class HistogramOfShifts:
 
     def _fit_to(self, matches: Matches) -> "HistogramOfShifts":
         """This scorer with the capacity that one pair needs."""
-        if is_concrete(matches) and not np.any(matches.mask):  # the sizes may be anything
+        if is_concrete(matches) and not np.asarray(matches.mask).any():  # the sizes may be anything
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 

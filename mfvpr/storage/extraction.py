@@ -14,7 +14,9 @@ from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import FeatureSource, InMemory
 from mfvpr.storage import features, vectors
 from mfvpr.storage.manifest import VECTORS, store_path
+from mfvpr.storage.recipes import states
 from mfvpr.storage.rows import RowStore, require_space
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Track, no_progress
 
 _MB = 1e6
@@ -68,6 +70,7 @@ class Extraction:
     """The state of one extractor on one folder of images.
 
     Attributes:
+        states: `recipes.states` of the images before they were hashed; None = in a worker, which may have other files.
         sinks: of the parts of its descriptions: the global descriptor, if it gives one, and each scale.
         bad: row -> reason, for images without features.
         is_announced: whether the user was told where the features are.
@@ -75,6 +78,7 @@ class Extraction:
 
     extractor: Extractor
     sinks: list[Sink]
+    states: Sequence[str] | None
     bad: dict[int, str] = field(default_factory=dict)
     is_announced: bool = False
 
@@ -102,7 +106,8 @@ class Extraction:
     def without_programs(self) -> "Extraction":
         """A copy that can be sent to workers: its extractor has compiled nothing."""
         extractor: Any = self.extractor
-        return replace(self, extractor=replace(extractor)) if hasattr(extractor, "__dataclass_fields__") else self
+        extractor = replace(extractor) if hasattr(extractor, "__dataclass_fields__") else extractor
+        return replace(self, extractor=extractor, states=None)
 
     def announcement(self, missing: Sequence[int], requested: int) -> Iterator[str]:
         """A line: how many of the `requested` images are missing; if none, only once. Requires space on the disk."""
@@ -137,7 +142,11 @@ def describe_rows(
 ) -> tuple[Sequence[int], list[np.ndarray], dict[int, str]]:
     """Write the descriptions of images; returns the rows, the numbers of features by store, and the bad rows."""
     missing = state.missing(rows)
+    before = state.states or dict(zip(missing, states(folder, missing), strict=True))
     for batch in describe_folder(folder, state.extractor, missing, state.bad, skip_bad=skip_bad, track=track):
+        for row, now in zip(batch, states(folder, batch), strict=True):
+            if now != before[row]:
+                raise InputError(f"{folder.paths[row]}: changed while it was described; run again when it is complete")
         for sink in state.sinks:
             sink.write(batch)
     bad = {row: state.bad[row] for row in rows if row in state.bad}

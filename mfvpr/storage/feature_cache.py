@@ -205,15 +205,16 @@ class FeatureCache:
         return opened
 
     def _open(self, folder: ImageFolder, extractor: Extractor) -> Extraction:
+        before = states(folder)
         if self.root is not None:
             contents, recipe = self.recipes.contents(folder), self.recipes.of_features(extractor)
             lock = self._lock(contents.fingerprint)
-            return Extraction(extractor, open_sinks(self.root, extractor, recipe, contents.keys, lock=lock))
-        sinks = open_sinks(None, extractor, {}, states(folder))
+            return Extraction(extractor, open_sinks(self.root, extractor, recipe, contents.keys, lock=lock), before)
+        sinks = open_sinks(None, extractor, {}, before)
         memory = self._memo.once("memory", lambda: [sink.items for sink in sinks], None, extractor)
         for sink, items in zip(sinks, memory, strict=True):
             sink.items = items
-        return Extraction(extractor, sinks)
+        return Extraction(extractor, sinks, before)
 
     def _vectors(
         self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str

@@ -3,7 +3,7 @@
 Results with the same recipe are computed once in a process.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
@@ -42,10 +42,11 @@ class Memo:
         return self._computed[key][0]
 
 
-def states(folder: ImageFolder) -> list[str]:
+def states(folder: ImageFolder, rows: Iterable[int] | None = None) -> list[str]:
     """A text for each image, which changes with the file, or with the conversion of its pixels."""
     how = folder.orient, folder.bits
-    paths = (f"{folder.root}/{image}" for image in folder.names)
+    names = folder.names if rows is None else [folder.names[row] for row in rows]
+    paths = (f"{folder.root}/{image}" for image in names)
     return [f"{path} {state_of(path)} {how}" for path in paths]
 
 

@@ -144,6 +144,8 @@ def check(settings: Mapping[str, Any]) -> None:
         raise SettingsError(f"fusion.weights={fusion['weights']}: expected fusion.c=zscore as well, or "
                             "fusion.weights=null")  # fmt: skip
     for name, needed, expected in _NEEDS:
+        if name == "threshold" and "images" in settings:  # a map may have a confidence of its own
+            continue
         if (value := settings.get(name)) is not None and settings[needed] is None:
             value = value["name"] if isinstance(value, Mapping) else value
             raise SettingsError(f"{name}={value}: expected {expected}")

@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.scoring.fields import Parameter, parameters_of
+from mfvpr.scoring.fields import Parameter, check_bounds, parameters_of
 from mfvpr.scoring.parameters import numbers_by_name, static_names, with_capacity, with_parameters
+from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.scoring.weights import WEIGHTS
@@ -59,7 +60,11 @@ class Axes:
         own = {name: self.own[name] if name in self.own else self._own(name) for name in values}
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "own", own)
-        _ = [self._value(name, value) for name, axis in values.items() for value in axis]  # before any work
+        for name, axis in values.items():  # before any work
+            for value in axis:
+                setting = self.setting({name: value})
+                if name in self.parameters and type(scorer) in SCORERS.values():
+                    check_bounds(with_parameters(scorer, setting))
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:

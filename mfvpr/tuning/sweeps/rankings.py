@@ -19,6 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.evaluation.validation import require_finite
 from mfvpr.matching.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
@@ -281,6 +282,8 @@ def block_scores(
         for places, values in run_batches(_score_settings, inputs, batches, devices=devices):
             next(ticks, None)
             scores[np.ix_(part.rows.reshape(-1), places)] = values.reshape(-1, len(places))
+    for of_setting in scores:
+        require_finite("a setting of the sweep", of_setting)
     return np.moveaxis(scores.reshape(-1, *shape), 1, 0)
 
 
