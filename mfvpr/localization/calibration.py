@@ -47,8 +47,8 @@ def read_confidence(folder: Path, system: System) -> Confidence | None:
     """
     if not (folder / _FILE).exists():
         return None
-    confidences, made = read_confidences(folder / _FILE)
-    if system.headline not in confidences or made.get("system") != _fingerprint(system):
+    confidences, origin = read_confidences(folder / _FILE)
+    if system.headline not in confidences or origin.get("system") != _fingerprint(system):
         raise InputError(f"{folder / _FILE}: expected the confidence of this map's system, got that of another one; "
                          "remove the file, then calibrate again")  # fmt: skip
     return confidences[system.headline]

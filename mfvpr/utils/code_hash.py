@@ -99,7 +99,11 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
         return ["module", part.__name__]
     if isinstance(part, types.BuiltinFunctionType):
         return [part.__qualname__, *parts([part.__self__])]
-    if isinstance(part, _SLOTS) or type(part).__module__ in ("typing", "types"):  # annotations, which compute nothing
+    if isinstance(part, _SLOTS) or type(part).__module__ in (
+        "typing",
+        "types",
+        "dataclasses",
+    ):  # annotations, which compute nothing
         return type(part).__qualname__
     if is_dataclass(part):
         code = [] if is_ours(type(part)) or id(type(part)) in seen else [behavior_of(type(part), recipe_of, seen)]

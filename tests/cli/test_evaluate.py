@@ -31,6 +31,7 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     paths = {
         "folder": ["dataset.database=a", "dataset.queries=b"],
         "grid": ["features=ssm", "matching.cross_check=candidate"],
+        "address": ["cluster.address=tcp://localhost:8786"],
     }
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
     programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}

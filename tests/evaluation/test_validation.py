@@ -121,7 +121,7 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"extractor": Own("fewer")}, r"Own: .*Description .*3 images, got 2"),
         ({"extractor": Own("features")}, "Own: expected a Description, got Features"),
         ({"extractor": Own("dimension")}, r"Own: .*\[128\] .*got \[5\]"),
-        ({"extractor": Own("shape")}, r"Own: features: expected keypoints \[N, 2\]"),
+        ({"extractor": Own("shape")}, r"Features.descriptors: expected shape \[20, 20\] beside a mask \[20\]"),
         ({"extractor": Own("vector")}, r"Own: vector_size=0.* 2 numbers"),
     ],
 )  # fmt: skip

@@ -51,7 +51,7 @@ def checkpoint(folder, name="SelaVPR_msls", registers=0):
 def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, system, file):
     stderr = program("evaluate", f"system={system}", code=2)
     assert f"not installed in {tmp_path}/weights; get {file}.pth from https://drive.google.com/" in stderr
-    program("weights", "convert", checkpoint(tmp_path, file))
+    program("weights", "add", checkpoint(tmp_path, file))
     program("evaluate", f"system={system}", "features.image_size=[56,42]", "candidates=6")
     rows = read_rows(tmp_path / "out")
     assert [row["system"] for row in rows if row["decides"]] == ["count"] * 3
@@ -61,10 +61,10 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
 
 def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_path):
     without, with_registers = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
-    stderr = program("weights", "convert", without, "--as", "selavpr_msls_registers", code=2)
+    stderr = program("weights", "add", without, "--as", "selavpr_msls_registers", code=2)
     assert "1 missing (backbone.registers); use the official SelaVPR_reg4_msls.pth" in stderr
-    assert "register_tokens" in program("weights", "convert", with_registers, "--as", "selavpr_msls", code=2)
-    program("weights", "convert", with_registers)
+    assert "register_tokens" in program("weights", "add", with_registers, "--as", "selavpr_msls", code=2)
+    program("weights", "add", with_registers)
     small = "features.image_size=[28,28]", "candidates=3", "figures=0"
     program("evaluate", "system=selavpr_msls", "features.weights=selavpr_msls_registers", *small)
 
@@ -73,7 +73,7 @@ def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_pat
 @pytest.mark.parametrize("pooling", ["cls", "gem"])
 def test_dinov2_is_a_retriever(program, tmp_path, pooling):
     tensors = random_checkpoint(dinov2_shapes(64, 1))
-    program("weights", "convert", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
+    program("weights", "add", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
     options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
     small = "features.max_keypoints=50", "candidates=5", "figures=0"
     program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
@@ -84,6 +84,6 @@ def test_dinov2_is_a_retriever(program, tmp_path, pooling):
 
 def test_wrong_weights_are_told(program, tmp_path):
     path = write_zip(tmp_path / "SelaVPR_msls.pth", random_checkpoint(dinov2_shapes(64, 1)))
-    assert "expected the keys of another network, got those of dinov2" in program("weights", "convert", path, code=2)
+    assert "expected the keys of another network, got those of dinov2" in program("weights", "add", path, code=2)
     stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf", code=2)
     assert "features.weights=d2_tf: expected weights of selavpr: one of selavpr_pitts30k" in stderr

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mfvpr.cli import build
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
@@ -46,7 +45,7 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     same = folder(tmp_path)
     data = Dataset("same", same, (QuerySequence("same", same, None),))
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
-    for group, build_stage, defaults in (("features", build.extractor, {"image_size": None}),
+    for group, build_stage, defaults in (("features", assembly.extractor, {"image_size": None}),
                              ("retrieval", lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data),
                               {"whiten": None})):  # fmt: skip
         settings = {"name": "import"} | common | defaults | change

@@ -28,7 +28,7 @@ WAYS = {
     "candidates": lambda scorer: score_candidates(scorer, BATCH),
     "grid": lambda scorer: score_grid(scorer, BATCH, max_distance=[9.0]),
     "pipeline": lambda scorer: stages.score({"own": scorer}, MATCHES, CANDIDATES),
-    "sweep": lambda scorer: sweeps.sweep(scorer, SETTINGS, MATCHES, CANDIDATES),
+    "sweep": lambda scorer: sweeps.rank_settings(scorer, SETTINGS, MATCHES, CANDIDATES),
 }
 
 
@@ -76,7 +76,9 @@ def test_a_class_that_is_no_value_raises(way):
 
 def test_no_sweep_stores_scores_of_code_that_may_change(monkeypatch, tmp_path):
     def first():
-        return sweeps.sweep(Host(), SETTINGS, MATCHES, CANDIDATES, folder=tmp_path)[0, 0, 0, :3].tolist()
+        return sweeps.rank_settings(
+            Host(), SETTINGS, MATCHES, CANDIDATES, options=sweeps.SweepOptions(folder=tmp_path)
+        )[0, 0, 0, :3].tolist()
 
     assert first() == [1, 0, 2]
     monkeypatch.setitem(globals(), "answer", lambda masks: -masks.sum(axis=1))
