@@ -19,7 +19,6 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 _FILE = "confidence.json"
-TOLERANCES, RADIUS = (1, 2, 5), 25.0  # of the programs: a prediction is correct within 2 frames, or 25 m
 
 
 def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> Confidence:
@@ -28,7 +27,7 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     if sequence.truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
     result = rank_dataset(dataset, system, cache=cache)
-    threshold = middle(sequence.truth.thresholds(tolerances=TOLERANCES, radius=RADIUS))
+    threshold = middle(sequence.truth.thresholds())
     [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
     [positives] = result.positives(threshold)
     return fit_confidence(confidence_inputs(ranked, by_retrieval), positives.contains(ranked.rows)[:, 0])

@@ -102,3 +102,13 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert prediction == known.localize(query)
     assert 0 < prediction.confidence < 1
     assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
+
+
+def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
+    known = Map.create(tmp_path, small_street / "database", small("steering"))
+    known.calibrate(small_street / "database", small_street / "queries")
+    settings = json.loads((tmp_path / "settings.json").read_text())
+    settings["scorer"]["sigma"] = 30.0
+    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    with pytest.raises(InputError, match="got that of another one"):
+        Map.open(tmp_path)

@@ -123,3 +123,13 @@ def test_names_of_scores_are_not_taken_apart(systems):
 
 def test_defaults_are_those_of_the_programs():
     assert composed()["recall"] == {"tolerances": [*TOLERANCES], "radius": RADIUS, "ks": [*KS]}
+
+
+def test_data_sets_without_ground_truth_have_predictions_alone(result, dataset, tmp_path):
+    without = replace(dataset, name="dark", sequences=(replace(dataset.only, truth=None),))
+    dark = replace(result.parts["one", "paper"], dataset=without)
+    both = replace(result, parts={("dark", "paper"): dark, ("one", "paper"): result.parts["one", "paper"]})
+    assert {row[0] for row in both.table().rows} == {"one"}
+    assert len(both.save(tmp_path / "both")) == 2
+    with pytest.raises(InputError, match="no ground truth, so no recall"):
+        replace(result, parts={("dark", "paper"): dark}).table()

@@ -12,7 +12,7 @@ from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.images import resize
 from mfvpr.features import Aggregated, Description, VladFitting
-from mfvpr.storage import FeatureCache, recipes, vectors
+from mfvpr.storage import FeatureCache, extraction, recipes, vectors
 from mfvpr.storage.features import forecast_bytes
 from mfvpr.storage.recipes import Recipes
 from mfvpr.utils import InputError
@@ -264,3 +264,21 @@ def test_the_papers_databases_take_about_half(images, features, paper, readme):
     ours = (forecast_bytes(images, features, 512) + vectors.forecast_bytes(images, 4096)) / 2**20
     assert ours <= 0.55 * paper
     assert round(ours) == readme
+
+
+def test_an_image_that_changes_while_it_is_described_is_refused(folder, tmp_path, monkeypatch):
+    """Otherwise its features would be those of the content that it had before."""
+    root = tmp_path / "images"
+    shutil.copytree(folder.root, root)
+    copied, plain = image_folder(root), extraction.describe_folder
+
+    def describe(*arguments, **options):
+        shutil.copy(root / "0001.png", root / "0005.png")
+        yield from plain(*arguments, **options)
+
+    monkeypatch.setattr(extraction, "describe_folder", describe)
+    with pytest.raises(InputError, match=r"0005\.png: changed while it was described"):
+        FeatureCache(tmp_path / "s").local(copied, SIFT)
+    monkeypatch.undo()
+    [features] = FeatureCache(tmp_path / "s").local(copied, SIFT)
+    assert_same(features[5], features[1])

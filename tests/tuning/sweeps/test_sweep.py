@@ -19,6 +19,7 @@ from mfvpr.scoring.parameters import with_parameters
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps.settings import group_by_program
 from mfvpr.types import Shortlist
+from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
 from tests.storage.synthetic_features import DAMAGE, interrupt_after
@@ -389,3 +390,15 @@ def test_long_work_says_how_long_it_takes_and_advances_meanwhile(data):
     assert max(np.diff([start, *times])) < 2
     assert numbers[-1] == totals[-1]
     np.testing.assert_array_equal(got, rank(Slow(), settings[:1], *data).repeat(160, axis=1))
+
+
+def half_nan(matches):
+    return mfvpr.MatchCount()(matches) / 0 * 0
+
+
+def test_scores_that_no_ranking_can_use_are_refused(data):
+    """They would leave the order of the retrieval, and win where that is good."""
+    with pytest.raises(InputError, match=r"sigma=0\.0: expected numbers"):
+        sweeps.Axes(mfvpr.HistogramOfShifts(), {"sigma": [0.0, 10.0]})
+    with pytest.raises(InputError, match="NaN or infinite"):
+        sweeps.rank_settings(half_nan, [{"max_distance": 1.0}], *data)
