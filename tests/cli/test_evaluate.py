@@ -112,7 +112,7 @@ def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["database features", "matching"])
+@pytest.mark.parametrize("stage", ["database features", "queries to match"])
 def test_ctrl_c_leaves_nothing(small_street, tmp_path, interrupt, stage):
     command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
@@ -170,7 +170,7 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     assert header.split("  ")[0] == "system"
     assert done.stdout.endswith(f"report: runs/streets/{folder.name}/report.html\n")
     assert (folder / "report.html").read_text("utf-8").count('src="data:image/jpeg;base64,') == 6
-    for bar in ("drawing streets", "database features", "matching", "scores", "figures"):
+    for bar in ("drawing streets", "database features", "figures"):
         assert bar in done.stderr
 
     files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}

@@ -10,7 +10,7 @@ from PIL import Image
 
 from mfvpr.cli import evaluation, learning, sweeping
 from mfvpr.scoring.weight_files import read_weight
-from mfvpr.tuning.learning import checkpoints, teaching
+from mfvpr.tuning.learning import teaching, training
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record
 from tests.programs import QUERIES, composed, job_of, results, small, snapshot
@@ -41,9 +41,9 @@ def untrained(monkeypatch):
     """Replace the training by its start values, and record its options."""
     calls = []
 
-    def start(parameters, objective, batches, **options):
+    def start(parameters, objective, batches, schedule, **options):
         calls.append(options)
-        for step in range(options["steps"]):
+        for step in range(schedule.steps):
             batches(step)
         return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
 
@@ -162,7 +162,7 @@ def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained
 
 
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
-    saved, save = [], checkpoints.save_checkpoint
+    saved, save = [], training.save_checkpoint
 
     def interrupted(folder, step, *rest):
         saved.append((folder.name, step))
@@ -170,7 +170,7 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
             raise KeyboardInterrupt
         save(folder, step, *rest)
 
-    monkeypatch.setattr(checkpoints, "save_checkpoint", interrupted)
+    monkeypatch.setattr(training, "save_checkpoint", interrupted)
     again = (*SHORT, f"checkpoints={tmp_path}/kept")
     with pytest.raises(KeyboardInterrupt):
         learn(tmp_path / "out", *again)
@@ -210,8 +210,8 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
         learning.learn(composed(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
-    assert len({call["folder"] for call in untrained}) == 5 * len(changes)
-    assert len({json.dumps(call["recipe"]) for call in untrained}) == 5 * len(changes)
+    assert len({call["checkpoints"].folder for call in untrained}) == 5 * len(changes)
+    assert len({json.dumps(call["checkpoints"].recipe) for call in untrained}) == 5 * len(changes)
 
 
 @pytest.mark.parametrize(("rate", "step", "step_kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
