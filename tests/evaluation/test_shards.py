@@ -77,8 +77,9 @@ def test_matches_are_made_by_shards_alone(dataset, tmp_path):
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
     several = datasets.folder(small_street / "database", split, ground_truth=IndexFile("truth.csv", True))
     extractor = TwoScales()
-    system = system_of(extractor, Retrieval(extractor), candidates=3)
-    assert_same(share(several, system, tmp_path / "s", 17)[1], rank_dataset(several, system))
+    system = system_of(extractor, Retrieval(extractor), candidates=3, cohort=None)
+    expected = rank_dataset(several, system, cache=FeatureCache(tmp_path / "plain"))
+    assert_same(share(several, system, tmp_path / "s", 17)[1], expected)
 
 
 def test_a_bad_image_of_one_shard_is_bad_for_all(dataset, small_street, tmp_path):
