@@ -52,7 +52,7 @@ def test_grids_data_sets_and_sweeps_score_alike():
     assert scores["opencv"].tolist() == [count_inliers(cv2.RANSAC)]
     assert scores["magsac"].tolist() == [count_inliers(cv2.USAC_MAGSAC)]
     settings = [{"threshold": 8.0, "max_distance": distance} for distance in (0.4, 0.6)]  # all are 0.5 apart
-    rows = sweeps.sweep(scorers["opencv"], settings, MATCHES, CANDIDATES)
+    rows = sweeps.rank_settings(scorers["opencv"], settings, MATCHES, CANDIDATES)
     assert rows[0, 0, 0].tolist()[:3] == [0, 1, 2]  # no match: the order of the retrieval
     assert rows[0, 1, 0].tolist()[:3] == np.argsort(count_inliers(cv2.RANSAC))[::-1].tolist()
 
