@@ -38,6 +38,9 @@ def value(cls: Class) -> Class:
     program: they are compared, and must be hashable. An integer in a field with a `float` default becomes a float.
     Unflattening calls no `__init__`.
 
+    A compiled program keeps the code of its methods and the values of globals: after a change of those in a running
+    process, define the class again.
+
     `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 at least compares its
     nodes without their class. The programs of this library tell the classes apart. With such classes, a `jit` of your
     own may run the program of another class if hashes collide.

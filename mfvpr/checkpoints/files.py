@@ -69,6 +69,8 @@ def install(checkpoint: Path, name: str, folder: Path | None = None, *, own: str
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
     entry = entry_of(name) if own is None else own_entry(f"{OWN}{own}", name)
+    if own is not None and is_installed(entry, folder):
+        raise InputError(f"{entry.name}: expected a name that is free, got one of installed weights; choose another")
     network, is_runtime_file = NETWORKS[name], own is not None and checkpoint.suffix == ".safetensors"
     if is_runtime_file:
         network, tensors = network._replace(table=RUNTIME), _parse(checkpoint.read_bytes(), f"{checkpoint}: ")

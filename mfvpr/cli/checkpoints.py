@@ -131,5 +131,5 @@ def _verify(entry: Entry) -> str:
         checks.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
             origin = "is your own" if entry.like else "nobody published"
-            checks.append(f"from a {manifest.source_file} of sha256 {manifest.source_sha256[:12]}..., which {origin}")
+            checks.append(f"from {manifest.source_file} of sha256 {manifest.source_sha256[:12]}..., which {origin}")
     return "good, " + ", ".join(checks)

@@ -60,7 +60,8 @@ class Progress:
         self.n, self._total = number, total
         if (now := time.monotonic()) >= self._next and self.n != self._total:
             self._next = now + _INTERVALS[self._is_terminal]
-            print(_ERASE * self._is_terminal + self._line(), end="\n"[self._is_terminal :], file=sys.stderr, flush=True)
+            start, end = (_ERASE, "") if self._is_terminal else ("", "\n")
+            print(start + self._line(), end=end, file=sys.stderr, flush=True)
 
     def _line(self) -> str:
         elapsed, counts = time.monotonic() - self._start, f"{self.n:,}"

@@ -31,7 +31,7 @@ def localize(settings: dict[str, Any]) -> None:
     drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
     for number, (name, image) in enumerate(images(settings)):
         if number == 0 and len(robot_map):
-            tell(f"{len(robot_map):,} images in the map; the first image takes seconds more: programs compile")
+            tell(f"{len(robot_map):,} images in the map; the first image takes longer")
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
             localized, line = drive.localize(name, pixels)

@@ -1,5 +1,6 @@
 """Sweeps of the parameters of a system, for users of the library; `sweeping` is the program."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.protocol import Split
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.report.sweeps import Sweep
+from mfvpr.report.runs import LAST
+from mfvpr.report.sweeps import Sweep, axes_json
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
@@ -62,7 +64,7 @@ def sweep(
     protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
     runtime = runtime or cache.runtime
     kind = system.fused[name].retrieval_score if name in system.fused else "cosine"
-    options = SweepOptions(ties=system.ties, retrieval_score=kind, folder=_block_folder(out), runtime=runtime)
+    options = SweepOptions(ties=system.ties, retrieval_score=kind, folder=_block_folder(out, swept), runtime=runtime)
     matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=runtime)
     result = Sweep(dataset.name, name, search_grid(swept, protocol, matched.by_scale, matched.candidates, options))
     if out is not None:
@@ -90,12 +92,16 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
                      "mfvpr.System(system.pipeline, {name: scorer})")  # fmt: skip
 
 
-def _block_folder(out: Path | str | None) -> Path | None:
-    """The folder of finished blocks, in a new or empty folder or in one of a sweep; None without `out`."""
+def _block_folder(out: Path | str | None, axes: Axes) -> Path | None:
+    """The folder of finished blocks, in a new or empty folder or in one of this sweep; None without `out`."""
     if out is None:
         return None
     blocks = Path(out) / "blocks"
     if not blocks.is_dir() and Path(out).exists() and (not Path(out).is_dir() or any(Path(out).iterdir())):
         raise InputError(f"out={out}: expected a new or empty folder, or one of a sweep; name another")
+    if (results := Path(out) / LAST).exists() and json.loads(results.read_text("utf-8"))["axes"] != axes_json(axes):
+        raise InputError(
+            f"out={out}: has the result of a sweep of other axes, which would be lost; name another folder"
+        )
     blocks.mkdir(parents=True, exist_ok=True)
     return blocks

@@ -67,7 +67,9 @@ class Describing:
         [features] = cache.local(images, self.extractor, rows)
         describer = self.describer if isinstance(self.describer, Extractor) else None
         vectors = None if describer is None else cache.vectors(images, describer, images)
-        bad, size = {*features.bad, *(vectors.bad if vectors else ())}, self.extractor.batch_size
+        bad, size = {**features.bad, **(vectors.bad if vectors else {})}, self.extractor.batch_size
+        for reason in bad.values():
+            cache.warn(reason)
         used = [row for row in rows if row not in bad]
         for start in range(0, len(used), size):
             batch = {row: round_as_stored(local) if cache.root is None else local

@@ -169,16 +169,14 @@ class MapImages:
         self.refresh()
         if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
             return 0
-        before = len(self)
         with lock_map(self.folder), self._learning(images, cache, track) as cache, self._adding() as (described, add):
             missing = [row for row, name in enumerate(images.names) if name not in self._row_of_name]
             before = len(self)
-            describing = described.describing
-            described_images = (
-                describing.folder(images, missing, track) if cache is None
-                else describing.cached(images, missing, cache)
-            )  # fmt: skip
-            for batch in described_images:
+            if cache is None:
+                batches = described.describing.folder(images, missing, track)
+            else:
+                batches = described.describing.cached(images, missing, cache)
+            for batch in batches:
                 add([
                     (features, Entry(images.names[row], places[row], vector))
                     for row, (features, vector) in batch.items()

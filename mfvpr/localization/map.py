@@ -78,6 +78,8 @@ class Map(MapImages):
         extractor, describer, candidates = _extractor(system), _describer(system), system.pipeline.candidates
         check_declaration(Path(folder), system)
         self.confidence = confidence or read_confidence(Path(folder), system)
+        if threshold is not None and not 0 <= threshold <= 1:
+            raise InputError(f"threshold={threshold}: expected a number from 0 to 1, or None")
         if threshold is not None and self.confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.system, self.threshold = system, threshold

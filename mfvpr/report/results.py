@@ -1,14 +1,16 @@
 """Evaluation in one call, and its result: tables, predictions, run folders and a page.
 
-data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
-result = mfvpr.evaluate(data, mfvpr.load_system("mfvpr"))
-print(result.table())
-result.write_report("report.html")
+    data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
+    result = mfvpr.evaluate(data, mfvpr.load_system("mfvpr"))
+    print(result.table())
+    result.write_report("report.html")
+
+`mfvpr.evaluation.rank_dataset` ranks; this module reports.
 """
 
 import math
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -112,10 +114,8 @@ class Result:
         Data sets without ground truth are left out; an InputError if there is no other.
         """
         several_data, several_systems = (len(self._names(place)) > 1 for place in (0, 1))
-        rows: list[dict[str, str]] = []
-        reports = [*self._reports(thresholds, ks)]
-        known = [(names, report) for names, report in reports if report.thresholds] or reports
-        for (dataset, system), report in known:
+        rows, reports = list[dict[str, str]](), self._reports(thresholds, ks)
+        for (dataset, system), report in [part for part in reports if part[1].thresholds] or reports:
             table = recall_table(report)
             for line in table.rows:
                 row = ({"data set": dataset} if several_data else {}) | dict(zip(table.header, line, strict=True))
@@ -168,13 +168,13 @@ class Result:
         """
         from mfvpr.report.run_files import save_run  # here, since SciPy's statistics take 0.3 s
 
-        folders, several = [], len(self.parts) > 1
+        folders, several, reports = list[Path](), len(self.parts) > 1, self._reports(thresholds, ks)
         files = [file_names(self._names(place)) for place in (0, 1)]
         with claim_run_folder(Path(folder)) as root:
-            for (dataset, system), report in self._reports(thresholds, ks):
+            for (dataset, system), report in reports:
                 folders.append(root / files[0][dataset] / files[1][system] if several else root)
                 save_run(folders[-1], report, self.cache)
-            if several and any(report.thresholds for _, report in self._reports(thresholds, ks)):
+            if several and any(report.thresholds for _, report in reports):
                 write_table(root, self.table(thresholds, ks), f"recall in %, {self!r}")
         return folders
 
@@ -193,6 +193,5 @@ class Result:
         """Names of the data sets, or of the systems."""
         return list(dict.fromkeys(names[place] for names in self.parts))
 
-    def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> Iterator[tuple[tuple[str, str], EvaluationReport]]:
-        for names, ranked in self.parts.items():
-            yield names, EvaluationReport.of(ranked, thresholds, ks)
+    def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> list[tuple[tuple[str, str], EvaluationReport]]:
+        return [(names, EvaluationReport.of(ranked, thresholds, ks)) for names, ranked in self.parts.items()]

@@ -19,6 +19,7 @@ from mfvpr.report.file_names import file_names
 from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, data_frame, format_value
+from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
@@ -138,12 +139,17 @@ def _recalls(outcome: Outcome, numbers: Iterable[int]) -> tuple[list[str], np.nd
     return header, np.column_stack([protocol.recall(rows, first), *deeper_recalls])
 
 
+def axes_json(axes: Axes) -> dict[str, Any]:
+    """The values of the axes as JSON values; weights that are no words as texts."""
+    return json.loads(json.dumps(dict(axes.values), default=str))
+
+
 def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
     protocol, ks = outcome.protocol, outcome.ks
     recall = np.stack([protocol.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
     values = {
-        "axes": dict(outcome.axes.values), "own": dict(outcome.axes.own),
+        "axes": axes_json(outcome.axes), "own": dict(outcome.axes.own),
         "search": "grid" if outcome.is_grid else "optuna",
         "unit": protocol.unit, "thresholds": list(protocol.thresholds), "ks": list(ks), "split": protocol.split,
         "chosen": [outcome.settings[number] for number in outcome.chosen],

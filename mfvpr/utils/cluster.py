@@ -1,7 +1,10 @@
 """Work on many processes or machines, by Dask Distributed (extra `cluster`).
 
-with Cluster.local(4) as cluster:
-    mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
+    with Cluster.local(4) as cluster:
+        mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
+
+Blocks of images are described, and blocks of queries matched, in worker processes. Dask repeats those of a worker that
+dies.
 """
 
 import os

@@ -25,6 +25,7 @@ _PLAIN = (bool, int, float, complex, str, bytes)
 _NAMED = (Enum, PurePath, range, slice, np.ufunc, np.dtype)  # known by their `repr`
 _CODE = (re.Pattern, types.BuiltinFunctionType, types.ModuleType)
 _CONSTANTS = (*_PLAIN, *_NAMED, *_CODE, np.ndarray, np.generic, jax.Array, tuple, list, dict, set, frozenset, type)
+_INERT = ("typing", "types", "dataclasses")  # modules of annotations and markers, which compute nothing
 _SLOTS = (types.MemberDescriptorType, types.GetSetDescriptorType)
 
 
@@ -99,11 +100,7 @@ def _part(part: Any, recipe_of: Callable[[Any], Any], seen: tuple[int, ...]) -> 
         return ["module", part.__name__]
     if isinstance(part, types.BuiltinFunctionType):
         return [part.__qualname__, *parts([part.__self__])]
-    if isinstance(part, _SLOTS) or type(part).__module__ in (
-        "typing",
-        "types",
-        "dataclasses",
-    ):  # annotations, which compute nothing
+    if isinstance(part, _SLOTS) or type(part).__module__ in _INERT:
         return type(part).__qualname__
     if is_dataclass(part):
         code = [] if is_ours(type(part)) or id(type(part)) in seen else [behavior_of(type(part), recipe_of, seen)]

@@ -15,6 +15,8 @@ from mfvpr.utils.progress import Track, no_progress
 class Runtime:
     """Settings of a call that change no result.
 
+        mfvpr.evaluate(data, system, runtime=Runtime(log=print))
+
     Attributes:
         devices: that share the work; None = the default device of JAX.
         memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what

@@ -106,7 +106,7 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
     for arguments in ([], ["tiny"]):
         code, stdout, stderr = program("verify", *arguments)
         assert (code, stderr) == (0, "")
-        source = f"from a tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
+        source = f"from tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
         assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
     tensors = random_checkpoint(SOURCE_SHAPES)
     tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
@@ -153,8 +153,9 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
     (folder / "own" / "mine.safetensors").rename(converted)
     assert program("verify", "own/mine")[1].endswith("install it: mfvpr weights add FILE --own mine --as tiny\n")
     assert program("add", converted, "--own", "mine", "--as", "tiny")[0] == 0
+    refused("own/mine: expected a name that is free", "add", converted, "--own", "mine", "--as", "tiny")
     for arguments in ([], ["own/mine"]):
-        source = f"from a converted.safetensors of sha256 {file_sha256(converted)[:12]}..., which is your own"
+        source = f"from converted.safetensors of sha256 {file_sha256(converted)[:12]}..., which is your own"
         assert program("verify", *arguments)[1] == f"own/mine: good, {PARAMETERS} parameters as converted, {source}\n"
     published, listed = (line.split() for line in program("list")[1].splitlines()[-2:])
     assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (

@@ -68,6 +68,8 @@ def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, 
     assert [path.name for path in (out / "figures").iterdir()] == ["sigma_weight.png"]
     monkeypatch.setattr(rankings, "block_scores", lambda *_: pytest.fail("computed again"))
     assert str(sweep(MyScorer(), **AXES, split="both", out=out).table()) == str(result.table())
+    with pytest.raises(mfvpr.InputError, match="has the result of a sweep of other axes"):
+        sweep(MyScorer(), sigma=[5], out=out)
     figure = result.plot("weight", "sigma")
     assert [figure.axes[0].get_ylabel(), figure.axes[0].get_xlabel()] == ["weight", "sigma"]
     assert result.plot("sigma").axes[0].get_xlabel() == "sigma"

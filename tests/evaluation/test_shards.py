@@ -70,7 +70,7 @@ def test_matches_are_made_by_shards_alone(dataset, tmp_path):
     system = system_of(SIFT, Retrieval(Mean()), cohort=None)
     _, result = share(dataset, system, tmp_path, 2)
     assert "matches read" in result.seconds
-    assert not {"matching", "retrieval"} & {name for name, seconds in result.seconds.items() if seconds > 0.1}
+    assert "matching" not in result.seconds
 
 
 @pytest.mark.slow

@@ -96,6 +96,8 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert known.localize(query).confidence is None
     with pytest.raises(InputError, match=r"threshold=0\.5: expected a confidence"):
         Map.open(tmp_path, threshold=0.5)
+    with pytest.raises(InputError, match=r"threshold=1\.5: expected a number from 0 to 1"):
+        Map.open(tmp_path, threshold=1.5)
     confidence = known.calibrate(small_street / "database", small_street / "queries")
     assert known.confidence == confidence
     prediction = Map.open(tmp_path).localize(query)

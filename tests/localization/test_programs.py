@@ -30,7 +30,7 @@ pytestmark = pytest.mark.thorough
 
 QUICK = ["features.max_keypoints=60", "features.image_size=[160,120]", "retrieval.num_words=8", "candidates=5"]
 NAMES = [f"{row:04d}.png" for row in range(10)]
-WAIT = "10 images in the map; the first image takes seconds more: programs compile\n"
+WAIT = "10 images in the map; the first image takes longer\n"
 
 
 @pytest.fixture

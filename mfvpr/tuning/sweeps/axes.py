@@ -34,7 +34,7 @@ class Axes:
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
             (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None). Words stand for weights in every
             scorer.
-        own: by name, the plain value without a sweep; what is left out is the scorer's, no limit, and c = 0.
+        own: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
 
     Raises:
         InputError: an axis without values or with equal ones, an unknown word, or a name that the scorer does not have.

@@ -392,7 +392,7 @@ def test_long_work_says_how_long_it_takes_and_advances_meanwhile(data):
     np.testing.assert_array_equal(got, rank(Slow(), settings[:1], *data).repeat(160, axis=1))
 
 
-def half_nan(matches):
+def all_nan(matches):
     return mfvpr.MatchCount()(matches) / 0 * 0
 
 
@@ -401,4 +401,4 @@ def test_scores_that_no_ranking_can_use_are_refused(data):
     with pytest.raises(InputError, match=r"sigma=0\.0: expected numbers"):
         sweeps.Axes(mfvpr.HistogramOfShifts(), {"sigma": [0.0, 10.0]})
     with pytest.raises(InputError, match="NaN or infinite"):
-        sweeps.rank_settings(half_nan, [{"max_distance": 1.0}], *data)
+        sweeps.rank_settings(all_nan, [{"max_distance": 1.0}], *data)
