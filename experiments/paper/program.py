@@ -1,7 +1,7 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,37 +27,41 @@ from mfvpr.utils import InputError
 def paper(settings: dict[str, Any]) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
     rows = systems.chosen_rows(settings["systems"])
-    places, left_out = systems.places(settings["data"], settings["datasets"])
+    places, absent, refused = systems.places(settings["data"], settings["datasets"])
     lacking = _missing_weights(rows, places[0], settings) if places else {}
     rows = [row for row in rows if row.run not in lacking]
+    left_out = [*absent.values(), *refused, *lacking.values()]
     if not places or not rows:
-        for line in (*left_out, *lacking.values()):
+        for line in left_out:
             tell(f"left out: {line}")
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
-    _announce(rows, places, settings, left_out, [*lacking])
+    _announce(rows, places, settings)
+    _announce_missing(settings, absent, lacking, refused)
     out = Path(settings["out"]).expanduser()
     with runs.lock_output(out):
-        _evaluate_and_report(rows, places, settings, out, [*left_out, *lacking.values()])
+        _evaluate_and_report(rows, places, settings, out, left_out)
 
 
-def _announce(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any], missing: Sequence[str],
-    lacking: Sequence[str],
-) -> None:  # fmt: skip
-    """Print the plan, and what is left out in one line; folders that cannot be used have lines of their own."""
-    names, absent = _names(rows), [line for line in missing if systems.ABSENT in line]
+def _announce(rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]) -> None:
+    """Print the plan."""
+    names = _names(rows)
     tell(
         f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
         f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
         f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
     )
+
+
+def _announce_missing(
+    settings: Mapping[str, Any], absent: Collection[str], lacking: Collection[str], refused: Sequence[str]
+) -> None:
+    """Print what is left out: data sets and evaluations in one line, and a line for each folder that is refused."""
     groups = {
-        f"data sets that are not in {settings['data'] or 'data=DIR'}, see `mfvpr data list`":
-            [line.partition(systems.ABSENT)[0] for line in absent],
+        f"data sets that are not in {settings['data'] or 'data=DIR'}, see `mfvpr data list`": absent,
         "evaluations without their weights, see `mfvpr weights list`": lacking,
-    }  # fmt: skip
+    }
     parts = [f"{len(members)} {words} ({', '.join(members)})" for words, members in groups.items() if members]
-    for line in ["; ".join(parts)] * bool(parts) + [line for line in missing if line not in absent]:
+    for line in [*(["; ".join(parts)] if parts else []), *refused]:
         tell(f"left out: {line}")
 
 

@@ -18,7 +18,6 @@ from mfvpr.systems.settings import RULES, SettingsError
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
 _SIDES = ("database", "queries")
-ABSENT = ": needs "  # between the name of a data set that is not there, and what it needs
 _POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
 COMBINED = f"histogram + {RETRIEVAL}"
 
@@ -120,8 +119,8 @@ def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]
             raise SettingsError(f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}")
 
 
-def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
-    """The data sets that are at hand, and a line for each that is not."""
+def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], dict[str, str], list[str]]:
+    """The data sets that are at hand, a line by name for those that are absent, and for each folder that is refused."""
     root = None if data is None else expand_user(data)
     if root is not None and not root.is_dir():
         got = "a file" if root.exists() else "nothing"
@@ -129,24 +128,24 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
     located = {place.name: place for place in _places_by_coordinates(root)} if root else {}
     known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))
     _check_names("datasets", names, known)
-    available, missing = [], []
+    available, absent, refused = list[Place](), dict[str, str](), list[str]()
     for name in known if names is None else [name for name in known if name in names]:
         if name == DRAWN:
             available.append(Place(name, (f"dataset={name}",)))
             if root and (root / name).is_dir():
-                missing.append(f"{root / name}: the drawn data set has this name; rename the folder")
+                refused.append(f"{root / name}: the drawn data set has this name; rename the folder")
         elif name in located and name in (*REAL, *PUBLISHED):
-            missing.append(f"{name}: expected another layout than that of names with positions; rename the folder")
+            refused.append(f"{name}: expected another layout than that of names with positions; rename the folder")
         elif name in located and not RULES["dataset.name"].holds(name):
-            missing.append(f"{name}: expected a folder's name of {RULES['dataset.name'].expected}; rename it")
+            refused.append(f"{name}: expected a folder's name of {RULES['dataset.name'].expected}; rename it")
         elif name in located:
             available.append(located[name])
         elif folder := _folder(root, name, located):
             available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={folder}")), folder))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
-            missing.append(f"{name}{ABSENT}{data or 'data=DIR'}/{name} {needs}")
-    return available, missing
+            absent[name] = f"{name}: needs {data or 'data=DIR'}/{name} {needs}"
+    return available, absent, refused
 
 
 def _places_by_coordinates(root: Path) -> Iterator[Place]:

@@ -300,7 +300,7 @@ def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
     np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
     pipeline = mfvpr.Pipeline(square, RETRIEVAL, CANDIDATE, 4)
     recipes = [matches_recipe(self_dataset, self_dataset.only, pipeline, FeatureCache(tmp_path))]
-    recipes.append(recipes[0] | {"database": FeatureCache().recipe(self_dataset.database, square)})
+    recipes.append(recipes[0] | {"database": FeatureCache().recipes.of_folder(self_dataset.database, square)})
     assert "whitening" in difference(*recipes)
 
 

@@ -150,8 +150,8 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
         assert (tmp_path / "out" / "tables" / "recall.csv").exists()  # before the other data sets
         return {place.name: None}, []
 
-    left_out = ["corridor: needs a folder", "nordland_1415: needs another", "street: expected another layout"]
-    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], left_out))
+    left_out = {"corridor": "needs a folder", "nordland_1415": "needs another"}, ["street: expected another layout"]
+    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], *left_out))
     monkeypatch.setattr(program, "evaluate_all", evaluate_all)
     monkeypatch.setattr(program, "paper_tables", lambda _: [("recall", "heading", table)])
     monkeypatch.setattr(program, "measure_times", interrupt)
