@@ -15,8 +15,8 @@ from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
 from mfvpr.report.plots import panels, save_figure
-from mfvpr.report.rankings import read_csv
 from mfvpr.report.runs import Figure
+from mfvpr.report.tables import read_csv
 from mfvpr.utils.files import clip_middle, printable, replacing
 
 _MIDDLE = 1  # of the tolerances: the paper's figure

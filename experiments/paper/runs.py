@@ -106,7 +106,7 @@ def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
-            write_run_folder(new, outcome.calibrated, outcome.description)
+            write_run_folder(new, outcome.report, outcome.description)
             write_json(new / INPUTS, dict(inputs))
             write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.report.ranked.dataset.database))
             run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished

@@ -11,8 +11,7 @@ from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.rankings import format_number, write_csv
-from mfvpr.report.tables import Table
+from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.utils.files import write_text
 
 

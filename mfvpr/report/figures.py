@@ -17,6 +17,7 @@ from mfvpr.report.plots import panels, save_figure
 from mfvpr.types import Matches
 from mfvpr.utils.files import clip_middle, printable
 
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets.truth import threshold_words
-from mfvpr.report.rankings import read_csv
 from mfvpr.report.runs import LAST, write_json, write_table
-from mfvpr.report.tables import Table, format_value
+from mfvpr.report.tables import Table, format_value, read_csv
 from mfvpr.utils.locks import lock
 
 

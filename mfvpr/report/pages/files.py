@@ -20,9 +20,8 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.file_names import file_names
-from mfvpr.report.rankings import read_csv
 from mfvpr.report.runs import LAST
-from mfvpr.report.tables import Table
+from mfvpr.report.tables import Table, read_csv
 from mfvpr.utils.errors import InputError, require_word
 
 _LEFT_BY = "expected the run folder of an evaluation"

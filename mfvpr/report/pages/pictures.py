@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from mfvpr.report.evaluations import ABOUT
+from mfvpr.report.figures import ABOUT
 from mfvpr.utils.errors import InputError
 
 MOST_PICTURES = 60
