@@ -11,9 +11,9 @@ from jaxtyping import Float
 from mfvpr.evaluation.calibration import write_confidences
 from mfvpr.evaluation.precision import chance_calibration_error, reliability
 from mfvpr.evaluation.results import Reason
+from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
-from mfvpr.report.rankings import NO_PLACE
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.reranking.results import RETRIEVAL

@@ -14,9 +14,8 @@ from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.features.extractor import Source
 from mfvpr.report.confidences import write_confidence
-from mfvpr.report.differences import write_gains
+from mfvpr.report.evaluation_files import write_gains, write_rankings, write_skipped
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.rankings import write_rankings, write_skipped
 from mfvpr.report.runs import write_about, write_json, write_table, writing
 from mfvpr.report.tables import format_number, write_csv
 from mfvpr.reranking.fusion import FinalScore, Fusion

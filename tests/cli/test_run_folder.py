@@ -351,7 +351,9 @@ def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
-    monkeypatch.setattr("mfvpr.report.query_figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(
+        "mfvpr.report.query_figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+    )
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + retrieval " in stdout

@@ -18,9 +18,8 @@ from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.report.differences import differences, write_gains
+from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.rankings import write_rankings
 from mfvpr.reranking import Fusion
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
