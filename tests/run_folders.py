@@ -10,7 +10,7 @@ from mfvpr.report import Table, write_json
 from mfvpr.report.evaluation_files import write_failures, write_predictions
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.report.tables import write_csv
 from mfvpr.reranking.results import Ranked
 from mfvpr.utils.files import printable

@@ -18,6 +18,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
+from mfvpr.report.runs import LAST
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
@@ -164,13 +165,13 @@ def _finished_runs(
 ) -> dict[tuple[str, str], Path]:
     """Run folders by data set and evaluation."""
     folders = {(name, run): runs.folder_of(run, name, settings) for name in datasets for run in _names(rows)}
-    return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
+    return {key: folder for key, folder in folders.items() if (folder / LAST).is_file()}
 
 
 def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], settings: Mapping[str, Any]) -> Evaluations:
     results, sizes, folders = {}, {}, _finished_runs(rows, datasets, settings)
     for (name, run), folder in folders.items():
-        content, size = runs.read_json(folder / "results.json"), runs.read_json(folder / runs.SIZES)
+        content, size = runs.read_json(folder / LAST), runs.read_json(folder / runs.SIZES)
         candidates = runs.read_json(folder / "run.json")["settings"]["candidates"]
         for row in (row for row in rows if row.run == run):
             if result := row_result(row, content, candidates):

@@ -24,7 +24,7 @@ from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
 from mfvpr.localization.vectors import Vectors
 from mfvpr.report.run_files import ground_truth, write_run_folder
-from mfvpr.report.runs import write_json
+from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -92,16 +92,11 @@ def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], t
     }  # fmt: skip
 
 
-def is_finished(folder: Path) -> bool:
-    """Whether a run is finished there, with any settings."""
-    return (folder / "results.json").is_file()
-
-
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
     """Whether a run of these inputs is finished there; SettingsError for one of other inputs, or a damaged one."""
-    if not is_finished(folder):
+    if not (folder / LAST).is_file():
         return False
-    for name in ("results.json", "run.json", SIZES):
+    for name in (LAST, "run.json", SIZES):
         try:
             read_json(folder / name)
         except (OSError, ValueError):

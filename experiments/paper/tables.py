@@ -29,12 +29,9 @@ _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")
 
 @dataclass(frozen=True)
 class RowResult:
-    """The result of a row's ranking on a data set.
+    """The result of a row's ranking on a data set: recall in % by sequence (`OVERALL` for all), threshold and depth.
 
-    Attributes:
-        recall: in %, by sequence (`OVERALL` for all), threshold and depth.
-        about: settings of the evaluation, from its results.
-        candidates: setting, of which a small database has fewer; None = as many as there were.
+    `about` are settings, from the results. `candidates` is a setting, of which a small database has fewer.
     """
 
     recall: Mapping[str, Mapping[float, Mapping[int, float]]]

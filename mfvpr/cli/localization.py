@@ -15,7 +15,7 @@ from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.localization.declaration import read_declaration, read_system
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime

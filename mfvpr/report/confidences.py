@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.evaluation.calibration import write_confidences
+from mfvpr.evaluation.calibration import fit_confidence, write_confidences
 from mfvpr.evaluation.precision import chance_calibration_error, reliability
 from mfvpr.evaluation.results import Reason
 from mfvpr.report.evaluation_files import NO_PLACE
@@ -83,16 +83,17 @@ def write_confidence(folder: Path, evaluation: EvaluationReport, provenance: Map
     points = [[name, by, *map(format_number, point)] for name in evaluation.ranked.systems
               for by, curve in evaluation.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
-    write_confidences(folder / "confidence.json", evaluation.fitted, provenance)
+    inputs = {name: evaluation.confidence_inputs(name) for name in evaluation.ranked.systems}
+    fits = {name: fit_confidence(values, evaluation.hits(name)) for name, values in inputs.items()
+            if np.isfinite(values).all(axis=1).any()}  # fmt: skip
+    write_confidences(folder / "confidence.json", fits, provenance)
 
 
 def _write_top_predictions(folder: Path, evaluation: EvaluationReport) -> None:
     """Write `query,prediction,score,confidence,correct,reason,in_database`.
 
-    `score`, `confidence` and `correct` are of the first candidate, also where the prediction is `NO_PLACE`, so that
-    calibration can be computed from the file. `reason` says why the prediction is `NO_PLACE`. `in_database` is 1 where
-    the database shows the query's place; elsewhere `NO_PLACE` is correct. Without ground truth `correct` and
-    `in_database` are empty.
+    `score`, `confidence` and `correct` are of the first candidate, also where the prediction is `NO_PLACE` for a
+    `reason`. `in_database` is 1 where the database shows the query's place; elsewhere `NO_PLACE` is correct.
     """
     name, database = evaluation.headline, evaluation.ranked.dataset.database.names
     refused, probabilities = evaluation.refused, evaluation.by_sequence(evaluation.probabilities[name])

@@ -13,7 +13,7 @@ from mfvpr.evaluation.paths import places_along_path
 from mfvpr.evaluation.results import RankedDataset
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.reranking.results import Ranked
 from mfvpr.utils.files import write_text
@@ -133,22 +133,11 @@ def _places(evaluation: EvaluationReport) -> np.ndarray | None:
     return places_along_path(stack_positives(known), truth.unit)
 
 
-def _table(names: Sequence[str], tests: Sequence[Difference]) -> Table:
-    """Table system x system: queries that only the system of the row predicts correctly, and p by blocks of places."""
-    cells = {}
-    for first, second, counts, flips in tests:
-        cells[first, second] = f"{counts.only_first} (p {flips.p_value:.2g})"
-        cells[second, first] = f"{counts.only_second} (p {flips.p_value:.2g})"
-    rows = [[name, *(cells.get((name, other), "") for other in names)] for name in names]
-    return Table(["only this is correct, not", *names], rows)
-
-
 def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
     """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`; nothing without ground truth.
 
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
-    one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need. It is
-    the row of the query where that is the order of the path.
+    one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need.
     """
     if not evaluation.thresholds:
         return
@@ -162,7 +151,11 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
             ranks = np.where(correct.any(axis=1), np.argmax(correct, axis=1) + 1, 0)
             columns += [correct[:, 0].astype(int).tolist(), [rank or "" for rank in ranks.tolist()]]
         write_csv(evaluation.folder(folder, part) / "gains.csv", header, zip(*columns, strict=True))
-    tests = differences(evaluation)
+    tests, counts = differences(evaluation), {}
+    for first, second, test, flips in tests:
+        counts[first, second] = f"{test.only_first} (p {flips.p_value:.2g})"
+        counts[second, first] = f"{test.only_second} (p {flips.p_value:.2g})"
+    rows = [[name, *(counts.get((name, other), "") for other in systems)] for name in systems]
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"]
     write_csv(folder / "differences.csv", header, [test.cells for test in tests])
-    write_text(folder / "differences.md", _table(systems, tests).markdown())
+    write_text(folder / "differences.md", Table(["only this is correct, not", *systems], rows).markdown())

@@ -16,7 +16,7 @@ from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_conf
 from mfvpr.evaluation.precision import PrecisionRecall, precision_recall
 from mfvpr.evaluation.results import KS, RankedDataset, Recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.scoring.histogram import HistogramOfShifts
@@ -134,27 +134,14 @@ class EvaluationReport:
         """Confidence by system, NaN without a prediction, or without anything to fit on."""
         systems = self.ranked.systems
         if self.confidences is not None:
-            return {name: confidence.probability(self._inputs(name, confidence))
+            return {name: confidence.probability(self.confidence_inputs(name, confidence))
                     for name, confidence in self.confidences.items() if name in systems}  # fmt: skip
         return {name: self._cross_fitted_probability(name) for name in systems} if self.thresholds else {}
-
-    @cached_property
-    def fitted(self) -> dict[str, Confidence]:
-        """Confidences by system for other images, fitted on all queries with ground truth; none without predictions."""
-        systems = self.ranked.systems if self.thresholds else ()
-        inputs = {name: self._inputs(name) for name in systems}
-        return {name: fit_confidence(values, self.hits(name)) for name, values in inputs.items()
-                if np.isfinite(values).all(axis=1).any()}  # fmt: skip
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
         parts = self.ranked.systems[system]
         return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
-
-    @cached_property
-    def has_positives(self) -> Bool[np.ndarray, " queries"]:
-        """Whether the database shows the query's place, with ground truth."""
-        return np.concatenate([part.counts > 0 for part in self.positives if part is not None])
 
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the prediction is `NO_PLACE`."""
@@ -168,19 +155,21 @@ class EvaluationReport:
         return self.by_sequence(self.refusals(self.headline))
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
-        """Precision and recall by the score, and by the confidence where it is known."""
+        """Precision and recall by the score, and by the confidence where it is known; with ground truth."""
+        has_positives = np.concatenate([part.counts > 0 for part in self.positives if part is not None])
         by_kind = {"score": self.scores(system), "confidence": self.probabilities.get(system)}
-        return {by: precision_recall(values, self.hits(system), self.has_positives)
+        return {by: precision_recall(values, self.hits(system), has_positives)
                 for by, values in by_kind.items() if values is not None}  # fmt: skip
 
-    def _inputs(self, system: str, like: Confidence | None = None) -> np.ndarray:
+    def confidence_inputs(self, system: str, like: Confidence | None = None) -> Float[np.ndarray, "queries inputs"]:
+        """Inputs of the confidence of a system; those of a known confidence, or all."""
         options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
         pairs = zip(self.ranked.systems[system], self.ranked.systems[RETRIEVAL], strict=True)
         return np.concatenate([confidence_inputs(*pair, **options) for pair in pairs])
 
     def _cross_fitted_probability(self, system: str) -> np.ndarray:
         """Confidence on each half of the path by a fit on the other, without what shows places of both."""
-        inputs, correct = self._inputs(system), self.hits(system)
+        inputs, correct = self.confidence_inputs(system), self.hits(system)
         probability = np.full(len(correct), np.nan)
         for half in self.path_halves():
             if np.isfinite(inputs[half.tune]).all(axis=1).any():

@@ -17,8 +17,7 @@ from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.figures import ABOUT, Candidate, histogram_figure, pixel_aspect_of
-from mfvpr.report.file_names import file_names
-from mfvpr.report.runs import Figure
+from mfvpr.report.runs import Figure, file_names
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, path_inside, printable
@@ -131,11 +130,8 @@ def localization_figure(
 ) -> None:
     """Write the figure of one prediction: the image beside the best candidate, their matches, the histogram of shifts.
 
-    `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be
-    read is drawn gray, as are all without a folder.
-
-    Raises:
-        InputError: the candidate's name leads out of the folder.
+    `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be read is drawn
+    gray, as are all without a folder. An InputError if the candidate's name leads out of the folder.
     """
     prediction, extractor = localization.prediction, known.extractor
     width, height = extractor.image_size

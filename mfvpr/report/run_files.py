@@ -34,11 +34,9 @@ class RunDescription:
     Attributes:
         stages: name and settings of "retrieval", "features" and "matching".
         parameters: by final score.
-        truth: kind, files, unit and thresholds of the ground truth.
-        truth_words: the same in words, for headings.
+        truth: kind, files, unit and thresholds of the ground truth; `truth_words` say the same in headings.
         contents: of the image files, by side.
         settings: that scores depend on.
-        command: of a program.
     """
 
     stages: Mapping[str, Mapping[str, Any]]

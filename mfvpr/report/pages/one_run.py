@@ -137,8 +137,9 @@ def tolerance_charts(curves: Curves) -> list[Chart]:
     by_kind: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
     for name, (run, system) in curves.items():
         if len(run.thresholds) > 1:
-            by_kind.setdefault((run.unit, run.first_k), {})[name] = [
-                (row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][run.first_k])
+            unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
+            by_kind.setdefault((unit, k), {})[name] = [
+                (row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][k])
                 for row in run.results
                 if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]
             ]
