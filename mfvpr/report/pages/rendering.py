@@ -114,24 +114,20 @@ def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
-    """Figures of queries in a run folder, by the names of their files; evenly chosen if there are more than `most`."""
-    paths = sorted((run / "figures").rglob("*_[0-9]*.png"))
-    step = max(1, -(-len(paths) // most))
-    return [picture for path in paths[::step] for picture in _pictures(path)]
-
-
-def _pictures(path: Path) -> Iterator[Picture]:
-    """The picture of a figure; empty if its file has no keywords."""
-    try:
-        with Image.open(path) as image:
-            image.load()
-            about = image.info
-            if {*ABOUT} <= {*about}:
+    """Figures of queries that have the keywords `ABOUT`, by their files; evenly chosen if there are more than `most`."""
+    paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
+    for path in paths[:: max(1, -(-len(paths) // most))]:
+        try:
+            with Image.open(path) as image:
+                image.load()
                 small = image.convert("RGB")
-                small.thumbnail((_WIDTH, small.height))
-                file = BytesIO()
-                small.save(file, "JPEG", quality=_QUALITY, optimize=True)
-                source = f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
-                yield Picture(**{name: str(about[name]) for name in ABOUT}, source=source, size=small.size)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: expected a figure of the run ({error}); remove it, or run again") from None
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise InputError(f"{path}: expected a figure of the run ({error}); remove it, or run again") from None
+        if {*ABOUT} <= {*image.info}:
+            small.thumbnail((_WIDTH, small.height))
+            file = BytesIO()
+            small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+            source = f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
+            about = {name: str(image.info[name]) for name in ABOUT}
+            shown.append(Picture(**about, source=source, size=small.size))
+    return shown
