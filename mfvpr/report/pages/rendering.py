@@ -114,7 +114,7 @@ def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
-    """Figures of queries that have the keywords `ABOUT`, by their files; evenly chosen if there are more than `most`."""
+    """Figures that have the keywords `ABOUT`, by their files; evenly chosen if there are more than `most`."""
     paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
     for path in paths[:: max(1, -(-len(paths) // most))]:
         try:
