@@ -7,9 +7,12 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from mfvpr.report import Table, write_json
-from mfvpr.report.evaluations import ABOUT, sequence_folder
-from mfvpr.report.file_names import file_names
-from mfvpr.report.rankings import Rankings, write_csv, write_failures, write_predictions
+from mfvpr.report.evaluation_files import write_failures, write_predictions
+from mfvpr.report.evaluations import sequence_folder
+from mfvpr.report.figures import ABOUT
+from mfvpr.report.runs import file_names
+from mfvpr.report.tables import write_csv
+from mfvpr.reranking.results import Ranked
 from mfvpr.utils.files import printable
 
 HOSTILE = (
@@ -73,9 +76,9 @@ def _write_answers(folder, ranks, truth, places):
         correct = np.array(first)[:, None] == np.arange(1, CANDIDATES + 1)
         rows = (np.arange(len(HOSTILE))[:, None] + np.arange(CANDIDATES)) % len(HOSTILE)
         scores = np.arange(len(HOSTILE))[:, None] + 10.0 - np.arange(CANDIDATES)
-        rankings = Rankings(HOSTILE, HOSTILE[::-1], rows, scores, correct if truth else None)
-        write_predictions(folder / "predictions" / f"{files[system]}.csv", rankings)
-        write_failures(folder / "failures" / f"{files[system]}.csv", rankings)
+        rankings = HOSTILE, HOSTILE[::-1], Ranked(rows, scores), correct if truth else None
+        write_predictions(folder / "predictions" / f"{files[system]}.csv", *rankings)
+        write_failures(folder / "failures" / f"{files[system]}.csv", *rankings)
     if truth:
         header = ["query", "place", *(column for name in ranks for column in (name, f"{name} rank"))]
         lines = []

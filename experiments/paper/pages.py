@@ -1,23 +1,169 @@
-"""The pages: one of all evaluations, and one of each data set's evaluations side by side."""
+"""The figures of the evaluations at hand; the page of all of them, and one of each data set's side by side."""
 
+import itertools
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.paper.figures import mean_recalls
-from experiments.paper.tables import Evaluations
-from experiments.paper.timing import STEPS
+import numpy as np
+from matplotlib.figure import Figure as Canvas
+
+from experiments.paper.runs import STEPS
+from experiments.paper.tables import TOLERANCES, Evaluations, average, printed_tables
+from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.truth import middle, threshold_words
 from mfvpr.report import Table
+from mfvpr.report.evaluations import sequence_folder
+from mfvpr.report.figures import with_longest_side
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
-from mfvpr.report.pages.one_run import PAGE, values_table
-from mfvpr.report.pages.pictures import MOST_PICTURES, pictures
-from mfvpr.report.pages.rendering import Gallery, Section, write_page
+from mfvpr.report.pages.rendering import MOST_PICTURES, PAGE, Gallery, Section, pictures, values_table, write_page
 from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.plots import panels, save_figure
+from mfvpr.report.runs import Figure
+from mfvpr.report.tables import read_csv
+from mfvpr.utils.files import clip_middle, printable, replacing
 from mfvpr.utils.versions import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
+_MIDDLE = 1  # of the tolerances: the paper's figure
+_OVER_PAPERS = "printed, over the paper's six"
+_OURS, _PRINTED = "#2f6fb0", "#c9a227"
+_STEPS = {"retrieval": "#7a9e9f", "features": "#c98b2d", "matching": "#2f6fb0", "scores": "#7b4b94"}
+_SIDE = 300  # px of an image's longer side among the failures
+_NAME_LENGTH = 32  # characters
+_FAILURES = 2  # of each data set
+
+_Image = tuple[np.ndarray, str]  # pixels and a title
+
+
+def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
+    """The figures that there are numbers for; of each data set, the best row shows its histogram and failures."""
+    folders = {name: evaluations.folders[name, row.run] for name in evaluations.datasets
+               for row in reversed(evaluations.best_rows) if (name, row.run) in evaluations.folders}  # fmt: skip
+    histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("correct_*.png")))
+    if histogram := next(histograms, None):
+        yield "histogram.png", partial(_copy, source=histogram)
+    if groups := mean_recalls(evaluations):
+        titles = [row.title for row in evaluations.rows if any(row.title in group for group in groups.values())]
+        yield "averages.png", partial(_draw_averages, titles=titles, groups=groups)
+    if evaluations.seconds:
+        yield "speed.png", partial(_draw_speed, evaluations=evaluations)
+    if evaluations.growth:
+        yield "growth.png", partial(_draw_growth, growth=evaluations.growth)
+    if folders:
+        cases = [case for name, folder in folders.items() for case in _failures(folder, evaluations.datasets[name])]
+        yield "failures.png", partial(_draw_failures, cases=cases)
+
+
+def mean_recalls(evaluations: Evaluations) -> dict[str, dict[str, float]]:
+    """Mean recall at 1 within 2 frames by title, here (see `Evaluations.means`) and printed, as far as there are."""
+    groups: dict[str, dict[str, float]] = {f"over {evaluations.averaged}": {}, _OVER_PAPERS: {}}
+    for row in evaluations.rows:
+        means = evaluations.means[1].get(row.name), average(printed_tables()["recall"].get(row.name, {}))
+        for group, mean in zip(groups.values(), means, strict=True):
+            if mean is not None:
+                group[row.title] = float(mean[_MIDDLE])
+    return {label: group for label, group in groups.items() if group}
+
+
+def _draw_averages(path: Path, titles: Sequence[str], groups: Mapping[str, Mapping[str, float]]) -> None:
+    """Draw the means of `mean_recalls` side by side."""
+    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(titles))
+    for number, (label, members) in enumerate(groups.items()):
+        places = [titles.index(title) + 0.4 * (number - (len(groups) - 1) / 2) for title in members]
+        color = _PRINTED if label == _OVER_PAPERS else _OURS
+        bars = axes.barh(places, [*members.values()], 0.38, label=label, color=color)
+        axes.bar_label(bars, fmt="%.1f", padding=2, fontsize=7)
+    _save_bars(figure, path, titles, "mean Recall@1 within 2 frames, %", 108)
+
+
+def _draw_speed(path: Path, evaluations: Evaluations) -> None:
+    """Draw the seconds of a query, step by step."""
+    rows = [row for row in evaluations.rows if row.name in evaluations.seconds]
+    figure, [axes] = panels(1, 9, 1.2 + 0.3 * len(rows))
+    left = np.zeros(len(rows))
+    for step, color in _STEPS.items():
+        width = np.array([evaluations.seconds[row.name][step] for row in rows])
+        axes.barh(np.arange(len(rows)), width, 0.7, left=left, label=step, color=color)
+        left += width
+    for place, total in enumerate(left):
+        axes.text(total, place, f" {total:.3f}", va="center", fontsize=7)
+    label = f"seconds of a query of {evaluations.timed_on}"
+    _save_bars(figure, path, [row.title for row in rows], label, 1.12 * left.max())
+
+
+def _save_bars(figure: Canvas, path: Path, titles: Sequence[str], label: str, limit: float) -> None:
+    [axes] = figure.axes
+    axes.set_yticks(np.arange(len(titles)), titles, fontsize=8)
+    axes.invert_yaxis()
+    axes.set(xlim=(0, limit), xlabel=label)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=len(_STEPS), frameon=False, fontsize=8)
+    save_figure(figure, path)
+
+
+def _draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
+    """Draw the seconds of a query as the database grows: the search grows, the rest stays."""
+    figure, [axes] = panels(1, 7, 4.2)
+    for title, by_size in growth.items():
+        axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
+    axes.set(xlabel="images of a database, whose descriptors are made up", ylabel="seconds of a query")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def _draw_failures(path: Path, cases: Sequence[Sequence[_Image]]) -> None:
+    """Draw query, prediction, and the best ranked correct image side by side."""
+    heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image, _ in case) for case in cases] or [1.0]
+    number = len(heights)
+    figure, axes = panels(3 * number, 9.5 / 3, sum(heights) / number, columns=3, height_ratios=heights)
+    for panel in axes:
+        panel.set_axis_off()
+    for panel, (image, title) in zip(axes, itertools.chain.from_iterable(cases), strict=False):
+        panel.imshow(image)
+        panel.set_title(printable(title), fontsize=7, parse_math=False)
+    save_figure(figure, path)
+
+
+def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
+    """Query, prediction and correct image of the clearest failures that retrieval did not cause."""
+    names, failures = [sequence.name for sequence in dataset.sequences], []
+    for place, sequence in enumerate(dataset.sequences):
+        file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
+        failures += [(sequence, row) for row in read_csv(file)
+                     if row["correct_image"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
+    failures.sort(key=lambda failure: -float(failure[1]["margin"]))
+    for sequence, row in failures[:_FAILURES]:
+        where = " ".join(dict.fromkeys((dataset.name, sequence.name)))
+        yield [
+            _image(sequence.images, row["query"], f"{where} query"),
+            _image(dataset.database, row["prediction"], "prediction"),
+            _image(dataset.database, row["correct_image"], "correct"),
+        ]
+
+
+def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
+    """Whether a prediction is incorrect within the widest of the paper's tolerances, too; True for positions."""
+    if sequence.truth is None or sequence.truth.unit != "frames":
+        return True
+    correct = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
+    return database.names.index(row["prediction"]) not in correct
+
+
+def _copy(path: Path, source: Path) -> None:
+    with replacing(path) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+def _image(folder: ImageFolder, name: str, words: str) -> _Image:
+    """An image, small, and its title."""
+    image = with_longest_side(folder.read(folder.names.index(name)), _SIDE)
+    return image, f"{words}: {clip_middle(name, _NAME_LENGTH)}"
 
 
 def write_pages(
@@ -44,13 +190,13 @@ def write_pages(
     about["Versions"] = values_table(versions())
     sections = [
         Section("recall", "Recall", "In %. Where the paper prints a number, that and the difference stand beside ours.",
-                [_averages(evaluations), *_by_sequence(evaluations)], recalls),
+                [_averages_chart(evaluations), *_by_sequence(evaluations)], recalls),
         Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
                 "intervals.", links=addresses),
         Section("predictions", "Predictions", "For every evaluation: queries and top predictions with their heaviest "
                 "matches, and the histogram of shifts. An incorrect prediction has the correct image below it.",
                 gallery=_gallery(evaluations)),
-        Section("costs", "Seconds and sizes", "", [*_costs(evaluations)], costs),
+        Section("costs", "Seconds and sizes", "", [*_cost_charts(evaluations)], costs),
         Section("settings", "Data sets and settings", tables=about),
     ]  # fmt: skip
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
@@ -58,7 +204,7 @@ def write_pages(
     write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
 
 
-def _averages(evaluations: Evaluations) -> Chart:
+def _averages_chart(evaluations: Evaluations) -> Chart:
     groups = {label: {title: Bar(value) for title, value in members.items()}
               for label, members in mean_recalls(evaluations).items()}  # fmt: skip
     return bar_chart("averages", "Mean recall at 1 within 2 frames", groups, axis="mean recall at 1, %")
@@ -83,7 +229,7 @@ def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:
             )
 
 
-def _costs(evaluations: Evaluations) -> Iterator[Chart]:
+def _cost_charts(evaluations: Evaluations) -> Iterator[Chart]:
     if evaluations.seconds:
         titles = {row.name: row.title for row in evaluations.rows}
         totals = {titles[name]: sum(steps[step] for step in STEPS) for name, steps in evaluations.seconds.items()}

@@ -1,14 +1,13 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.paper import runs, systems, timing
-from experiments.paper.figures import paper_figures
-from experiments.paper.pages import write_pages
+from experiments.paper import runs, systems
+from experiments.paper.pages import paper_figures, write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.checkpoints import how_to_install
@@ -19,9 +18,11 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
+from mfvpr.report.runs import LAST
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
+from mfvpr.utils.files import expand_user
 
 
 def paper(settings: dict[str, Any]) -> None:
@@ -35,21 +36,16 @@ def paper(settings: dict[str, Any]) -> None:
         for line in left_out:
             tell(f"left out: {line}")
         raise SettingsError("nothing to evaluate: the lines above say what is missing")
-    _announce(rows, places, settings)
+    names, known = _names(rows), [place.name for place in places]
+    tell(
+        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets ({', '.join(known)}), "
+        f"{len(_finished_runs(rows, known, settings))} of {len(names) * len(places)} finished; then tables, seconds of "
+        f"a query, and figures in {settings['out']}"
+    )
     _announce_missing(settings, absent, lacking, refused)
-    out = Path(settings["out"]).expanduser()
+    out = expand_user(settings["out"])
     with runs.lock_output(out):
         _evaluate_and_report(rows, places, settings, out, left_out)
-
-
-def _announce(rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]) -> None:
-    """Print the plan."""
-    names = _names(rows)
-    tell(
-        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
-        f"({', '.join(place.name for place in places)}), {len(_finished_runs(rows, places, settings))} of "
-        f"{len(names) * len(places)} finished; then tables, seconds of a query, and figures in {settings['out']}"
-    )
 
 
 def _announce_missing(
@@ -84,23 +80,22 @@ def _evaluate_and_report(
     rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any], out: Path, left_out: Sequence[str]
 ) -> None:
     def write_tables(datasets: Mapping[str, Dataset]) -> None:
-        finished = _finished_runs(rows, [place for place in places if place.name in datasets], settings)
-        _write_tables(out, _read_evaluations(rows, datasets, finished))
+        _write_tables(out, _read_evaluations(rows, datasets, settings))
 
     datasets, failures = evaluate_all(rows, places, settings, write_tables)
-    readable = [place for place in places if place.name in datasets]
-    if not readable:
+    if not datasets:
         raise SettingsError(f"nothing was evaluated: {failures[0]}")
-    evaluations = _read_evaluations(rows, datasets, _finished_runs(rows, readable, settings))
-    timed_on = next((place for place in readable if place.name == "robotcar_seasons"), readable[0])
-    about = f"{timed_on.name}, on {timing.device()['cores']} cores of {timing.device()['device']}"
+    evaluations = _read_evaluations(rows, datasets, settings)
+    name = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets))
+    timed_on = next(place for place in places if place.name == name)
+    about = f"{timed_on.name}, on {runs.device()['cores']} cores of {runs.device()['device']}"
     evaluations = replace(evaluations, timed_on=about)
     for name, (heading, table) in _write_tables(out, evaluations).items():  # before the seconds, which take a while
         if name in ("recall", "averages"):
             print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
     times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
-    seconds = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-    evaluations = replace(evaluations, seconds=seconds)
+    evaluations = replace(evaluations, seconds={row.name: times[row.run] for row in rows
+                                                if row.run in times and row.leads})  # fmt: skip
     evaluations = replace(evaluations, growth=_measure_growth(evaluations, out))
     for name in ("figures", "comparisons"):  # they may have those of other rows and data sets
         shutil.rmtree(out / name, ignore_errors=True)
@@ -146,7 +141,7 @@ def evaluate_all(
         for difference in published_differences(dataset):
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names, start=number * len(names) + 1):
-            chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place, settings)
+            chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place.name, settings)
             inputs = runs.input_fingerprints(chosen, images, correct)
             if runs.is_finished_with(inputs, folder):
                 finished += 1
@@ -167,25 +162,24 @@ def evaluate_all(
 
 
 def _finished_runs(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any]
+    rows: Sequence[Row], datasets: Iterable[str], settings: Mapping[str, Any]
 ) -> dict[tuple[str, str], Path]:
     """Run folders by data set and evaluation."""
-    folders = {(place.name, run): runs.folder_of(run, place, settings) for place in places for run in _names(rows)}
-    return {key: folder for key, folder in folders.items() if runs.is_finished(folder)}
+    folders = {(name, run): runs.folder_of(run, name, settings) for name in datasets for run in _names(rows)}
+    return {key: folder for key, folder in folders.items() if (folder / LAST).is_file()}
 
 
-def _read_evaluations(
-    rows: Sequence[Row], datasets: Mapping[str, Dataset], folders: Mapping[tuple[str, str], Path]
-) -> Evaluations:
-    results, sizes = {}, {}
+def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], settings: Mapping[str, Any]) -> Evaluations:
+    results, sizes, folders = {}, {}, _finished_runs(rows, datasets, settings)
     for (name, run), folder in folders.items():
-        content, size = runs.read_json(folder / "results.json"), runs.read_json(folder / runs.SIZES)
+        content, size = runs.read_json(folder / LAST), runs.read_json(folder / runs.SIZES)
         candidates = runs.read_json(folder / "run.json")["settings"]["candidates"]
         for row in (row for row in rows if row.run == run):
             if result := row_result(row, content, candidates):
                 results[row.name, name] = result
             if row.leads or row.ranking == RETRIEVAL:  # retrieval alone has no local features
-                sizes[row.name, name] = size["descriptor"] + (0 if row.ranking == RETRIEVAL else size["local"])
+                of_image = size["descriptor"] + (0 if row.ranking == RETRIEVAL else size["local"])
+                sizes[row.name, name] = of_image * len(datasets[name].database) / 2**20
     return Evaluations(rows, datasets, results, sizes=sizes, folders=folders)
 
 
@@ -194,14 +188,14 @@ def measure_times(
 ) -> dict[str, dict[str, Any]]:
     """Seconds by finished evaluation on a data set, measured once for the same settings, data and device."""
     times = {}
-    for (_, run), folder in _finished_runs(rows, [place], settings).items():
+    for (_, run), folder in _finished_runs(rows, [place.name], settings).items():
         path = out / "seconds" / f"{run}.json"
-        about = {"data_set": place.name, "of": runs.read_json(folder / runs.INPUTS)} | timing.device()
+        about = {"data_set": place.name, "of": runs.read_json(folder / runs.INPUTS)} | runs.device()
         times[run] = runs.read_object(path)
         if any(times[run].get(name) != value for name, value in about.items()):
             tell(f"timing: {run} on {place.name}")
             try:
-                times[run] = timing.measure_query(runs.settings_of(run, place, settings), dataset) | about
+                times[run] = runs.measure_query(runs.settings_of(run, place, settings), dataset) | about
                 write_json(path, times[run])
             except InputError as error:
                 tell(f"left out: seconds of {run}: {error}")
@@ -211,7 +205,7 @@ def measure_times(
 
 def _measure_growth(evaluations: Evaluations, out: Path) -> dict[str, dict[int, float]]:
     """Seconds of a query of some systems by the size of the database; the search is measured once."""
-    path, device = out / "seconds" / "growth.json", timing.device()
+    path, device = out / "seconds" / "growth.json", runs.device()
     known = runs.read_object(path)
     if known.get("device") != device:
         known = {"device": device, "search": {}}
@@ -221,9 +215,9 @@ def _measure_growth(evaluations: Evaluations, out: Path) -> dict[str, dict[int, 
     for row in (row for row in evaluations.best_rows if row.name in evaluations.seconds):
         length = str(lengths[row.run])
         if length not in known["search"]:
-            known["search"][length] = {str(size): value for size, value in timing.search(lengths[row.run]).items()}
+            known["search"][length] = {str(size): value for size, value in runs.search(lengths[row.run]).items()}
             write_json(path, known)
-        rest = sum(evaluations.seconds[row.name][step] for step in timing.STEPS)
+        rest = sum(evaluations.seconds[row.name][step] for step in runs.STEPS)
         growth[row.title] = {int(size): rest + value for size, value in known["search"][length].items()}
     return growth
 

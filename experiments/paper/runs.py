@@ -1,12 +1,16 @@
-"""The evaluations, each in a run folder of its own; finished runs are not repeated."""
+"""The evaluations, each in a run folder of its own and not repeated; the seconds of a query, by step."""
 
 import json
+import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from omegaconf import OmegaConf
 
 from experiments.paper.systems import Place, overrides
@@ -14,15 +18,21 @@ from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder
 from mfvpr.cli.inputs import Inputs
 from mfvpr.cli.overrides import compose_program
+from mfvpr.datasets import Dataset, ImageFolder
+from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
+from mfvpr.localization.vectors import Vectors
 from mfvpr.report.run_files import ground_truth, write_run_folder
-from mfvpr.report.runs import write_json
+from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database
+from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError, check
-from mfvpr.utils.files import remove_leftovers
+from mfvpr.utils.files import expand_user, remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.locks import lock_folder
+from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
@@ -30,6 +40,11 @@ INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `by
 _SHARED = ("cache", "memory", "devices")  # settings of both programs
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
 _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
+QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
+STEPS = ("retrieval", "features", "matching", "scores")
+_MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
+_DATABASES = (100, 1000, 10_000, 100_000)  # images
+_ROUNDS = 5
 _FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change no number
 
 
@@ -52,15 +67,15 @@ def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str
     chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
     composed: Any = OmegaConf.to_container(compose_program("config", chosen), resolve=True)
     composed |= {name: settings[name] for name in _SHARED}
-    composed["out"] = str(folder_of(run, place, settings))
+    composed["out"] = str(folder_of(run, place.name, settings))
     check(composed)
     del composed["compiled"]  # a setting of this process
     return composed | {"command": f"mfvpr evaluate {' '.join(chosen)}"}
 
 
-def folder_of(run: str, place: Place, settings: Mapping[str, Any]) -> Path:
+def folder_of(run: str, dataset: str, settings: Mapping[str, Any]) -> Path:
     """The run folder of an evaluation."""
-    return Path(settings["out"]).expanduser() / "runs" / place.name / run
+    return expand_user(settings["out"]) / "runs" / dataset / run
 
 
 def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
@@ -77,16 +92,11 @@ def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], t
     }  # fmt: skip
 
 
-def is_finished(folder: Path) -> bool:
-    """Whether a run is finished there, with any settings."""
-    return (folder / "results.json").is_file()
-
-
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
     """Whether a run of these inputs is finished there; SettingsError for one of other inputs, or a damaged one."""
-    if not is_finished(folder):
+    if not (folder / LAST).is_file():
         return False
-    for name in ("results.json", "run.json", SIZES):
+    for name in (LAST, "run.json", SIZES):
         try:
             read_json(folder / name)
         except (OSError, ValueError):
@@ -105,7 +115,7 @@ def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
-            write_run_folder(new, outcome.calibrated, outcome.description)
+            write_run_folder(new, outcome.report, outcome.description)
             write_json(new / INPUTS, dict(inputs))
             write_json(new / SIZES, bytes_of_an_image(outcome.inputs))
             run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
@@ -144,3 +154,65 @@ def read_object(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
+    """Measure the seconds of a query by step.
+
+    A part of the database is enough: only the search among descriptors depends on its size (see `search`). Queries are
+    evaluated twice under different names, so that nothing is compiled, and no feature of the database is extracted,
+    while the second pass is timed.
+    """
+    sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
+    number = min(QUERIES, len(sequence.images))
+    candidates = settings["candidates"]
+    least = DATABASE if candidates == "all" else max(DATABASE, candidates)
+    database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
+    extractor = assembly.extractor(settings["features"], None)
+    retriever, matcher = (
+        assembly.retriever(settings["retrieval"], extractor, None),
+        assembly.matcher(settings["matching"]),
+    )
+    scorers, seconds = assembly.scorers(settings["scorer"]), dict[str, float]()
+    main = "histogram" if "histogram" in scorers else next(iter(scorers))
+    with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
+        cache = FeatureCache(Path(folder) / "cache")
+        system = System(Pipeline(extractor, retriever, matcher, candidates), {main: scorers[main]})
+        for turn in ("first", "second"):
+            images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
+            part = replace(sequence, images=images, truth=None, excluded=None)
+            seconds = rank_dataset(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
+    return {step: seconds.get(step, 0.0) / number for step in STEPS}
+
+
+def device() -> dict[str, Any]:
+    """The device that the seconds are measured on, and versions."""
+    return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": versions()}
+
+
+def _link_under_new_names(images: ImageFolder, number: int, folder: Path) -> ImageFolder:
+    """The first images under other names, in a folder of their own."""
+    folder.mkdir()
+    names = [f"{folder.name}{row:04d}{path.suffix}" for row, path in enumerate(images.paths[:number])]
+    for name, path in zip(names, images.paths, strict=False):
+        (folder / name).symlink_to(path.absolute())
+    return replace(images, root=folder, names=tuple(names))
+
+
+def search(descriptor: int) -> dict[int, float]:
+    """Measure the seconds of a search among synthetic descriptors, by the size of the database.
+
+    `descriptor` is the size of one in bytes; all of a database take at most `_MOST_BYTES`.
+    """
+    seconds, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
+    for size in (size for size in _DATABASES if size * descriptor <= _MOST_BYTES):
+        database = Vectors()
+        for row in range(size):
+            database.put(row, rng.standard_normal(length, np.float32))
+        query, times = rng.standard_normal(length, np.float32), []
+        for _ in range(_ROUNDS + 1):
+            start = time.perf_counter()
+            database.nearest(query, 50)
+            times.append(time.perf_counter() - start)
+        seconds[size] = float(np.median(times[1:]))
+    return seconds

@@ -1,8 +1,7 @@
 """Rows of the tables, the evaluations that give them, and the data sets at hand."""
 
 import difflib
-import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,6 +129,8 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
     _check_names("datasets", names, known)
     available, absent, refused = list[Place](), dict[str, str](), list[str]()
     for name in known if names is None else [name for name in known if name in names]:
+        folders = PUBLISHED[name].folders if name in PUBLISHED else (name,)
+        present = [root / folder for folder in folders if root and folder not in located and (root / folder).is_dir()]
         if name == DRAWN:
             available.append(Place(name, (f"dataset={name}",)))
             if root and (root / name).is_dir():
@@ -140,8 +141,8 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
             refused.append(f"{name}: expected a folder's name of {RULES['dataset.name'].expected}; rename it")
         elif name in located:
             available.append(located[name])
-        elif folder := _folder(root, name, located):
-            available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={folder}")), folder))
+        elif present:
+            available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={present[0]}")), present[0]))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
             absent[name] = f"{name}: needs {data or 'data=DIR'}/{name} {needs}"
@@ -153,23 +154,11 @@ def _places_by_coordinates(root: Path) -> Iterator[Place]:
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
         for inside in (folder, folder / "images" / "test"):
             sides = {side: inside / side for side in _SIDES}
-            if all(side.is_dir() and _first_name(side).startswith(_POSITIONS) for side in sides.values()):
+            if all(any(path.is_file() for path in side.glob(f"{_POSITIONS}*")) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
                 settings = (quote(f"dataset.{name}={value}") for name, value in chosen.items())
                 yield Place(folder.name, ("dataset=folder", *settings), folder)
                 break
-
-
-def _first_name(folder: Path) -> str:
-    """The name of some file; empty if there is none."""
-    with os.scandir(folder) as entries:
-        return next((entry.name for entry in entries if entry.is_file()), "")
-
-
-def _folder(root: Path | None, name: str, taken: Collection[str]) -> Path | None:
-    names = PUBLISHED[name].folders if name in PUBLISHED else (name,)
-    folders = (root / folder for folder in names if folder not in taken) if root else ()
-    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:

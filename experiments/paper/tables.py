@@ -1,16 +1,16 @@
-"""The paper's tables: numbers of the evaluations at hand beside the printed ones."""
+"""The paper's tables: numbers of the evaluations at hand beside the printed ones, and averages of both."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from jaxtyping import Float
 
-from experiments.paper.printed import BERLIN, OTHERS, average, printed_recall, printed_settings, printed_tables
 from experiments.paper.systems import Row
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import MEANS
@@ -18,6 +18,8 @@ from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import middle
 from mfvpr.report import Table
 
+BERLIN = ("berlin_a100", "berlin_kudamm", "berlin_halenseestrasse")
+OTHERS = ("gardens_point", "nordland_1415", "robotcar_seasons")
 INCOMPLETE = " (incomplete)"
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
 TOLERANCES = (1, 2, 5)  # of the printed recalls
@@ -27,12 +29,9 @@ _BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")
 
 @dataclass(frozen=True)
 class RowResult:
-    """The result of a row's ranking on a data set.
+    """The result of a row's ranking on a data set: recall in % by sequence (`OVERALL` for all), threshold and depth.
 
-    Attributes:
-        recall: in %, by sequence (`OVERALL` for all), threshold and depth.
-        about: settings of the evaluation, from its results.
-        candidates: setting, of which a small database has fewer; None = as many as there were.
+    `about` are settings, from the results. `candidates` is a setting, of which a small database has fewer.
     """
 
     recall: Mapping[str, Mapping[float, Mapping[int, float]]]
@@ -48,8 +47,8 @@ class Evaluations:
         rows: of the tables.
         datasets: at hand, by name.
         results: by row and data set.
-        seconds: of a query, by row and step; see `timing`.
-        sizes: by row and data set: bytes of an image's features in float32, as the paper counts them.
+        seconds: of a query, by row and step; see `runs.measure_query`.
+        sizes: by row and data set: MiB of the database's features in float32, as the paper counts them.
         timed_on: the data set and the device of the seconds, in words.
         growth: seconds of a query by title and by the size of the database.
         folders: run folders by data set and evaluation.
@@ -71,7 +70,7 @@ class Evaluations:
 
     def title(self, name: str) -> str:
         """A data set's name, marked if it lacks images."""
-        return name + INCOMPLETE * (next(published_differences(self.datasets[name]), None) is not None)
+        return name + INCOMPLETE * any(published_differences(self.datasets[name]))
 
     @cached_property
     def means(self) -> tuple[list[str], dict[str, Float[np.ndarray, " tolerances"]]]:
@@ -89,9 +88,8 @@ class Evaluations:
             recalls = {name: [result.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
                        for name, result in zip(names, results, strict=True) if result}  # fmt: skip
             if names and len(recalls) == len(names):
-                macro = average(recalls)
-                is_papers = macro is not None and names == six
-                means[row.name] = macro if is_papers else np.mean([*recalls.values()], axis=0)
+                macro = average(recalls) if names == six else None
+                means[row.name] = np.mean([*recalls.values()], axis=0) if macro is None else macro
         return names, means
 
     @property
@@ -103,6 +101,36 @@ class Evaluations:
         """Thresholds of a data set's evaluations."""
         recalls = (result.recall[OVERALL] for (_, name), result in self.results.items() if name == dataset)
         return sorted(next(recalls, {}))
+
+
+@cache
+def printed_tables() -> Mapping[str, Any]:
+    """Tables by their names in printed.yaml, which describes them."""
+    return yaml.safe_load((Path(__file__).parent / "printed.yaml").read_text(encoding="utf-8"))
+
+
+def average(recalls: Mapping[str, Sequence[float]]) -> Float[np.ndarray, " tolerances"] | None:
+    """The paper's average recall: Berlin's three count as one data set; None if one of six is missing.
+
+    `recalls` are by data set and tolerance.
+    """
+    if not {*BERLIN, *OTHERS} <= recalls.keys():
+        return None
+    berlin = np.mean([recalls[name] for name in BERLIN], axis=0)
+    return np.mean([berlin, *(recalls[name] for name in OTHERS)], axis=0)
+
+
+def printed_recall(row: str, dataset: str, sequence: str | None = None) -> Sequence[float] | None:
+    """Recall of a system within 1, 2, 5 frames in %, on a data set or a sequence of RobotCar's; None = not printed."""
+    if sequence is None:
+        return printed_tables()["recall"].get(row, {}).get(dataset)
+    return printed_tables()["sequences"].get(row, {}).get(sequence) if dataset == "robotcar_seasons" else None
+
+
+def printed_settings(row: str) -> Mapping[str, Any]:
+    """Sizes of images and candidates of a system, by column; empty = not printed."""
+    families = (family for family in printed_tables()["settings"] if row.startswith(family))
+    return printed_tables()["settings"].get(max(families, key=len, default=""), {})
 
 
 def row_result(row: Row, results: Sequence[Mapping[str, Any]], candidates: int | str | None = None) -> RowResult | None:
@@ -177,39 +205,39 @@ def _settings(evaluations: Evaluations) -> Table:
 
 
 def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) -> Table:
-    """Recall by part and threshold, of rows that are known on a data set; parts are (words, data set, sequence)."""
+    """Recall by part and threshold; parts are (words, data set, sequence)."""
     columns = [(*part, threshold) for part in parts for threshold in evaluations.thresholds(part[1])]
-    rows = []
-    for row in evaluations.rows if columns else ():
-        if not any((row.name, name) in evaluations.results or printed_recall(row.name, name) for _, name, _ in parts):
-            continue
-        cells = []
-        for _, name, sequence, threshold in columns:
-            result = evaluations.results.get((row.name, name))
-            ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
-            theirs = printed_recall(row.name, name, sequence or None)
-            known = theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None
-            cells.append(beside(ours, known))
-        rows.append([row.title, *cells])
-    return Table(["system", *(f"{words} ±{threshold:g}" for words, *_, threshold in columns)], rows)
+
+    def cell(row: Row, name: str, sequence: str, threshold: float) -> str:
+        result, theirs = evaluations.results.get((row.name, name)), printed_recall(row.name, name, sequence or None)
+        ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
+        return beside(ours, theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None)
+
+    header = [f"{words} ±{threshold:g}" for words, *_, threshold in columns]
+    return _filled(header, {row.title: [cell(row, *column[1:]) for column in columns] for row in evaluations.rows})
+
+
+def _filled(header: Sequence[str], cells: Mapping[str, Sequence[str]]) -> Table:
+    """A table of the systems that have numbers; `cells` are by title."""
+    rows = [[title, *texts] for title, texts in cells.items() if any(text != _NONE for text in texts)]
+    return Table(["system", *header], rows)
 
 
 def _averages(evaluations: Evaluations) -> Table:
     """Means over the data sets that are here, see `Evaluations.means`, and the printed ones beside those of all six."""
     names, means = evaluations.means
     is_papers, no_values = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES)
-    rows = []
+    cells = {}
     for row in evaluations.rows:
-        printed_mean = average(printed_tables()["recall"].get(row.name, {}))
-        if row.name in means or printed_mean is not None:
-            ours = means.get(row.name, no_values)
-            theirs = no_values if printed_mean is None else printed_mean
-            cells = [beside(*both) for both in zip(ours if is_papers else no_values, theirs, strict=True)]
-            rows.append([row.title, *cells, *(beside(value, None) for value in (no_values if is_papers else ours))])
-    header = ["system"] + [f"of the paper's six ±{tolerance}" for tolerance in TOLERANCES]
-    header += [f"of {len(names)} here ±{tolerance}" for tolerance in TOLERANCES]
-    filled = [place for place in range(len(header)) if not rows or any(row[place] != _NONE for row in rows)]
-    return Table([header[place] for place in filled], [[row[place] for place in filled] for row in rows])
+        printed_mean, ours = average(printed_tables()["recall"].get(row.name, {})), means.get(row.name, no_values)
+        theirs = no_values if printed_mean is None else printed_mean
+        cells[row.title] = [beside(*both) for both in zip(ours if is_papers else no_values, theirs, strict=True)]
+        cells[row.title] += [beside(value, None) for value in (no_values if is_papers else ours)]
+    words = "of the paper's six", f"of {len(names)} here"
+    table = _filled([f"{name} ±{tolerance}" for name in words for tolerance in TOLERANCES], cells)
+    columns = [column for column in zip(table.header, *table.rows, strict=True) if {*column[1:]} != {_NONE}]
+    header, *rows = map(list, zip(*columns, strict=True))
+    return Table(header, rows)
 
 
 def _depths(evaluations: Evaluations) -> Table:
@@ -227,17 +255,14 @@ def _depths(evaluations: Evaluations) -> Table:
 
 
 def _sizes(evaluations: Evaluations) -> Table:
-    """Bytes of an image times images of the database."""
-    rows = []
-    for row in evaluations.rows:
-        theirs = printed_tables()["sizes"].get(row.name, {})
-        cells = []
-        for name, dataset in evaluations.datasets.items():
-            size = evaluations.sizes.get((row.name, name))
-            cells.append(beside(None if size is None else size * len(dataset.database) / 2**20, theirs.get(name)))
-        if any(cell != _NONE for cell in cells):
-            rows.append([row.title, *cells])
-    return Table(["system", *map(evaluations.title, evaluations.datasets)], rows)
+    """Sizes of the databases."""
+    printed = printed_tables()["sizes"]
+    cells = {
+        row.title: [beside(evaluations.sizes.get((row.name, name)), printed.get(row.name, {}).get(name))
+                    for name in evaluations.datasets]
+        for row in evaluations.rows
+    }  # fmt: skip
+    return _filled([*map(evaluations.title, evaluations.datasets)], cells)
 
 
 def _seconds(evaluations: Evaluations) -> Table:

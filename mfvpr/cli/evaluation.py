@@ -7,8 +7,9 @@ from mfvpr.cli import confidences, run_folder, truth
 from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Shard, System, fill_shard, rank_dataset
-from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table
-from mfvpr.report.evaluations import EvaluationReport, query_figures, recall_table
+from mfvpr.report.confidences import confidence_figures, confidence_table
+from mfvpr.report.evaluations import EvaluationReport, recall_table
+from mfvpr.report.query_figures import query_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
@@ -21,14 +22,9 @@ class Outcome:
     """The results of one evaluation, for its run folder."""
 
     inputs: Inputs
-    calibrated: CalibratedPredictions
+    report: EvaluationReport
     description: RunDescription
     figures: list[Figure]
-
-    @property
-    def report(self) -> EvaluationReport:
-        """Rankings, and the criteria of their report."""
-        return self.calibrated.evaluation
 
 
 def evaluate(settings: dict[str, Any]) -> None:
@@ -41,7 +37,7 @@ def evaluate(settings: dict[str, Any]) -> None:
         truth_of_run = ground_truth(outcome.report, outcome.description)
         run_folder.write_results(
             folder, settings, truth_of_run, text=text(outcome), figures=outcome.figures,
-            write=lambda new: write_run_folder(new, outcome.calibrated, outcome.description),
+            write=lambda new: write_run_folder(new, outcome.report, outcome.description),
         )  # fmt: skip
         if page := run_folder.report_page(folder):
             print(f"report: {page}")
@@ -63,11 +59,12 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     confidence = confidence and confidences.check_confidence(confidence, system, inputs)
     ranked = rank_dataset(inputs.dataset, system, cache=inputs.cache)
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
-    report = EvaluationReport.of(ranked, inputs.thresholds, settings["recall"]["ks"])
-    calibrated = CalibratedPredictions(report, confidence and confidence.systems, settings["threshold"])
-    figures = query_figures(report, figure_queries, calibrated.refused_of_headline)
-    figures += confidence_figures(calibrated) if figure_queries else []
-    return Outcome(inputs, calibrated, _describe(settings, inputs, system), figures)
+    report = EvaluationReport.of(
+        ranked, inputs.thresholds, settings["recall"]["ks"],
+        confidences=confidence and confidence.systems, least_confidence=settings["threshold"],
+    )  # fmt: skip
+    figures = query_figures(report, figure_queries) + (confidence_figures(report) if figure_queries else [])
+    return Outcome(inputs, report, _describe(settings, inputs, system), figures)
 
 
 def _describe(settings: dict[str, Any], inputs: Inputs, system: System) -> RunDescription:
@@ -84,8 +81,8 @@ def _describe(settings: dict[str, Any], inputs: Inputs, system: System) -> RunDe
 def text(outcome: Outcome) -> str:
     """Heading and tables for the terminal."""
     tables = [recall_table(outcome.report)] if outcome.report.thresholds else []
-    if tables and outcome.calibrated.confidences is not None:
-        tables.append(confidence_table(outcome.calibrated))
+    if tables and outcome.report.confidences is not None:
+        tables.append(confidence_table(outcome.report))
     return "\n".join([f"{heading(outcome.report, outcome.description)}\n", *(table.text() for table in tables)])
 
 

@@ -15,7 +15,7 @@ from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.localization.declaration import read_declaration, read_system
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime
@@ -109,7 +109,7 @@ class _LocalizationFigures:
         self._missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = self._out / f"{file}.png"
-        from mfvpr.report.localizations import localization_figure  # here: Matplotlib takes 0.4 s
+        from mfvpr.report.query_figures import localization_figure  # here: Matplotlib takes 0.4 s
 
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)

@@ -15,7 +15,7 @@ from mfvpr.datasets.published import PUBLISHED, published_differences
 from mfvpr.datasets.sequences import own_rows
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.report import Table
-from mfvpr.report.contact_sheets import contact_sheet
+from mfvpr.report.figures import contact_sheet
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import available_cpus

@@ -7,7 +7,6 @@ from typing import Any
 
 from mfvpr.cli import console
 from mfvpr.report import runs
-from mfvpr.report.jobs import add_job
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
 from mfvpr.systems.settings import SettingsError
@@ -44,7 +43,7 @@ def write_results(
     draw_figures(folder, figures)
     print(f"results: {folder}")
     if job := settings.get("multirun"):
-        add_job(Path(job["multirun"]), job["number"], job["overrides"], folder)
+        runs.add_job(Path(job["multirun"]), job["number"], job["overrides"], folder)
         print(f"jobs: {job['multirun']}")
 
 

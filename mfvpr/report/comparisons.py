@@ -17,7 +17,7 @@ from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_value
 from mfvpr.scoring.learned_weight import LearnedWeight
 from mfvpr.scoring.weight_files import write_weight
-from mfvpr.tuning.learning.comparison import Comparison, Row
+from mfvpr.tuning.learning.comparison import Comparison
 from mfvpr.tuning.learning.training import Fit
 from mfvpr.utils.numerics import compiled
 
@@ -88,7 +88,11 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
             ),
             "by_set": {set_name: by_threshold(set_hits.mean(axis=0).tolist())
                        for set_name, set_hits in _by_set(protocol, hits.T).items()},
-            "halves": {row.half: _half(row) for row in halves},
+            "halves": {
+                row.half: {"values": dict(row.values), "recall_at_1": row.hits.mean(axis=1).tolist()}
+                | ({"steps": row.fitted.step, "history": row.fitted.history} if row.fitted else {})
+                for row in halves
+            },
         }
         for name, hits, halves in comparison.rows()
     ]  # fmt: skip
@@ -122,11 +126,6 @@ def _fits(comparison: Comparison) -> dict[str, Fit]:
 def _weights(comparison: Comparison) -> dict[str, LearnedWeight]:
     fits = _fits(comparison)
     return {name: fit.parameters["weight"] for name, fit in fits.items() if "weight" in fit.parameters}
-
-
-def _half(row: Row) -> dict[str, Any]:
-    values = {"values": dict(row.values), "recall_at_1": row.hits.mean(axis=1).tolist()}
-    return values if row.fitted is None else values | {"steps": row.fitted.step, "history": row.fitted.history}
 
 
 def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, LearnedWeight]) -> None:

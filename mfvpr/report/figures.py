@@ -1,4 +1,4 @@
-"""The paper's histogram figure: images with their matches beside the histogram of shifts, its peak marked."""
+"""Figures of images: the paper's histogram figure, which has a pair beside its shifts; contact sheets of data sets."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,16 +11,24 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.images import resize
 from mfvpr.evaluation.stages import Explanation
 from mfvpr.report.plots import panels, save_figure
 from mfvpr.types import Matches
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, printable
 
+ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
 _TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
+_PAIRS, _PAIRS_IN_A_ROW = 12, 2  # of a contact sheet; at least two of each sequence
+_SIDE, _WIDTH = 320, 3.2  # of an image on the sheet: px of the longer side, inches
+_SHEET_CAPTION_LENGTH = 44  # characters
+
+LabeledImage = tuple[np.ndarray | None, str]  # pixels, None if they cannot be read, and a caption
 
 
 @dataclass(frozen=True)
@@ -130,3 +138,45 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     words += f" of images zoomed by {explanation.scale:.3g}" if explanation.scale != 1 else ""
     axes.set_title(words.format(explanation.score, *explanation.peak), fontsize=9)
     return image
+
+
+def contact_sheet(path: Path, dataset: Dataset) -> None:
+    """Write a figure of pairs, evenly spread over each sequence; the name replaces an image that cannot be read.
+
+    Without ground truth, queries stand alone.
+    """
+    each = max(2, -(-_PAIRS // len(dataset.sequences)))
+    pairs = [pair for sequence in dataset.sequences for pair in _pairs(sequence, dataset.database, each)]
+    shapes = [image.shape for pair in pairs for image, _ in pair if image is not None]
+    height = _WIDTH * float(np.median([rows / columns for rows, columns, _ in shapes] or [0.75]))
+    rows, columns = -(-len(pairs) // _PAIRS_IN_A_ROW), 2 * _PAIRS_IN_A_ROW
+    figure, axes = panels(columns * rows, _WIDTH, 0.3 + height + 0.5 / rows, columns)
+    figure.suptitle(f"{dataset.name}: query | the place that the ground truth names", fontsize=11, parse_math=False)
+    for panel in axes:
+        panel.set_axis_off()
+    for number, pair in enumerate(pairs):
+        for panel, (image, caption) in zip(axes[2 * number : 2 * number + 2], pair, strict=False):
+            if image is not None:
+                panel.imshow(image)
+            panel.set_title(printable(clip_middle(caption, _SHEET_CAPTION_LENGTH)), fontsize=7, parse_math=False)
+        if len(pair) < 2:
+            axes[2 * number + 1].text(0.5, 0.5, "no place", ha="center")
+    save_figure(figure, path, dpi=80)
+
+
+def _pairs(sequence: QuerySequence, database: ImageFolder, number: int) -> list[list[LabeledImage]]:
+    """Queries, each with its place where that is known."""
+    pairs = []
+    for query in np.unique(np.linspace(0, len(sequence.images) - 1, number).round().astype(int)).tolist():
+        place = None if sequence.truth is None else sequence.truth.place(query)
+        places = [] if place is None else [_image(database, place, "")]
+        pairs.append([_image(sequence.images, query, sequence.name), *places])
+    return pairs
+
+
+def _image(folder: ImageFolder, row: int, sequence: str) -> LabeledImage:
+    name = folder.names[row]
+    try:
+        return with_longest_side(folder.read(row), _SIDE), f"{sequence} {name}".strip()
+    except InputError:
+        return None, f"{name} cannot be read"

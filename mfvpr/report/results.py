@@ -21,8 +21,7 @@ from mfvpr.evaluation.evaluation import rank_dataset
 from mfvpr.evaluation.results import KS, RankedDataset
 from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.file_names import file_names
-from mfvpr.report.runs import claim_run_folder, write_table
+from mfvpr.report.runs import claim_run_folder, file_names, write_table
 from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError

@@ -1,12 +1,11 @@
 """Files of the run folder of an evaluation: of `mfvpr evaluate`, and of `save` of a result in Python."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.published import published_differences
@@ -14,11 +13,11 @@ from mfvpr.datasets.truth import middle
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.features.extractor import Source
-from mfvpr.report.confidences import CalibratedPredictions, write_confidence
-from mfvpr.report.differences import write_gains
-from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings, write_skipped
-from mfvpr.report.rankings import format_number, write_csv
+from mfvpr.report.confidences import write_confidence
+from mfvpr.report.evaluation_files import write_gains, write_rankings, write_skipped
+from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.runs import write_about, write_json, write_table, writing
+from mfvpr.report.tables import format_number, write_csv
 from mfvpr.reranking.fusion import FinalScore, Fusion
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.storage.extraction import open_sinks
@@ -35,11 +34,9 @@ class RunDescription:
     Attributes:
         stages: name and settings of "retrieval", "features" and "matching".
         parameters: by final score.
-        truth: kind, files, unit and thresholds of the ground truth.
-        truth_words: the same in words, for headings.
+        truth: kind, files, unit and thresholds of the ground truth; `truth_words` say the same in headings.
         contents: of the image files, by side.
         settings: that scores depend on.
-        command: of a program.
     """
 
     stages: Mapping[str, Mapping[str, Any]]
@@ -95,31 +92,25 @@ def _skip_note(number: int) -> str:
     return f" ({number} skipped)" if number else ""
 
 
-def write_run_folder(folder: Path, calibrated: CalibratedPredictions, description: RunDescription) -> None:
+def write_run_folder(folder: Path, report: EvaluationReport, description: RunDescription) -> None:
     """Write all files of a run folder but run.json and the figures."""
-    report, refused = calibrated.evaluation, calibrated.refused_of_headline
     write_json(folder / "results.json", result_rows(report, description))
     if report.thresholds:
         write_table(folder, recall_table(report), heading(report, description))
-    write_rankings(folder, report, refused)
+    write_rankings(folder, report)
     write_gains(folder, report)
-    write_confidence(folder, calibrated, _provenance(report, description))
+    write_confidence(folder, report, _provenance(report, description))
     if report.histogram is not None:
-        write_shifts(folder, report, report.histogram, refused)
+        write_shifts(folder, report, report.histogram)
     write_skipped(folder, report.ranked)
 
 
-def write_shifts(
-    folder: Path,
-    evaluation: EvaluationReport,
-    scorer: HistogramOfShifts,
-    refused: Sequence[Bool[np.ndarray, " _"]] | None = None,
-) -> None:
+def write_shifts(folder: Path, evaluation: EvaluationReport, scorer: HistogramOfShifts) -> None:
     """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
 
     A line has the refined dominant shift of the query's middle in the images that the detector saw, its 95 % interval,
-    and how much larger the candidate shows it; empty if no match votes. Features of several scales have no file.
-    `refused` are queries of each sequence, which have no line; None = no query is refused.
+    and how much larger the candidate shows it; empty if no match votes. Queries that are refused have no line, features
+    of several scales no file.
     """
     names = evaluation.ranked.dataset.database.names
     sequences = zip(evaluation.ranked.matched, evaluation.ranked.systems[evaluation.headline], strict=True)
@@ -128,8 +119,7 @@ def write_shifts(
         if isinstance(match_set, Scales):
             continue
         predictions = ranked.rows[:, 0]
-        has_prediction = predictions >= 0
-        queries = np.flatnonzero(has_prediction if refused is None else has_prediction & ~refused[place])
+        queries = np.flatnonzero((predictions >= 0) & ~evaluation.refused[place])
         places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
         shifts, intervals, scales = dominant_shifts(scorer, match_set, queries, places)
         numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None]], axis=1)
@@ -214,7 +204,7 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
     by_score = parameters(system.final_scores.values(), scorers)
     description = RunDescription(stages, by_score, known, words, contents, settings)
     with writing(folder) as new:
-        write_run_folder(new, CalibratedPredictions(report), description)
+        write_run_folder(new, report, description)
         write_about(new, settings, ground_truth(report, description))
 
 

@@ -1,4 +1,4 @@
-"""Run folders: each belongs to one run, and its files appear together."""
+"""Run folders: each belongs to one run, and its files appear together; the jobs of a multirun; names of files."""
 
 import json
 import os
@@ -6,20 +6,28 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from mfvpr.report.tables import Table
+from mfvpr.datasets.truth import threshold_words
+from mfvpr.report.tables import Table, format_value, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
-from mfvpr.utils.locks import lock_folder
+from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.locks import lock, lock_folder
 from mfvpr.utils.versions import versions
 
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # the file of a run that appears last
+
+_MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
+_PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')
+_HASHED = re.compile(r".*-[0-9a-f]{16}", re.IGNORECASE | re.DOTALL)
 
 Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 
@@ -138,3 +146,64 @@ def write_table(folder: Path, table: Table, heading: str, *, name: str = "table"
     write_text(folder / f"{name}.md", f"{heading}\n\n{table.markdown()}")
     write_text(folder / f"{name}.csv", table.csv())
     write_text(folder / f"{name}.tex", f"% {heading}\n{table.latex()}")
+
+
+def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path) -> None:
+    """Add a finished run to the joint table in the folder of its multirun; jobs may end at the same time."""
+    job = {"job": number, "overrides": dict(overrides), "run": str(run), "rows": list(_rows(run))}
+    multirun.mkdir(parents=True, exist_ok=True)
+    with lock(multirun, os.O_RDONLY | os.O_DIRECTORY, lambda _: None):
+        known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
+        jobs = sorted([*known, job], key=lambda job: job["job"])
+        names = dict.fromkeys(name for job in jobs for name in job["overrides"])
+        differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1 and name != "out"]
+        columns = list(dict.fromkeys(name for job in jobs for row in job["rows"] for name in row))
+        lines = [
+            [str(job["job"]), *(job["overrides"].get(name, "") for name in differing),
+             *(row.get(name, "") for name in columns), job["run"]]
+            for job in jobs for row in job["rows"]
+        ]  # fmt: skip
+        table = Table(["job", *differing, *columns, "run"], lines, text_columns=len(differing) + 2)
+        write_table(multirun, table, f"{len(jobs)} jobs")
+        write_json(multirun / LAST, {"jobs": jobs})
+
+
+def _rows(run: Path) -> Iterator[dict[str, str]]:
+    """Cells by column of every system of a run: an evaluation, a sweep or a learning comparison."""
+    results = json.loads((run / LAST).read_text("utf-8"))
+    if isinstance(results, dict) and "axes" in results:
+        chosen = ("; ".join(f"{name} = {format_value(value)}" for name, value in setting.items())
+                  for setting in results["chosen"])  # fmt: skip
+        recalls = {f"R@1{threshold_words(results['unit'], verdict['threshold'])}":
+                   f"{100 * verdict['chosen']['recall']:.1f}" for verdict in results["report"]}  # fmt: skip
+        yield {"system": results["scorer"]["method"], **recalls, "chosen": " / ".join(chosen)}
+    elif (run / "table.csv").exists():
+        for row in read_csv(run / "table.csv"):
+            yield {"system" if name == "score" else name: cell for name, cell in row.items()}
+    else:
+        yield {"system": next(row["system"] for row in results if row["decides"])}
+
+
+def file_names(names: Sequence[str]) -> dict[str, str]:
+    """File names without suffix, by name; they differ even if the file system ignores case.
+
+    A file name is the name with `_` for ` + `. It ends in a hash instead if the name is not safe on every file system,
+    too long, or the same as another.
+
+    Raises:
+        InputError: a name is repeated.
+    """
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
+        raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")
+    plain = {name: name.replace(" + ", "_") for name in names}
+    counts = Counter(map(_fold_case, plain.values()))
+    files = {}
+    for name, file in plain.items():
+        is_safe = _PLAIN.fullmatch(file) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
+        hashed = f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
+        files[name] = file if is_safe and counts[_fold_case(file)] == 1 else hashed
+    return files
+
+
+def _fold_case(file: str) -> str:
+    return unicodedata.normalize("NFC", file.casefold())

@@ -15,9 +15,8 @@ from matplotlib.figure import Figure as Canvas
 from mfvpr import evaluation
 from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import runs
-from mfvpr.report.file_names import file_names
 from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
-from mfvpr.report.runs import Figure
+from mfvpr.report.runs import Figure, file_names
 from mfvpr.report.tables import Table, data_frame, format_value
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.outcome import Outcome

@@ -2,13 +2,15 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import replacing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -60,6 +62,26 @@ def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
     except ImportError:
         raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
     return pandas.DataFrame(rows)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a file of `write_csv` by column."""
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+        return [*csv.DictReader(file)]
+
+
+def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
+    """Write names as the very bytes that the file system has, so that they can be looked up again.
+
+    A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
+    """
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *lines])
+
+
+def format_number(value: Any) -> str:
+    """A number in a CSV file."""
+    return f"{value:.7g}"
 
 
 def format_value(value: Any) -> str:

@@ -24,7 +24,7 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.report import runs
-from mfvpr.report.evaluations import SequenceFigures
+from mfvpr.report.query_figures import SequenceFigures
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
@@ -190,7 +190,7 @@ def page_of(outcome, **changes):
     ranked = outcome.report.ranked
     dataset = replace(ranked.dataset, sequences=(replace(ranked.dataset.only, **changes),))
     report = replace(outcome.report, ranked=replace(ranked, dataset=dataset))
-    return SequenceFigures(report, 0, np.zeros(24, bool))
+    return SequenceFigures(report, 0)
 
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
@@ -221,7 +221,9 @@ def test_figures_of_chosen_queries(outcome):
 
 
 def test_the_figure_of_a_refused_answer_says_that_there_is_no_place(outcome):
-    page = replace(page_of(outcome), refused=np.arange(24) == 5)
+    [probabilities] = outcome.report.by_sequence(outcome.report.probabilities["histogram"])
+    page = SequenceFigures(replace(outcome.report, least_confidence=probabilities[2]), 0)
+    assert probabilities[5] < probabilities[2]
     assert "no place" in page.title(5, "correct")
     assert "no place" not in page.title(2, "correct")
 
@@ -349,7 +351,9 @@ def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
-    monkeypatch.setattr("mfvpr.report.figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(
+        "mfvpr.report.query_figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
+    )
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + retrieval " in stdout

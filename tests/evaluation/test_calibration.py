@@ -12,7 +12,8 @@ from scipy import special
 
 from mfvpr.datasets import Positives
 from mfvpr.evaluation import confidence_inputs, fit_confidence, read_confidences, write_confidences
-from mfvpr.report.confidences import CalibratedPredictions, recall_by_share
+from mfvpr.report.confidences import recalls_by_share
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.reranking import Ranked
 from mfvpr.utils import InputError
 
@@ -174,9 +175,10 @@ def test_queries_without_an_answer_are_reranked_first():
     probabilities, correct = np.linspace(0.99, 0.01, 20), {"retrieval": np.zeros(20, bool), "it": np.zeros(20, bool)}
     probabilities[3] = np.nan
     correct["it"][3] = correct["retrieval"][19] = True
-    evaluation = SimpleNamespace(hits=correct.__getitem__)
-    calibrated: Any = SimpleNamespace(probabilities={"retrieval": probabilities}, evaluation=evaluation)
-    np.testing.assert_allclose(recall_by_share(calibrated, "it")[:4], [0.05, 0.1, 0.05, 0.05])
+    evaluation: Any = SimpleNamespace(
+        hits=correct.__getitem__, probabilities={"retrieval": probabilities}, ranked=SimpleNamespace(systems=correct)
+    )
+    np.testing.assert_allclose(recalls_by_share(evaluation)["it"][:4], [0.05, 0.1, 0.05, 0.05])
 
 
 def test_halves_of_drives_there_and_back_share_no_place():
@@ -185,9 +187,9 @@ def test_halves_of_drives_there_and_back_share_no_place():
     places = [Positives.from_rows(list(map(list, drive)), 20) for drive in (rows[:20], rows[20:])]
     sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, drive=drive: drive, unit="frames"))
                  for drive in places]  # fmt: skip
-    evaluation: Any = SimpleNamespace(thresholds=[1], sequences=sequences)
+    ranked: Any = SimpleNamespace(dataset=SimpleNamespace(sequences=sequences))
     reported = []
-    for half in CalibratedPredictions(evaluation).path_halves():
+    for half in EvaluationReport(ranked, [1], [1]).path_halves():
         places = [{place for row in part for place in rows[row]} for part in (half.tune, half.report)]
         assert not places[0] & places[1]
         assert min(map(len, places)) >= 9

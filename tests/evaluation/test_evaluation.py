@@ -18,9 +18,8 @@ from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.report.confidences import CalibratedPredictions
-from mfvpr.report.differences import differences, write_gains
-from mfvpr.report.evaluations import EvaluationReport, recall_table, write_rankings
+from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
+from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.reranking import Fusion
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
@@ -97,16 +96,16 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
 def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
     result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
-    calibrated = CalibratedPredictions(EvaluationReport(result, [0, 1], [1]))
+    report = EvaluationReport(result, [0, 1], [1])
     predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
     inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
-    correct, halved = calibrated.evaluation.hits("count"), halves(dataset.truth.positives(1))
+    correct, halved = report.hits("count"), halves(dataset.truth.positives(1))
     for half in halved:
         fitted = fit_confidence(inputs[half.tune], correct[half.tune])
         expected = fitted.probability(inputs[half.report])
         assert np.isfinite(expected).all()
-        np.testing.assert_allclose(calibrated.probabilities["count"][half.report], expected)
-    assert [len(part) for part in calibrated.evaluation.by_sequence(calibrated.scores("count"))] == [3, 7]
+        np.testing.assert_allclose(report.probabilities["count"][half.report], expected)
+    assert [len(part) for part in report.by_sequence(report.scores("count"))] == [3, 7]
 
 
 def test_only_candidates_are_extracted(dataset, tmp_path):

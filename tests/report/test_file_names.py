@@ -2,7 +2,7 @@
 
 import pytest
 
-from mfvpr.report.file_names import file_names
+from mfvpr.report.runs import file_names
 from mfvpr.utils import InputError
 
 HOSTILE = (

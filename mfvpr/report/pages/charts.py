@@ -61,7 +61,8 @@ def line_chart(
     form = ".1f" if unit == "%" else ".3g"
     traces = [
         {"type": "scatter", "x": [x for x, _ in points], "y": [y for _, y in points], "name": _escape(label),
-         "mode": "lines+markers" if marked else "lines", "line": _line(place),
+         "mode": "lines+markers" if marked else "lines",
+         "line": dict(zip(("color", "dash"), color_and_dash(place), strict=True), width=2),
          "hovertemplate": f"%{{x:.4g}}: %{{y:{form}}} {unit}"}
         for place, (label, points) in enumerate(curves.items())
     ]  # fmt: skip
@@ -109,11 +110,6 @@ def _bars(values: Mapping[str, float]) -> dict[str, Any]:
 def _escape(text: str) -> str:
     """Escape a label: plotly's labels understand some HTML."""
     return html.escape(printable(text), quote=False)
-
-
-def _line(place: int) -> dict[str, Any]:
-    color, dash = color_and_dash(place)
-    return {"color": color, "dash": dash, "width": 2}
 
 
 def _whiskers(members: Sequence[Bar]) -> dict[str, Any]:

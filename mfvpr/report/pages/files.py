@@ -19,13 +19,10 @@ from jaxtyping import Bool, Int
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.file_names import file_names
-from mfvpr.report.rankings import read_csv
-from mfvpr.report.runs import LAST
-from mfvpr.report.tables import Table
+from mfvpr.report.runs import LAST, file_names
+from mfvpr.report.tables import Table, read_csv
 from mfvpr.utils.errors import InputError, require_word
 
-_LEFT_BY = "expected the run folder of an evaluation"
 _KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}
 _KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "retrieval.name": str, "features.name": str,
           "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int,
@@ -39,10 +36,7 @@ _TABLES = {"table.csv": 1, "differences.csv": 2, "confidence.csv": None, "rerank
 class Gains:
     """Ranks of the first correct candidates for the Q queries of one sequence, or of several, one after the other.
 
-    Attributes:
-        queries: names.
-        places: along the map.
-        ranks: by system, 0 = no candidate is correct.
+    `queries` are names, `places` are along the map, `ranks` are by system, 0 = no candidate is correct.
     """
 
     queries: tuple[str, ...]
@@ -103,24 +97,14 @@ class Run:
         return list(dict.fromkeys(row["sequence"] for row in self.results))[: -len(MEANS)]  # their means come last
 
     @property
-    def unit(self) -> Unit:
-        """Unit of the thresholds, with ground truth."""
-        return self.common["ground_truth"]["unit"]
-
-    @property
     def thresholds(self) -> list[float]:
         """Distances within which a prediction is correct, ascending; none without ground truth."""
         return self.common["ground_truth"].get("thresholds", [])
 
     @property
-    def first_k(self) -> str:
-        """The smallest depth of recall, with ground truth."""
-        return min(self.common["recall_at"], key=int)
-
-    @property
     def within(self) -> str:
         """The threshold of `gains` and of all values per query, as it stands behind R@K."""
-        return threshold_words(self.unit, middle(self.thresholds))
+        return threshold_words(self.common["ground_truth"]["unit"], middle(self.thresholds))
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:
@@ -226,9 +210,8 @@ def errors_as_input_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, StopIteration, csv.Error) as error:
-        raise InputError(
-            f"{folder}: {_LEFT_BY} of this version, got other files ({type(error).__name__}: {error})"
-        ) from None
+        raise InputError(f"{folder}: expected the run folder of an evaluation of this version, got other files "
+                         f"({type(error).__name__}: {error})") from None  # fmt: skip
 
 
 def read_table(path: Path, num_texts: int | None) -> Table:

@@ -13,8 +13,7 @@ from mfvpr.evaluation.precision import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Gains, Run, errors_as_input_errors, read_results, read_run, read_table
-from mfvpr.report.pages.pictures import pictures
-from mfvpr.report.pages.rendering import PAGE, Gallery, Section, values_table, write_page
+from mfvpr.report.pages.rendering import PAGE, Gallery, Section, pictures, values_table, write_page
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
 
@@ -37,7 +36,10 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         _write_search_page(folder, results, path)
         return path
     run = read_run(folder)
-    sections = [_recall_section(run), *_differences_section(run)] if run.gains else []
+    sections = [_recall_section(run)] if run.gains else []
+    if run.gains and (table := run.tables.get("differences.csv")) and table.rows:
+        words, tests = paired_tests("system", table.rows)
+        sections.append(Section("differences", "Differences", words, tables={"Every two systems": tests}))
     sections += [*_confidence_section(run), _predictions_section(run), _costs_section(run), _settings_section(run)]
     write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
     return path
@@ -135,8 +137,9 @@ def tolerance_charts(curves: Curves) -> list[Chart]:
     by_kind: dict[tuple[str, str], dict[str, list[tuple[float, float]]]] = {}
     for name, (run, system) in curves.items():
         if len(run.thresholds) > 1:
-            by_kind.setdefault((run.unit, run.first_k), {})[name] = [
-                (row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][run.first_k])
+            unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
+            by_kind.setdefault((unit, k), {})[name] = [
+                (row["tolerance"] if "tolerance" in row else row["radius"], 100 * row["recall_at"][k])
                 for row in run.results
                 if row["system"] == system and row.get("sequence", MEANS[-1]) == MEANS[-1]
             ]
@@ -174,13 +177,6 @@ def paired_tests(kind: str, lines: Sequence[Sequence[str]]) -> tuple[str, Table]
             for line in lines]  # fmt: skip
     columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
     return words, Table(columns, rows, text_columns=2)
-
-
-def _differences_section(run: Run) -> Iterator[Section]:
-    table = run.tables.get("differences.csv")
-    if table and table.rows:
-        words, tests = paired_tests("system", table.rows)
-        yield Section("differences", "Differences", words, tables={"Every two systems": tests})
 
 
 def _confidence_section(run: Run) -> Iterator[Section]:

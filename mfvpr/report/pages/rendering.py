@@ -5,18 +5,37 @@ from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
+from mfvpr.report.figures import ABOUT
 from mfvpr.report.pages.charts import Chart
 from mfvpr.report.pages.files import Prediction
-from mfvpr.report.pages.pictures import Picture
 from mfvpr.report.tables import Table
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 
 # Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
 PAGE = "report.html"  # in a run folder
+MOST_PICTURES = 60
+_WIDTH, _QUALITY = 1000, 75  # px of a picture, of JPEG: some 60 kB each
 _TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The figure of a query and its prediction, as a `data:` URI; `size` is width and height, px."""
+
+    system: str
+    sequence: str
+    outcome: str
+    query: str
+    prediction: str
+    source: str
+    size: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -92,3 +111,23 @@ def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
         else:
             yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
+    """Figures that have the keywords `ABOUT`, by their files; evenly chosen if there are more than `most`."""
+    paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
+    for path in paths[:: max(1, -(-len(paths) // most))]:
+        try:
+            with Image.open(path) as image:
+                image.load()
+                small = image.convert("RGB")
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            raise InputError(f"{path}: expected a figure of the run ({error}); remove it, or run again") from None
+        if {*ABOUT} <= {*image.info}:
+            small.thumbnail((_WIDTH, small.height))
+            file = BytesIO()
+            small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+            source = f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
+            about = {name: str(image.info[name]) for name in ABOUT}
+            shown.append(Picture(**about, source=source, size=small.size))
+    return shown

@@ -7,17 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
-from mfvpr.report.differences import Difference
+from mfvpr.report.evaluation_files import Difference
+from mfvpr.report.pages import one_run
 from mfvpr.report.pages.charts import bar_chart
 from mfvpr.report.pages.files import Run, read_run
-from mfvpr.report.pages.one_run import (
-    depths_chart,
-    description,
-    paired_tests,
-    precision_charts,
-    recall_bar,
-    tolerance_charts,
-)
 from mfvpr.report.pages.rendering import Section, flat, write_page
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
@@ -30,7 +23,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     sections = [_overview(runs), *([_recall(evaluation), _pairs(runs)] if evaluation else []), _settings(runs)]
     words = "The systems that decide, beside each other; each run has a page of its own."
     names = ", ".join(dict.fromkeys(str(run.common["dataset"]) for run in runs.values()))
-    facts = {f"{label}, R@1{run.within}": f"{recall_bar(run.all_gains, run.headline).percent:.1f} %"
+    facts = {f"{label}, R@1{run.within}": f"{one_run.recall_bar(run.all_gains, run.headline).percent:.1f} %"
              for label, run in evaluation.items()}  # fmt: skip
     write_page(path, title=f"{names}: {len(runs)} runs compared", words=words, facts=facts, sections=sections)
 
@@ -64,7 +57,7 @@ def _labels(folders: Sequence[Path]) -> list[str]:
 
 def _overview(runs: Mapping[str, Run]) -> Section:
     rows = [
-        [label, str(run.common["dataset"]), run.headline, description(run),
+        [label, str(run.common["dataset"]), run.headline, one_run.description(run),
          f"{sum(run.common['seconds'].values()):.1f}"]
         for label, run in runs.items()
     ]  # fmt: skip
@@ -75,15 +68,18 @@ def _overview(runs: Mapping[str, Run]) -> Section:
 def _recall(runs: Mapping[str, Run]) -> Section:
     """Recall of all systems side by side; of the headline systems with intervals and over K."""
     curves = {label: (run, run.headline) for label, run in runs.items()}
-    headlines = {label: recall_bar(run.all_gains, run.headline) for label, run in runs.items()}
+    headlines = {label: one_run.recall_bar(run.all_gains, run.headline) for label, run in runs.items()}
     charts = [
         bar_chart("intervals", "Recall at 1, with intervals", {"recall": headlines}, axis="recall at 1, %"),
-        depths_chart("Recall over K", curves), *tolerance_charts(curves), *precision_charts(curves),
+        one_run.depths_chart("Recall over K", curves), *one_run.tolerance_charts(curves),
+        *one_run.precision_charts(curves),
     ]  # fmt: skip
     systems = dict.fromkeys(name for run in runs.values() for name in run.systems)
     rows = []
     for system in systems:
-        recalls = [recall_bar(run.all_gains, system) if system in run.systems else None for run in runs.values()]
+        recalls = [
+            one_run.recall_bar(run.all_gains, system) if system in run.systems else None for run in runs.values()
+        ]
         rows.append([system, *(f"{bar.percent:.1f} {bar.interval_words}" if bar else "" for bar in recalls)])
     header = ["system", *(f"{label}{run.within}" for label, run in runs.items())]
     words = "In %, of all queries, correct at the middle tolerance of each run; intervals are 95 % and know that "
@@ -103,7 +99,7 @@ def _pairs(runs: Mapping[str, Run]) -> Section:
         pair = run.all_gains.hits(run.headline), second.all_gains.hits(second.headline)
         tests = mcnemar(*pair), block_sign_flips(*pair, places=np.sort(run.all_gains.places))
         rows.append(Difference(f"{label}: {run.headline}", f"{other}: {second.headline}", *tests).cells)
-    words, tests = paired_tests("run", rows)
+    words, tests = one_run.paired_tests("run", rows)
     tables = {"Every two runs of the same queries": tests} if rows else {}
     if incomparable:
         tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.paper.printed import BERLIN, OTHERS, average, printed_recall, printed_tables
+from experiments.paper.tables import BERLIN, OTHERS, average, printed_recall, printed_tables
 
 # Recomputed from the printed tables by hand: within 1, 2 and 5 frames.
 AVERAGES = {

@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 
 from experiments.paper import systems
-from experiments.paper.figures import mean_recalls
-from experiments.paper.printed import printed_tables
+from experiments.paper.pages import mean_recalls
 from experiments.paper.runs import input_fingerprints, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
-from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, row_result
+from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 from mfvpr.systems.settings import SettingsError
 
@@ -166,7 +165,7 @@ def test_tables_hold_both_numbers():
     key = "mix_hist_50", "gardens_point"
     tables = tables_of(Evaluations(
         [MIX], {"gardens_point": make_dataset("gardens_point", database=200)},
-        {key: RowResult({OVERALL: recall}, result("histogram", 0.8))}, sizes={key: 2.0**20},
+        {key: RowResult({OVERALL: recall}, result("histogram", 0.8))}, sizes={key: 200.0},
         seconds={"mix_hist_50": dict(retrieval=0.1, features=0.2, matching=0.3, scores=0.1)},
     ))  # fmt: skip
     assert tables["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
