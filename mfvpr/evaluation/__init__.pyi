@@ -8,7 +8,6 @@ __all__ = [
     "Shard",
     "Split",
     "System",
-    "Tally",
     "best_setting",
     "confidence_inputs",
     "estimate",
@@ -33,7 +32,7 @@ from .calibration import Confidence, confidence_inputs, fit_confidence, read_con
 from .evaluation import rank_dataset
 from .precision import precision_recall, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
-from .recall import Tally, hits, recall_at_k
+from .recall import hits, recall_at_k
 from .results import RankedDataset, Recall
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence

@@ -2,15 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.recall import Tally
+from mfvpr.evaluation.recall import count_correct
 from mfvpr.evaluation.system import System
 from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.utils.errors import InputError
@@ -21,9 +20,10 @@ Reason = Literal["no candidates", "too few features", "too few matches", "low co
 
 @dataclass(frozen=True, repr=False)
 class Recall:
-    """Recall of one system, from counts for each sequence, and in it for each threshold."""
+    """Recall of one system, from numbers of correct queries and of all queries."""
 
-    tallies: Sequence[Sequence[Tally]]
+    correct: Int[np.ndarray, "sequences tolerances ks"]
+    queries: Int[np.ndarray, " sequences"]
 
     def __repr__(self) -> str:
         return f"Recall({np.round(self.pooled, 3).tolist()} over all queries, by threshold and k)"
@@ -31,7 +31,7 @@ class Recall:
     @property
     def by_sequence(self) -> Float[np.ndarray, "sequences tolerances ks"]:
         """Recall of each sequence."""
-        return np.array([[tally.recall for tally in of_sequence] for of_sequence in self.tallies])
+        return self.correct / np.maximum(self.queries, 1)[:, None, None]
 
     @property
     def mean(self) -> Float[np.ndarray, "tolerances ks"]:
@@ -41,7 +41,7 @@ class Recall:
     @property
     def pooled(self) -> Float[np.ndarray, "tolerances ks"]:
         """Recall over all queries of all sequences."""
-        return np.array([reduce(Tally.merge, of_threshold).recall for of_threshold in zip(*self.tallies, strict=True)])
+        return self.correct.sum(axis=0) / max(self.queries.sum(), 1)
 
 
 @dataclass(frozen=True, repr=False)
@@ -93,9 +93,10 @@ class RankedDataset:
         by_threshold = [self.positives(threshold) for threshold in thresholds]
 
         def count(rankings: Sequence[Ranked]) -> Recall:
-            return Recall([
-                [Tally.of(ranking.rows, positives[sequence], ks) for positives in by_threshold]
+            correct = [
+                [count_correct(ranking.rows, positives[sequence], ks) for positives in by_threshold]
                 for sequence, ranking in enumerate(rankings)
-            ])  # fmt: skip
+            ]
+            return Recall(np.array(correct), np.array([len(ranking.rows) for ranking in rankings]))
 
         return {name: count(rankings) for name, rankings in self.systems.items()}
