@@ -1,7 +1,4 @@
-"""Recipes of results: the content of images and files, the extractor, and the versions of decoders.
-
-Results with the same recipe are computed once in a process.
-"""
+"""Recipes of results, which are computed once in a process: content of files, extractor, versions of decoders."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
