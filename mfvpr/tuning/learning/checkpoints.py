@@ -1,8 +1,4 @@
-"""Checkpoints of a training in a folder, written atomically.
-
-Every checkpoint has the recipe of the training and the shapes of its arrays. Both are compared before anything in the
-folder changes, so that another training cannot use it. The last two checkpoints are kept.
-"""
+"""Checkpoints of a training in a folder: the last two, written atomically, with the recipe and the shapes of arrays."""
 
 import json
 import logging
@@ -40,11 +36,7 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
 
 
 def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
-    """Write the checkpoint of a step above all earlier ones, and remove all but the last two.
-
-    `state` is a pytree of arrays; `recipe` and `progress` are JSON values. If the disk is full, earlier checkpoints
-    stay.
-    """
+    """Write the pytree `state`, with JSON values, at a step above all earlier ones; remove all but the last two."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     arrays = {str(place): leaf for place, leaf in enumerate(leaves)}
     record = {**_description(recipe, state), "progress": progress, "checksum": _checksum(leaves, progress)}
@@ -57,12 +49,9 @@ def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: A
 
 
 def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
-    """State and progress of the newest checkpoint, None without one. Nothing in the folder is changed.
+    """State and progress of the newest checkpoint, None without one; `state` has the same structure and shapes.
 
-    `state` is a pytree of the same structure and shapes. The folder may be missing.
-
-    Raises:
-        InputError: the folder is no folder of checkpoints, the checkpoint has another recipe, or it is damaged.
+    An InputError for a folder of something else, another recipe or damage; nothing in the folder is changed.
     """
     if not _holds_checkpoints(folder):
         return None
