@@ -22,21 +22,13 @@ FUSION = "c"
 
 @dataclass(frozen=True)
 class Group:
-    """Settings of one program, the product of G settings and W weightings.
+    """Settings of one program, the product of G settings and W weightings."""
 
-    Attributes:
-        scorer: with the choices and the capacity for these settings.
-        settings: values by parameter.
-        weightings: values of `weight` (an option's number) and `max_distance`.
-        rows: numbers of the settings.
-        program: the scorer's program as text, if blocks are stored.
-    """
-
-    scorer: Any
+    scorer: Any  # with the choices and the capacity for these settings
     settings: Mapping[str, Shaped[np.ndarray, " settings"]]
-    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]
-    rows: Int[np.ndarray, "settings weightings"]
-    program: str = ""
+    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]  # of `weight` (an option's number) and `max_distance`
+    rows: Int[np.ndarray, "settings weightings"]  # numbers of the settings
+    program: str = ""  # the scorer's program as text, if blocks are stored
 
     def blocks(self, size: int) -> Iterator["Group"]:
         """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""
