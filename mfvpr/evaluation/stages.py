@@ -108,11 +108,7 @@ def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mappin
 def stored_matches(
     store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
 ) -> tuple[MatchSet, Shortlist]:
-    """Read matches and their shortlist from a store, NumPy; features are not needed.
-
-    If all matches take more than `memory` GB, by default a third of what is free, none are kept in memory, and they are
-    read from the store whenever they are used.
-    """
+    """Read matches and their shortlist from a store, NumPy; more than `memory` GB of them are read at every use."""
     rows = range(len(store.done)) if rows is None else rows
     if not (done := store.done[[*rows]]).all():
         raise InputError(
@@ -195,13 +191,11 @@ def pair_shifts(
     scorer: HistogramOfShifts, matches: Matches
 ) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
-    votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
-    no_votes = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
-    return (
-        np.where(no_votes[:, None], np.nan, shifts),
-        np.where(no_votes[:, None, None], np.nan, intervals),
-        np.where(no_votes, np.nan, scales),
-    )
+    votes, *values = jax.tree.map(np.array, _pair_shifts(scorer, matches))
+    for of_pairs in values:  # the host makes the NaN: `jax_debug_nans` stops at those of programs
+        of_pairs[~votes] = np.nan
+    shifts, intervals, scales = values
+    return shifts, intervals, scales
 
 
 @compiled

@@ -196,14 +196,11 @@ def _autocorrelations(paths: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _flat_top(correlations: np.ndarray) -> float:
-    """Sum of the autocorrelations at all lags in a window that is 1 up to half its width and falls to 0 at its end.
-
-    Half the width is the lag after which the next few autocorrelations are all insignificant.
-    """
+    """Sum of the autocorrelations at all lags in a window that is 1 up to half its width and falls to 0 at its end."""
     total = len(correlations)
     run = max(5, math.ceil(math.sqrt(math.log10(total))))
     insignificant = np.abs(correlations[1:]) < 2 * math.sqrt(math.log10(total) / total)
-    half = 0
+    half = 0  # the lag after which the next few autocorrelations are all insignificant
     while half < math.sqrt(total) and not insignificant[half : half + run].all():
         half += 1
     lags = np.arange(1, total)

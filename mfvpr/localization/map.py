@@ -196,7 +196,8 @@ class Map(MapImages):
         best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
         if best.mask.sum() < LEAST_MATCHES:
             return refusal("too few matches", description)
-        p = self._probability(ranking, by_retrieval)
+        p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
+        p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
@@ -224,11 +225,6 @@ class Map(MapImages):
         rankings = rank_by_scores(shortlist, padded_scores, final_scores, self.system.ties)
         cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
-
-    def _probability(self, ranking: Ranked, retrieval: Ranked) -> float | None:
-        """Probability that the top prediction is correct; None without a confidence or a finite score."""
-        p = math.nan if self.confidence is None else float(self.confidence(ranking, retrieval)[0])
-        return None if math.isnan(p) else p
 
 
 def _whole_number(name: str, value: Any) -> int:

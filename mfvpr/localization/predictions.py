@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
-from mfvpr.evaluation.results import Reason
+from mfvpr.evaluation.evaluation import Reason
 from mfvpr.localization.describing import Described
 from mfvpr.types import Matches
 

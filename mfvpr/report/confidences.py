@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence, write_confidences
+from mfvpr.evaluation.evaluation import Reason
 from mfvpr.evaluation.precision import PrecisionRecall, chance_calibration_error, precision_recall, reliability
-from mfvpr.evaluation.results import Reason
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure

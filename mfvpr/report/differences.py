@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mfvpr.datasets.positives import stack_positives
-from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.selection import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.rankings import format_number, write_csv

@@ -14,7 +14,7 @@ from mfvpr.datasets.datasets import MEANS, ImageFolder, QuerySequence
 from mfvpr.datasets.images import resize
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Unit, middle, threshold_words
-from mfvpr.evaluation.results import KS, RankedDataset, Recall
+from mfvpr.evaluation.evaluation import KS, RankedDataset, Recall
 from mfvpr.evaluation.stages import explain
 from mfvpr.report.file_names import file_names
 from mfvpr.report.rankings import Rankings, write_failures, write_predictions
