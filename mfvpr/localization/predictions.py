@@ -44,11 +44,6 @@ class Prediction:
     scale: float | None
     reason: Reason | None = None
 
-    @property
-    def is_refused(self) -> bool:
-        """Whether there is no place although the map has images to compare with."""
-        return self.reason not in (None, "no candidates")
-
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with at most `most` alternatives."""
         values = asdict(replace(self, alternatives=self.alternatives[:most]))

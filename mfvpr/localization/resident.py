@@ -30,9 +30,7 @@ class Resident:
     def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
         """Read nothing yet; there will be at least two slots for each of a query's candidates.
 
-        Args:
-            typical: keypoints of a typical image; if the detector limits the number, the largest capacity.
-            memory: GB that slots may take; None = a third of what is free.
+        `typical` is the number of keypoints of an image, at most if the detector limits it; `memory` is in GB.
         """
         self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())
