@@ -76,7 +76,11 @@ def match_sequence(
             retrieved = _find_candidates(work)
             matches, remarks = _match(work, retrieved, stores)
             matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
-    _warn_of_queries_without_candidates(matched, cache)
+    missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
+    if missing:
+        images = sequence.images
+        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
+                     "counts as a failure")  # fmt: skip
     return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.extractor.scales))
 
 
@@ -129,14 +133,6 @@ def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Featur
     warnings += image_warnings(sequence.images, queries[0], bad_queries)
     remarks = {"queries": bad_queries, "database": bad_database, "warnings": warnings}
     return list(zip(queries, database, strict=True)), remarks
-
-
-def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -> None:
-    missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
-    if missing:
-        images = matched.sequence.images
-        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
-                     "counts as a failure")  # fmt: skip
 
 
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:

@@ -64,9 +64,8 @@ def match(
         options = {"memory": runtime.memory, "devices": runtime.devices or [device_of(())]}
         pairs = batched.match_queries(*sides, requested, matcher, **options)
         matched = [query for _, query in runtime.progress("matching")(pairs, len(requested))]
-        counts = np.array([query.counts for query in matched], np.int32).reshape(
-            len(matched), candidates.indices.shape[1]
-        )
+        shape = len(matched), candidates.indices.shape[1]
+        counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
         return MatchSet.of([query.matches for query in matched], counts)
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
@@ -130,26 +129,16 @@ def stored_matches(
 
 @dataclass(frozen=True)
 class Explanation:
-    """The histogram of one pair and its parts, NumPy.
+    """The histogram of one pair and its parts, NumPy."""
 
-    Attributes:
-        histogram: all bins (-inf beyond the range of shifts) with their centers, px.
-        score: the tallest bin.
-        shift: its center (x, y), px.
-        peak: the refined peak between bin centers, px.
-        agrees: whether a match's shift lies within two standard deviations of the peak along both axes.
-        scale: the dominant one of the scorer's scales, to which all of this belongs.
-        direction: of the shifts, as the scorer defines it.
-    """
-
-    histogram: ShiftHistogram
-    score: Float[Array, ""]
-    shift: Float[Array, "2"]
-    peak: Float[Array, "2"]
+    histogram: ShiftHistogram  # all bins (-inf beyond the range of shifts) with their centers, px
+    score: Float[Array, ""]  # the tallest bin
+    shift: Float[Array, "2"]  # its center (x, y), px
+    peak: Float[Array, "2"]  # the refined peak between bin centers, px
     weights: Float[Array, " slots"]
-    agrees: Bool[Array, " slots"]
-    scale: Float[Array, ""]
-    direction: str
+    agrees: Bool[Array, " slots"]  # whether a shift lies within two standard deviations of the peak along both axes
+    scale: Float[Array, ""]  # the dominant one of the scorer's scales, to which all of this belongs
+    direction: str  # of the shifts, as the scorer defines it
 
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
