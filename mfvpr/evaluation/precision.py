@@ -52,16 +52,11 @@ def recall_at_k(
 
 
 class PrecisionRecall(NamedTuple):
-    """Precision and recall if only queries with a confidence of at least a threshold have a prediction.
+    """Precision and recall if only queries with a confidence of at least a threshold have a prediction."""
 
-    thresholds: the distinct confidences of the predictions, descending.
-    precision: fraction of the predictions that are correct.
-    recall: correct predictions, as a fraction of the queries with positives.
-    """
-
-    thresholds: Float[np.ndarray, " thresholds"]
-    precision: Float[np.ndarray, " thresholds"]
-    recall: Float[np.ndarray, " thresholds"]
+    thresholds: Float[np.ndarray, " thresholds"]  # the distinct confidences of the predictions, descending
+    precision: Float[np.ndarray, " thresholds"]  # fraction of the predictions that are correct
+    recall: Float[np.ndarray, " thresholds"]  # correct predictions, as a fraction of the queries with positives
 
     @property
     def average_precision(self) -> float:
@@ -74,16 +69,11 @@ class PrecisionRecall(NamedTuple):
 
 
 class Reliability(NamedTuple):
-    """Predictions in bins of equal width of their probabilities, from 0 to 1.
+    """Predictions in bins of equal width of their probabilities, from 0 to 1."""
 
-    probability: mean, NaN in an empty bin.
-    correct: fraction of correct predictions, NaN in an empty bin.
-    count: of predictions.
-    """
-
-    probability: Float[np.ndarray, " bins"]
-    correct: Float[np.ndarray, " bins"]
-    count: Int[np.ndarray, " bins"]
+    probability: Float[np.ndarray, " bins"]  # mean, NaN in an empty bin
+    correct: Float[np.ndarray, " bins"]  # fraction of correct predictions, NaN in an empty bin
+    count: Int[np.ndarray, " bins"]  # of predictions
 
     @property
     def calibration_error(self) -> float:

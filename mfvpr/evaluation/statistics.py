@@ -14,36 +14,23 @@ _PSEUDO_EVENTS = 1.0  # with a default autocorrelation: a path with hits only, o
 
 
 class McNemar(NamedTuple):
-    """Two systems on the same queries.
+    """Two systems on the same queries."""
 
-    only_first, only_second: number of queries for which only this system is correct.
-    p_value: probability of a difference at least this large if neither were better.
-    """
-
-    only_first: int
+    only_first: int  # queries for which only this system is correct
     only_second: int
-    p_value: float
+    p_value: float  # probability of a difference at least this large if neither were better
 
 
 class SignFlips(NamedTuple):
-    """Two systems on the same queries, by blocks of the path, see `block_sign_flips`.
+    """Two systems on the same queries, by blocks of the path, see `block_sign_flips`."""
 
-    block: number of queries of a block.
-    blocks: number of blocks in which one of the two is ahead.
-    p_value: probability of a difference at least this large if the sign of each of these blocks were random.
-    """
-
-    block: int
-    blocks: int
-    p_value: float
+    block: int  # number of queries of a block
+    blocks: int  # number of blocks in which one of the two is ahead
+    p_value: float  # probability of a difference at least this large if the sign of each of these blocks were random
 
 
 class Estimate(NamedTuple):
-    """A recall and its confidence interval.
-
-    recall: fraction of the queries.
-    interval: (low, high), see `recall_interval`.
-    """
+    """A recall, fraction of the queries, and its confidence interval, see `recall_interval`."""
 
     recall: float
     interval: tuple[float, float]

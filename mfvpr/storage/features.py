@@ -29,10 +29,7 @@ _NUM_ARRAYS = 5
 def open_store(
     folder: Path, recipe: Mapping[str, Any], *, num_images: int, kind: Kind = FEATURES, **options: Any
 ) -> FeatureStore:
-    """The store in `folder`, see `rows.RowStore`; `options` are its `keys`, `tokens` and `lock`.
-
-    A store that is part of a map has another `kind`, with other messages.
-    """
+    """The store in `folder`, see `rows.RowStore`; a map's has a `kind` with other messages."""
     return RowStore(folder, RowFormat(kind, pack_features, _unpack), recipe, {"num_images": num_images}, **options)
 
 

@@ -64,10 +64,7 @@ def lock_map(folder: Path) -> Iterator[None]:
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a map, unless they are there; within `lock_map`.
-
-    Raises `InputError` if the map has other settings, or format 1, or the folder cannot be written.
-    """
+    """Write the settings of a map within `lock_map`; an InputError if it has other settings, or format 1."""
     if _is_old(folder):
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
                          "map anew in another folder.")  # fmt: skip

@@ -25,10 +25,7 @@ class Memo:
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder | None, by: Any) -> Value:
-        """The result of `compute`, called once while the images and the recipe of `by` stay the same.
-
-        Without a recipe, the `id` of `by` counts. Without a folder, the result belongs to all images.
-        """
+        """Call `compute` once while the images (None = any) and the recipe of `by`, or else its `id`, stay the same."""
         try:
             recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
         except TypeError:

@@ -63,7 +63,10 @@ def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, A
         if not (where / "record").exists():
             raise InputError(f"{where}: expected a checkpoint of mfvpr, got another; choose another folder")
         record = _read(manager, where, record=ocp.args.JsonRestore())
-        if differs := _difference(record, _description(recipe, state)):
+        expected = _description(recipe, state)
+        parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
+        differences = (difference(record.get(part, {}), expected[part], name) for part, name in parts)
+        if differs := next(filter(None, differences), None):
             raise InputError(f"{folder}: this checkpoint is of {differs}; choose another folder, or delete this one")
         arrays = _read(manager, where, arrays=ocp.args.StandardRestore())
     leaves = [arrays[str(place)] for place in range(len(arrays))]
@@ -145,13 +148,6 @@ def _description(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
     """Format, recipe and shapes of arrays of a checkpoint, JSON values."""
     arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in leaves_by_path(state).items()}
     return json.loads(json.dumps({"format": FORMAT, "recipe": recipe or {}, "arrays": arrays}))  # tuples become lists
-
-
-def _difference(record: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
-    """The first difference, see `fingerprints.difference`; the recipe before the arrays."""
-    parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
-    differences = (difference(record.get(part, {}), expected[part], name) for part, name in parts)
-    return next(filter(None, differences), None)
 
 
 def _reason(error: Exception) -> str:

@@ -68,8 +68,7 @@ def compare(
     Args:
         axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances retrieval and score.
         protocol: the ground truth, with halves.
-        match_set: matches of Q queries with C candidates, with their ratio.
-        candidates: their shortlist.
+        match_set: matches of all queries, with their ratio.
         checkpoints: where an interrupted training is continued; None = nowhere.
 
     Raises:

@@ -27,20 +27,12 @@ Objective = Callable[["Parameters", Batch], Array]
 
 @dataclass(frozen=True)
 class Model:
-    """A score with parameters to learn.
+    """A score with parameters to learn, from the ranking, or from a teacher's labels of single matches."""
 
-    Attributes:
-        scorer: its numbers are learned; its other parameters stay.
-        start: the parameters to begin with.
-        unit: spread of the scores at the start; the loss sees scores in this unit.
-        teacher: labels the matches of correct pairs as correct or incorrect, from which the match weight is learned;
-            None = learn from the ranking.
-    """
-
-    scorer: Any
+    scorer: Any  # its numbers are learned; its other parameters stay
     start: Parameters
-    unit: float
-    teacher: HistogramOfShifts | None = None
+    unit: float  # spread of the scores at the start; the loss sees scores in this unit
+    teacher: HistogramOfShifts | None = None  # labels the matches of correct pairs as correct or incorrect
 
     def scorer_of(self, parameters: Parameters) -> Any:
         """The soft scorer."""

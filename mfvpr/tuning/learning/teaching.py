@@ -26,35 +26,20 @@ SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
 
 @dataclass(frozen=True)
 class Options:
-    """Options of learning and comparing scores.
+    """Options of learning and comparing scores."""
 
-    Attributes:
-        c: the retrieval's weight if it is set by hand; None = balanced.
-        retrieval_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.retrieval_scores`.
-        ties: as in `mfvpr.reranking.ranking.rank_shortlist`.
-        loss: of one query.
-        steps: updates of a training, at most.
-        every: steps from one validation to the next.
-        patience: validations without a gain after which to stop.
-        batch: queries of a step.
-        learning_rate: of Adam.
-        hidden: width of the network of match weights.
-        inputs: properties of a match that the network sees, see `LearnedWeight`.
-        seed: of the network, and of the order of the queries.
-    """
-
-    c: float | None = None
-    retrieval_score: RetrievalScore = "cosine"
-    ties: Ties = "retrieval"
-    loss: Loss = cross_entropy
-    steps: int = 200
-    every: int = 5
-    patience: int = 10
-    batch: int = 8
-    learning_rate: float = 0.01
-    hidden: int = 16
-    inputs: tuple[str, ...] = RELATIVE
-    seed: int = 0
+    c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
+    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.reranking.ranking.retrieval_scores`
+    ties: Ties = "retrieval"  # as in `mfvpr.reranking.ranking.rank_shortlist`
+    loss: Loss = cross_entropy  # of one query
+    steps: int = 200  # updates of a training, at most
+    every: int = 5  # steps from one validation to the next
+    patience: int = 10  # validations without a gain after which to stop
+    batch: int = 8  # queries of a step
+    learning_rate: float = 0.01  # of Adam
+    hidden: int = 16  # width of the network of match weights
+    inputs: tuple[str, ...] = RELATIVE  # properties of a match that the network sees, see `LearnedWeight`
+    seed: int = 0  # of the network, and of the order of the queries
 
 
 def start(

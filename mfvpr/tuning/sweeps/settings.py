@@ -89,7 +89,8 @@ def _group_by(
     groups: dict[Any, tuple[dict, list[int]]] = {}
     for row in members:
         shared = {name: value for name, value in settings[row].items() if chosen(name, value)}
-        groups.setdefault(_key(shared), (shared, []))[1].append(row)
+        key = tuple((name, id(value) if name == "weight" else value) for name, value in shared.items())
+        groups.setdefault(key, (shared, []))[1].append(row)
     return list(groups.values())
 
 
@@ -105,10 +106,6 @@ def _arrays(
         else np.array([setting[name] for setting in settings], int if name in integers else np.float32)
         for name in names
     }
-
-
-def _key(setting: Setting) -> tuple:
-    return tuple((name, id(value) if name == "weight" else value) for name, value in setting.items())
 
 
 def _parts(total: int, size: int) -> list[np.ndarray]:
