@@ -108,14 +108,11 @@ def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries
     Returns:
         -1 for a query whose place no image shows.
     """
-    order = {"frames": _row_order, "m": _traversal_order, "exact": _query_order}[unit](shown)
+    orders = {"m": _traversal_order, "exact": _query_order}
+    order = orders[unit](shown) if unit in orders else np.arange(shown.num_database)
     sums = np.add.reduceat(np.append(order[shown.rows], 0), shown.offsets[:-1]) if len(shown) else np.zeros(0)
     middle = sums / np.maximum(shown.counts, 1)
     return np.where(shown.counts > 0, np.unique(middle, return_inverse=True)[1], -1)
-
-
-def _row_order(shown: Positives) -> np.ndarray:
-    return np.arange(shown.num_database)
 
 
 def _traversal_order(shown: Positives) -> np.ndarray:

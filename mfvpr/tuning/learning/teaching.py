@@ -52,10 +52,7 @@ def start(
     scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
     deviation = split.score_deviation(scorer)
     scorer = parameters.with_capacity(scorer, *split.match_set.image_sizes)
-    first: Parameters = {
-        "numbers": first_numbers(scorer, deviation),
-        "sharpness": jnp.log(jnp.asarray(SHARPNESS)),
-    }
+    first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
     if fused:
         c = FIRST_SHARE * split.balance(deviation)
         first["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * deviation) / deviation))
