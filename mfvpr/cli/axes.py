@@ -8,7 +8,7 @@ from mfvpr.scoring import SCORERS
 from mfvpr.scoring.fields import parameters_of
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
-from mfvpr.tuning.learning.parameters import can_learn
+from mfvpr.tuning.learning.models import can_learn
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.rankings import SETTINGS_PER_BLOCK
 from mfvpr.tuning.sweeps.search import require_optuna

@@ -8,7 +8,6 @@ __all__ = [
     "Shard",
     "Split",
     "System",
-    "Tally",
     "best_setting",
     "confidence_inputs",
     "estimate",
@@ -30,11 +29,9 @@ __all__ = [
 ]
 
 from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
-from .evaluation import rank_dataset
-from .precision import precision_recall, reliability
+from .evaluation import RankedDataset, Recall, rank_dataset
+from .precision import hits, precision_recall, recall_at_k, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
-from .recall import Tally, hits, recall_at_k
-from .results import RankedDataset, Recall
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .shards import Shard, fill_shard

@@ -1,7 +1,6 @@
 """Confidence: the probability that the top prediction is correct, from how its score stands out among the others.
 
-Differences of scores are in units of their spread over the same query's candidates. So a model that was fitted on some
-images can be used for other images.
+Differences are in units of the spread of a query's scores, so that a model can be used for other images.
 """
 
 import json

@@ -1,27 +1,62 @@
-"""Quality of confidences: precision against recall, and calibration."""
+"""Recall@K of rankings; precision against recall, and calibration, of confidences."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.datasets.positives import Positives
+from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import as_array
 
 BINS = 10
 _DRAWS = 400
 
 
-class PrecisionRecall(NamedTuple):
-    """Precision and recall if only queries with a confidence of at least a threshold have a prediction.
+def hits(
+    rows: Int[np.ndarray, "*batch queries depth"], positives: Positives, k: int = 1
+) -> Bool[np.ndarray, "*batch queries"]:
+    """Whether one of the first k database rows of a ranking is a positive; -1 never is."""
+    return np.any(positives.contains(rows[..., :k]), axis=-1)
 
-    thresholds: the distinct confidences of the predictions, descending.
-    precision: fraction of the predictions that are correct.
-    recall: correct predictions, as a fraction of the queries with positives.
+
+def count_correct(
+    rows: Int[np.ndarray, "queries depth"], positives: Positives, ks: Sequence[int]
+) -> Int[np.ndarray, " ks"]:
+    """Number of queries with a positive among their first k."""
+    correct = positives.contains(rows)
+    return np.array([correct[:, :k].any(axis=1).sum() for k in ks], int)
+
+
+def recall_at_k(
+    order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]
+) -> Float[np.ndarray, " ks"]:
+    """Fraction of ALL queries with a positive among their first k.
+
+    Args:
+        order: `[Q, C]` database rows, best first; -1 = none.
+        positives: a query without positives counts as a failure.
+        ks: depths; beyond C all C candidates count.
+
+    Raises:
+        InputError: `order` has other axes.
     """
+    order = np.asarray(as_array(order))
+    if order.ndim != 2:
+        raise InputError(f"order: expected database rows [Q, C], best first, got {list(order.shape)}; count each "
+                         "ranking of several by itself")  # fmt: skip
+    sets = positives if isinstance(positives, Positives) else Positives.from_matrix(as_array(positives))
+    return count_correct(order, sets, ks) / max(len(order), 1)
 
-    thresholds: Float[np.ndarray, " thresholds"]
-    precision: Float[np.ndarray, " thresholds"]
-    recall: Float[np.ndarray, " thresholds"]
+
+class PrecisionRecall(NamedTuple):
+    """Precision and recall if only queries with a confidence of at least a threshold have a prediction."""
+
+    thresholds: Float[np.ndarray, " thresholds"]  # the distinct confidences of the predictions, descending
+    precision: Float[np.ndarray, " thresholds"]  # fraction of the predictions that are correct
+    recall: Float[np.ndarray, " thresholds"]  # correct predictions, as a fraction of the queries with positives
 
     @property
     def average_precision(self) -> float:
@@ -34,16 +69,11 @@ class PrecisionRecall(NamedTuple):
 
 
 class Reliability(NamedTuple):
-    """Predictions in bins of equal width of their probabilities, from 0 to 1.
+    """Predictions in bins of equal width of their probabilities, from 0 to 1."""
 
-    probability: mean, NaN in an empty bin.
-    correct: fraction of correct predictions, NaN in an empty bin.
-    count: of predictions.
-    """
-
-    probability: Float[np.ndarray, " bins"]
-    correct: Float[np.ndarray, " bins"]
-    count: Int[np.ndarray, " bins"]
+    probability: Float[np.ndarray, " bins"]  # mean, NaN in an empty bin
+    correct: Float[np.ndarray, " bins"]  # fraction of correct predictions, NaN in an empty bin
+    count: Int[np.ndarray, " bins"]  # of predictions
 
     @property
     def calibration_error(self) -> float:

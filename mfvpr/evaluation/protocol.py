@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, threshold_words
-from mfvpr.evaluation.paths import places_along_path
-from mfvpr.evaluation.recall import hits
-from mfvpr.evaluation.selection import Half, halves
+from mfvpr.evaluation.precision import hits
+from mfvpr.evaluation.selection import Half, halves, places_along_path
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash
@@ -99,20 +98,14 @@ class EvaluationProtocol:
         return self.join_halves([np.array(part) for part in parts])
 
     def join_halves(self, parts: Sequence[Bool[np.ndarray, "tolerances _"]]) -> Bool[np.ndarray, "tolerances reported"]:
-        """Join the hits of each half in the order of the path.
-
-        Neighbors fail together, so confidence intervals depend on this order.
-        """
+        """Join the hits of each half in the order of the path, which confidence intervals depend on."""
         place = np.argsort(self.order)[np.concatenate([half.report for half in self.halves])]
         return np.concatenate(parts, axis=1)[:, np.argsort(place)]
 
     @cached_property
     def order(self) -> Int[np.ndarray, " queries"]:
-        """Queries in the order of their path, data set by data set.
-
-        This is the order of their rows, except for positions in meters, whose images may have any order.
-        """
-        if self.unit != "m":
+        """Queries in the order of their path, data set by data set."""
+        if self.unit != "m":  # images with positions may have any order
             return np.arange(len(self.places))
         places = places_along_path(self.places, self.unit)
         sizes = [*self.reported_sets.values()]

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -18,9 +19,11 @@ from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.matches import MatchStore
+from mfvpr.storage.manifest import MATCHES, store_path
+from mfvpr.storage.matches import MatchStore, forecast_bytes, open_match_store
+from mfvpr.storage.rows import require_space
 from mfvpr.utils.files import write_text
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
@@ -73,7 +76,11 @@ def match_sequence(
             retrieved = _find_candidates(work)
             matches, remarks = _match(work, retrieved, stores)
             matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
-    _warn_of_queries_without_candidates(matched, cache)
+    missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
+    if missing:
+        images = sequence.images
+        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
+                     "counts as a failure")  # fmt: skip
     return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.extractor.scales))
 
 
@@ -128,14 +135,6 @@ def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Featur
     return list(zip(queries, database, strict=True)), remarks
 
 
-def _warn_of_queries_without_candidates(matched: Matched, cache: FeatureCache) -> None:
-    missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
-    if missing:
-        images = matched.sequence.images
-        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
-                     "counts as a failure")  # fmt: skip
-
-
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
     """Candidates of a query: as many as the setting says, if the database has so many images."""
     return len(database) if candidates == "all" else min(int(candidates), len(database))
@@ -183,19 +182,30 @@ def matches_recipe(
 
 @contextmanager
 def _match_stores(work: _Work, rows: Sequence[int] | None = None) -> Iterator[list[MatchStore]]:
-    """One store of matches per scale, for all queries or those in `rows`; none if the cache is in memory."""
-    if work.cache.root is None:
+    """One store per scale of the matches of all queries or those in `rows`, locked while some are missing.
+
+    There are none if the cache is in memory.
+    """
+    cache, scales, number = work.cache, work.pipeline.extractor.scales, len(work.sequence.images)
+    if cache.root is None:
         yield []
         return
-    recipe = matches_recipe(work.dataset, work.sequence, work.pipeline, work.cache)
-    scales, sizes = work.pipeline.extractor.scales, (len(work.sequence.images), recipe["candidates"])
+    recipe = matches_recipe(work.dataset, work.sequence, work.pipeline, cache)
     share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
-    label = f"{work.sequence.name} matches"
+    lock = partial(cache.lock, None if rows is None else fingerprint(list(rows)))
+    sizes = {"num_queries": number, "num_candidates": recipe["candidates"]}
     with ExitStack() as stack:
-        yield [
-            stack.enter_context(work.cache.matches(
-                {**recipe, "scale": number} if len(scales) > 1 else recipe, sizes, rows=rows,
-                typical=scale.typical_count // share, label=label,
-            ))
-            for number, scale in enumerate(scales)
-        ]  # fmt: skip
+        stores = []
+        for place, scale in enumerate(scales):
+            of_scale = {**recipe, "scale": place} if len(scales) > 1 else recipe
+            path = store_path(cache.root, "matches", of_scale, MATCHES)
+            stores.append(store := stack.enter_context(open_match_store(path, of_scale, **sizes, lock=lock)))
+            if missing := sum(not store.done[row] for row in (range(number) if rows is None else rows)):
+                needed = forecast_bytes(missing, recipe["candidates"], scale.typical_count // share)
+                require_space(store.folder, needed)
+                line = (f"{missing} of {number} queries to match with {recipe['candidates']} candidates: about "
+                        f"{needed / 1e6:.1f} MB in {store.folder}")  # fmt: skip
+            else:
+                line = f"{'all' if store.done.all() else 'its part of'} {number} queries from {store.folder}"
+            cache.log(f"{work.sequence.name} matches: {line}")
+        yield stores

@@ -52,10 +52,6 @@ class Shard:
         """Rows of this shard: by a hash of the name, so that no order matters."""
         return [row for row, name in enumerate(names) if shard_of(name, self.count) == self.index]
 
-    def part(self, folder: ImageFolder) -> ImageFolder:
-        """The images of this shard."""
-        return replace(folder, names=tuple(folder.names[row] for row in self.rows(folder.names)))
-
 
 def shard_of(name: str, count: int) -> int:
     """Index of the shard of a name: the first 8 bytes of its SHA-256, big endian, modulo `count`."""
@@ -74,7 +70,8 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
     paths = [marks / f"{index}-of-{shard.count}" for index in range(shard.count)]
     if not paths[shard.index].exists():
         for folder in (database, *(sequence.images for sequence in dataset.sequences)):
-            _describe(shard.part(folder), database, pipeline, cache)
+            names = tuple(folder.names[row] for row in shard.rows(folder.names))
+            _describe(replace(folder, names=names), database, pipeline, cache)
         marks.mkdir(parents=True, exist_ok=True)
         write_text(paths[shard.index], "described\n")
     if missing := [index for index, path in enumerate(paths) if not path.exists()]:

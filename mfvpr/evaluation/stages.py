@@ -64,9 +64,8 @@ def match(
         options = {"memory": runtime.memory, "devices": runtime.devices or [device_of(())]}
         pairs = batched.match_queries(*sides, requested, matcher, **options)
         matched = [query for _, query in runtime.progress("matching")(pairs, len(requested))]
-        counts = np.array([query.counts for query in matched], np.int32).reshape(
-            len(matched), candidates.indices.shape[1]
-        )
+        shape = len(matched), candidates.indices.shape[1]
+        counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
         return MatchSet.of([query.matches for query in matched], counts)
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
@@ -108,11 +107,7 @@ def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mappin
 def stored_matches(
     store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
 ) -> tuple[MatchSet, Shortlist]:
-    """Read matches and their shortlist from a store, NumPy; features are not needed.
-
-    If all matches take more than `memory` GB, by default a third of what is free, none are kept in memory, and they are
-    read from the store whenever they are used.
-    """
+    """Read matches and their shortlist from a store, NumPy; more than `memory` GB of them are read at every use."""
     rows = range(len(store.done)) if rows is None else rows
     if not (done := store.done[[*rows]]).all():
         raise InputError(
@@ -134,26 +129,16 @@ def stored_matches(
 
 @dataclass(frozen=True)
 class Explanation:
-    """The histogram of one pair and its parts, NumPy.
+    """The histogram of one pair and its parts, NumPy."""
 
-    Attributes:
-        histogram: all bins (-inf beyond the range of shifts) with their centers, px.
-        score: the tallest bin.
-        shift: its center (x, y), px.
-        peak: the refined peak between bin centers, px.
-        agrees: whether a match's shift lies within two standard deviations of the peak along both axes.
-        scale: the dominant one of the scorer's scales, to which all of this belongs.
-        direction: of the shifts, as the scorer defines it.
-    """
-
-    histogram: ShiftHistogram
-    score: Float[Array, ""]
-    shift: Float[Array, "2"]
-    peak: Float[Array, "2"]
+    histogram: ShiftHistogram  # all bins (-inf beyond the range of shifts) with their centers, px
+    score: Float[Array, ""]  # the tallest bin
+    shift: Float[Array, "2"]  # its center (x, y), px
+    peak: Float[Array, "2"]  # the refined peak between bin centers, px
     weights: Float[Array, " slots"]
-    agrees: Bool[Array, " slots"]
-    scale: Float[Array, ""]
-    direction: str
+    agrees: Bool[Array, " slots"]  # whether a shift lies within two standard deviations of the peak along both axes
+    scale: Float[Array, ""]  # the dominant one of the scorer's scales, to which all of this belongs
+    direction: str  # of the shifts, as the scorer defines it
 
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
@@ -195,13 +180,11 @@ def pair_shifts(
     scorer: HistogramOfShifts, matches: Matches
 ) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
-    votes, shifts, intervals, scales = jax.tree.map(np.asarray, _pair_shifts(scorer, matches))
-    no_votes = ~votes  # the host makes the NaN: `jax_debug_nans` stops at those of programs
-    return (
-        np.where(no_votes[:, None], np.nan, shifts),
-        np.where(no_votes[:, None, None], np.nan, intervals),
-        np.where(no_votes, np.nan, scales),
-    )
+    votes, *values = jax.tree.map(np.array, _pair_shifts(scorer, matches))
+    for of_pairs in values:  # the host makes the NaN: `jax_debug_nans` stops at those of programs
+        of_pairs[~votes] = np.nan
+    shifts, intervals, scales = values
+    return shifts, intervals, scales
 
 
 @compiled

@@ -14,36 +14,23 @@ _PSEUDO_EVENTS = 1.0  # with a default autocorrelation: a path with hits only, o
 
 
 class McNemar(NamedTuple):
-    """Two systems on the same queries.
+    """Two systems on the same queries."""
 
-    only_first, only_second: number of queries for which only this system is correct.
-    p_value: probability of a difference at least this large if neither were better.
-    """
-
-    only_first: int
+    only_first: int  # queries for which only this system is correct
     only_second: int
-    p_value: float
+    p_value: float  # probability of a difference at least this large if neither were better
 
 
 class SignFlips(NamedTuple):
-    """Two systems on the same queries, by blocks of the path, see `block_sign_flips`.
+    """Two systems on the same queries, by blocks of the path, see `block_sign_flips`."""
 
-    block: number of queries of a block.
-    blocks: number of blocks in which one of the two is ahead.
-    p_value: probability of a difference at least this large if the sign of each of these blocks were random.
-    """
-
-    block: int
-    blocks: int
-    p_value: float
+    block: int  # number of queries of a block
+    blocks: int  # number of blocks in which one of the two is ahead
+    p_value: float  # probability of a difference at least this large if the sign of each of these blocks were random
 
 
 class Estimate(NamedTuple):
-    """A recall and its confidence interval.
-
-    recall: fraction of the queries.
-    interval: (low, high), see `recall_interval`.
-    """
+    """A recall, fraction of the queries, and its confidence interval, see `recall_interval`."""
 
     recall: float
     interval: tuple[float, float]
@@ -196,14 +183,11 @@ def _autocorrelations(paths: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _flat_top(correlations: np.ndarray) -> float:
-    """Sum of the autocorrelations at all lags in a window that is 1 up to half its width and falls to 0 at its end.
-
-    Half the width is the lag after which the next few autocorrelations are all insignificant.
-    """
+    """Sum of the autocorrelations at all lags in a window that is 1 up to half its width and falls to 0 at its end."""
     total = len(correlations)
     run = max(5, math.ceil(math.sqrt(math.log10(total))))
     insignificant = np.abs(correlations[1:]) < 2 * math.sqrt(math.log10(total) / total)
-    half = 0
+    half = 0  # the lag after which the next few autocorrelations are all insignificant
     while half < math.sqrt(total) and not insignificant[half : half + run].all():
         half += 1
     lags = np.arange(1, total)

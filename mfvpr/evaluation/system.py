@@ -102,7 +102,12 @@ class System:
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
         for name, scorer in self.scorers.items():
-            _check_scorer(name, scorer)
+            is_class = isinstance(scorer, type)
+            if is_class or not callable(scorer):
+                got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if is_class else scorer
+                raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
+            if type(scorer) in SCORERS.values():
+                check_bounds(scorer)
 
     @cached_property
     def final_scores(self) -> dict[str, FinalScore]:
@@ -151,11 +156,3 @@ def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -
         got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
         raise InputError(f"LightGlue: expected ALIKED's features, of {matcher.dimension} dimensions, got {got}; "
                          "extract these, or match nearest neighbors")  # fmt: skip
-
-
-def _check_scorer(name: str, scorer: Scorer) -> None:
-    if isinstance(scorer, type) or not callable(scorer):
-        got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if isinstance(scorer, type) else scorer
-        raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
-    if type(scorer) in SCORERS.values():
-        check_bounds(scorer)

@@ -39,11 +39,7 @@ def write_confidence(folder: Path, system: System, confidence: Confidence) -> No
 
 
 def read_confidence(folder: Path, system: System) -> Confidence | None:
-    """The confidence of a map for the ranking that decides; None if it was never calibrated.
-
-    Raises:
-        InputError: it was calibrated with another system.
-    """
+    """The confidence of a map, None if it was never calibrated; an InputError if it is of another system."""
     if not (folder / _FILE).exists():
         return None
     confidences, origin = read_confidences(folder / _FILE)

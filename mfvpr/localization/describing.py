@@ -27,14 +27,10 @@ Described = tuple[Features, np.ndarray]
 
 @dataclass(frozen=True)
 class Describing:
-    """Extractors of a map; the features of queries are rounded as a store rounds the features of the map.
+    """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
 
-    The extractor gives local features of one scale. The describer of the global descriptor is the same extractor,
-    another, or an aggregation of the local features.
-    """
-
-    extractor: Extractor
-    describer: Extractor | Aggregation
+    extractor: Extractor  # of local features of one scale
+    describer: Extractor | Aggregation  # of global descriptors: the same extractor, another, or of local features
 
     @property
     def recipe(self) -> dict[str, Any]:

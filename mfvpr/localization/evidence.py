@@ -33,11 +33,7 @@ class MapStrength:
         self._rows, self._strengths = rows, {}
 
     def __call__(self, end: int) -> float:
-        """Mean strength of rows 0 to `end` - 1, or 0 if there are none.
-
-        The sampled rows depend on `end` alone. A growing map costs one more read for every few images. Raises
-        `InputError` if a sampled row is damaged.
-        """
+        """Mean strength of a sample of the rows before `end`, which depends on `end` alone; 0 if there are none."""
         step = 1 << max(0, (end // _SAMPLE).bit_length() - 1)
         sample = range(0, end, step)
         present = [row for row, count in zip(sample, self._rows.counts(sample), strict=True) if count >= 0]

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.evaluation.system import System
 from mfvpr.features.extractor import Aggregation, Extractor
 from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.declaration import LEARNING
+from mfvpr.localization.declaration import LEARNING, write_declaration
 from mfvpr.localization.describing import Describing, Image, is_file
 from mfvpr.localization.evidence import MapStrength
 from mfvpr.localization.resident import Resident
@@ -59,19 +60,19 @@ class MapImages:
     def __init__(
         self,
         folder: Path | str,
+        system: System,
         extractor: Extractor,
         describer: Extractor | VladFitting,
         *,
-        candidates: int,
         memory: float | None,
     ) -> None:
         """Open a map; see `mfvpr.localization.Map`."""
         self.folder = Path(folder).absolute()  # the working directory may change
-        self.extractor, self.candidates = extractor, candidates
+        self.system, self.extractor, self.candidates = system, extractor, int(system.pipeline.candidates)
         self._vectors = Vectors()
         self._entries: dict[int, Entry] = {}  # without vectors
         self._row_of_name: dict[str, int] = {}
-        self._resident_options = {"candidates": candidates, "memory": memory}
+        self._resident_options = {"candidates": self.candidates, "memory": memory}
         self._settings = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
         self._has_settings = False  # whether these settings are known to be the folder's
         self._lock = threading.RLock()
@@ -229,7 +230,7 @@ class MapImages:
         if self._described is not None or self._vocabulary is None:
             yield cache
             return
-        self._declare()
+        write_declaration(self.folder, self.system)
         temporary = self.folder / LEARNING
         shutil.rmtree(temporary, ignore_errors=True)  # left by a process that was killed
         try:
@@ -246,13 +247,10 @@ class MapImages:
         described = self._open_parts()
         self.refresh()  # first: nothing of this map goes into one that replaced it
         write_settings(self.folder, self._settings)
-        self._declare()
+        write_declaration(self.folder, self.system)
         with described.rows.adding() as add:
             self.refresh()
             yield described, add
-
-    def _declare(self) -> None:
-        """Write what else the folder of a map holds, before the first image is added."""
 
     def _use(self, describer: Extractor | Aggregation) -> None:
         """Open the rows, which are described by `describer`."""

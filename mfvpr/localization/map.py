@@ -17,7 +17,7 @@ from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
-from mfvpr.localization.declaration import check_declaration, read_system, write_declaration
+from mfvpr.localization.declaration import check_declaration, read_system
 from mfvpr.localization.describing import Described, Image
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
@@ -75,16 +75,16 @@ class Map(MapImages):
             InputError: a system that a map cannot use, a threshold without a confidence, or a folder with a map that
                 was made with another system.
         """
-        extractor, describer, candidates = _extractor(system), _describer(system), system.pipeline.candidates
+        extractor, describer = _extractor(system), _describer(system)
         check_declaration(Path(folder), system)
         self.confidence = confidence or read_confidence(Path(folder), system)
         if threshold is not None and not 0 <= threshold <= 1:
             raise InputError(f"threshold={threshold}: expected a number from 0 to 1, or None")
         if threshold is not None and self.confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
-        self.system, self.threshold = system, threshold
+        self.threshold = threshold
         keep_compiled_programs()
-        super().__init__(folder, extractor, describer, candidates=int(candidates), memory=runtime.memory)
+        super().__init__(folder, system, extractor, describer, memory=runtime.memory)
 
     @classmethod
     def open(cls, folder: Path | str, *, threshold: float | None = None, runtime: Runtime = DEFAULT_RUNTIME) -> "Map":
@@ -196,7 +196,8 @@ class Map(MapImages):
         best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
         if best.mask.sum() < LEAST_MATCHES:
             return refusal("too few matches", description)
-        p = self._probability(ranking, by_retrieval)
+        p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
+        p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
@@ -210,9 +211,6 @@ class Map(MapImages):
             )
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
-    def _declare(self) -> None:
-        write_declaration(self.folder, self.system)
-
     def _rank(
         self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]
     ) -> tuple[Ranked, Ranked]:
@@ -224,11 +222,6 @@ class Map(MapImages):
         rankings = rank_by_scores(shortlist, padded_scores, final_scores, self.system.ties)
         cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
-
-    def _probability(self, ranking: Ranked, retrieval: Ranked) -> float | None:
-        """Probability that the top prediction is correct; None without a confidence or a finite score."""
-        p = math.nan if self.confidence is None else float(self.confidence(ranking, retrieval)[0])
-        return None if math.isnan(p) else p
 
 
 def _whole_number(name: str, value: Any) -> int:

@@ -67,10 +67,7 @@ def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
 
 
 def shift_of(scorers: Iterable[Scorer], pair: Matches) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
-    """`shift`, `shift_interval` and `scale` of a `Prediction`, from the matches `[1, K, ...]` of a pair.
-
-    They are those of the first histogram of shifts among the scorers.
-    """
+    """`shift`, `shift_interval` and `scale` of a `Prediction` by the first histogram of shifts, from one pair."""
     scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
     if scorer is None:
         return None, None, None

@@ -4,7 +4,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
-from mfvpr.evaluation.results import Reason
+from mfvpr.evaluation.evaluation import Reason
 from mfvpr.localization.describing import Described
 from mfvpr.types import Matches
 
@@ -43,11 +43,6 @@ class Prediction:
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
     scale: float | None
     reason: Reason | None = None
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether there is no place although the map has images to compare with."""
-        return self.reason not in (None, "no candidates")
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with at most `most` alternatives."""

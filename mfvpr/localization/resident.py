@@ -25,19 +25,12 @@ _LEAST = 256  # slots, twice as many as a query's candidates at least
 
 
 class Resident:
-    """Slots on the device, padded to one capacity.
-
-    The number of slots and the capacity grow in few steps, so that a growing map compiles few programs.
-    """
+    """Slots of one capacity on the device; both numbers grow in few steps, so that few programs are compiled."""
 
     def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
         """Read nothing yet; there will be at least two slots for each of a query's candidates.
 
-        Args:
-            rows: of the map.
-            typical: keypoints of a typical image; if the detector limits the number, the largest capacity.
-            candidates: of a query, which must be on the device at the same time.
-            memory: GB that slots may take; None = a third of what is free.
+        `typical` is the number of keypoints of an image, at most if the detector limits it; `memory` is in GB.
         """
         self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())

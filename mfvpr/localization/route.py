@@ -114,10 +114,7 @@ def motion(advance: float, spread: float) -> Float[np.ndarray, " steps"]:
 
 
 def shares(scores: Float[np.ndarray, " candidates"], sharpness: float) -> Float[np.ndarray, " candidates"]:
-    """Shares of a query's candidates: (score - mean)^sharpness, or 0 below the mean, divided by their sum.
-
-    Shares are equal if all scores are equal. Scores that are not finite have the share 0.
-    """
+    """Shares of a query's candidates: (score - mean)^sharpness, 0 below the mean or if not finite; by their sum."""
     finite = np.isfinite(scores)
     if not finite.any():
         return np.zeros(len(scores))

@@ -12,15 +12,11 @@ _FIRST = 1024  # rows; twice as many whenever they are full
 
 
 class Vectors:
-    """Global descriptors by row. Rows may be added in any order, and some may be missing.
-
-    Attributes:
-        total: one more than the largest row.
-    """
+    """Global descriptors by row. Rows may be added in any order, and some may be missing."""
 
     def __init__(self) -> None:
         self._values, self._is_candidate = np.zeros((0, 0), np.float32), np.zeros(0, bool)
-        self.total = 0
+        self.total = 0  # one more than the largest row
 
     @property
     def length(self) -> int | None:
@@ -42,10 +38,7 @@ class Vectors:
     def nearest(
         self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
     ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
-        """At most `number` rows `before` a row, and their products with the query, most similar first.
-
-        The lowest row wins a tie. The zero descriptor of an image without features has no similar rows.
-        """
+        """At most `number` rows `before` a row, and their products with the query, most similar first, then by row."""
         total = self.total if before is None else max(0, min(self.total, before))
         rows = np.flatnonzero(self._is_candidate[:total])
         if not len(rows) or not query.any():

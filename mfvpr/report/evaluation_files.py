@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.datasets.positives import stack_positives
-from mfvpr.evaluation.paths import places_along_path
-from mfvpr.evaluation.results import RankedDataset
+from mfvpr.evaluation.evaluation import RankedDataset
+from mfvpr.evaluation.selection import places_along_path
 from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.runs import file_names

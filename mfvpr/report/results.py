@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from mfvpr.datasets.datasets import Dataset
-from mfvpr.evaluation.evaluation import rank_dataset
-from mfvpr.evaluation.results import KS, RankedDataset
+from mfvpr.evaluation.evaluation import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.runs import claim_run_folder, file_names, write_table

@@ -13,10 +13,7 @@ from mfvpr.utils.locks import lock
 
 @contextmanager
 def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hold the lock of a store, see `mfvpr.utils.locks`; `content` is for messages.
-
-    `waiting` is called with one line that names the process that this waits for; None = refuse a store in use.
-    """
+    """Hold the lock of a store; `waiting` gets a line if another process holds it, None = raise an `InputError`."""
 
     def on_conflict(handle: int) -> None:
         holder = os.pread(handle, 20, 0).decode(errors="replace") or "unknown"
@@ -39,10 +36,7 @@ def lock_store(folder: Path, content: str, waiting: Callable[[str], None] | None
 def disk_errors_as_input_errors(
     folder: Path, content: str, needed: Callable[[], int] = lambda: 10**6
 ) -> Iterator[None]:
-    """Raise errors of the file system as an InputError of one line about the `content` of a store.
-
-    `needed` gives the bytes that are still to be written when the disk is full.
-    """
+    """Raise errors of the file system as an InputError; `needed` gives the bytes that a full disk still has to hold."""
     try:
         yield
     except OSError as error:

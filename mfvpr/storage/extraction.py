@@ -1,8 +1,9 @@
 """The extraction of a folder's images: each part of a description goes to a store, or to memory."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import FeatureSource, InMemory
-from mfvpr.storage import features, vectors
+from mfvpr.storage import features
 from mfvpr.storage.manifest import VECTORS, store_path
 from mfvpr.storage.recipes import states
 from mfvpr.storage.rows import RowStore, require_space
@@ -24,18 +25,12 @@ _MB = 1e6
 
 @dataclass
 class Sink:
-    """One part of the descriptions of a folder's images, in a store or in memory.
-
-    Attributes:
-        pick: the part of a description.
-        store: None = in memory, in `items` by key.
-        forecast: number of images -> bytes on disk.
-    """
+    """One part of the descriptions of a folder's images, in a store or, by key, in `items` in memory."""
 
     pick: Callable[[Description], Any]
     store: RowStore[Any] | None
     keys: Sequence[str]
-    forecast: Callable[[int], int]
+    forecast: Callable[[int], int]  # number of images -> bytes on disk
     items: dict[str, Any] = field(default_factory=dict)
 
     def missing(self, rows: Iterable[int]) -> list[int]:
@@ -67,20 +62,13 @@ class Sink:
 
 @dataclass
 class Extraction:
-    """The state of one extractor on one folder of images.
-
-    Attributes:
-        states: `recipes.states` of the images before they were hashed; None = in a worker, which may have other files.
-        sinks: of the parts of its descriptions: the global descriptor, if it gives one, and each scale.
-        bad: row -> reason, for images without features.
-        is_announced: whether the user was told where the features are.
-    """
+    """The state of one extractor on one folder of images."""
 
     extractor: Extractor
-    sinks: list[Sink]
-    states: Sequence[str] | None
-    bad: dict[int, str] = field(default_factory=dict)
-    is_announced: bool = False
+    sinks: list[Sink]  # of the global descriptor, if the extractor gives one, and of each scale
+    states: Sequence[str] | None  # of the images before they were hashed; None = in a worker with files of its own
+    bad: dict[int, str] = field(default_factory=dict)  # row -> reason
+    is_announced: bool = False  # where the features are
 
     @property
     def of_scales(self) -> list[Sink]:
@@ -95,13 +83,6 @@ class Extraction:
     def missing(self, rows: Sequence[int]) -> list[int]:
         """The rows that a sink lacks, without bad ones."""
         return sorted({row for sink in self.sinks for row in sink.missing(rows)} - self.bad.keys())
-
-    def writing(self) -> ExitStack:
-        """Lock the stores, and find the rows that were written meanwhile."""
-        with ExitStack() as stack:
-            for store in self.stores:
-                stack.enter_context(store)
-            return stack.pop_all()
 
     def without_programs(self) -> "Extraction":
         """A copy that can be sent to workers: its extractor has compiled nothing."""
@@ -156,23 +137,17 @@ def describe_rows(
 def open_sinks(
     root: Path | None, extractor: Extractor, recipe: Mapping[str, Any], keys: Sequence[str], **options: Any
 ) -> list[Sink]:
-    """Open the sinks of an extractor: of its global descriptor, if it gives one, then of each scale.
-
-    Without a root, the sinks are in memory. `keys` are those of the images, `options` the `lock` of a `RowStore`.
-    """
+    """Open the sinks of an extractor, without a root in memory; `options` are the `lock` of a `RowStore`."""
     name, size = type(extractor).__name__, extractor.vector_size
     options |= {"num_images": len(keys), "keys": keys}
     sinks = []
     if size:
         path = None if root is None else store_path(root, name, recipe, VECTORS)
-        store = None if path is None else vectors.open_vector_store(path, recipe, **options)
-        forecast = lambda n: vectors.forecast_bytes(n, size)  # noqa: E731
-        sinks.append(Sink(lambda description: description.vector, store, keys, forecast))
+        store = None if path is None else features.open_vector_store(path, recipe, **options)
+        sinks.append(Sink(attrgetter("vector"), store, keys, partial(features.forecast_vector_bytes, size=size)))
     for number, scale in enumerate(extractor.scales):
         of_scale = {**recipe, "scale": number} if len(extractor.scales) > 1 else recipe
         store = None if root is None else features.open_store(store_path(root, name, of_scale), of_scale, **options)
-        sinks.append(Sink(
-            lambda description, number=number: description.local[number], store, keys,
-            lambda n, scale=scale: features.forecast_bytes(n, scale.typical_count, scale.dimension),
-        ))  # fmt: skip
+        forecast = partial(features.forecast_bytes, features_per_image=scale.typical_count, dimension=scale.dimension)
+        sinks.append(Sink(lambda description, number=number: description.local[number], store, keys, forecast))
     return sinks

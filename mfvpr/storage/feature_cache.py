@@ -8,8 +8,8 @@ The content of an image and the recipe of the extractor name its features, not t
 several data sets or maps share is extracted once.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,19 +21,15 @@ from jaxtyping import Float
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
-from mfvpr.storage import matches as match_stores
 from mfvpr.storage.disk import lock_store
 from mfvpr.storage.extraction import Extraction, describe_rows, open_sinks
-from mfvpr.storage.manifest import LOCKS, MATCHES, store_path
+from mfvpr.storage.manifest import LOCKS
 from mfvpr.storage.recipes import Memo, Recipes, Value, states
-from mfvpr.storage.rows import require_space
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 AGGREGATED = 16  # images at a time
-_MB = 1e6
 
 
 @dataclass(frozen=True)
@@ -138,7 +134,8 @@ class FeatureCache:
             if self.watch is not None and extractor.scales:
                 stack.enter_context(self.watch("features"))
             if state.missing(requested):
-                stack.enter_context(state.writing())
+                for store in state.stores:
+                    stack.enter_context(store)  # finds the rows that were written meanwhile
             missing = state.missing(requested)
             for line in state.announcement(missing, len(requested)):
                 self.log(f"{label}: {line}")
@@ -152,50 +149,11 @@ class FeatureCache:
                 self.log(f"{label}: {line}")
         return state
 
-    @contextmanager
-    def matches(
-        self,
-        recipe: Mapping[str, Any],
-        sizes: tuple[int, int],
-        *,
-        rows: Sequence[int] | None = None,
-        typical: int,
-        label: str,
-    ) -> Iterator[match_stores.MatchStore]:
-        """The store of the matches of queries, locked while queries are missing; needs a root.
-
-        Args:
-            recipe: of the shortlist and the matches.
-            sizes: number of queries, and of candidates of each.
-            rows: the queries that are going to be matched, while other processes match others; None = all.
-            typical: number of matches of a pair, about.
-            label: stands in messages.
-        """
-        if self.root is None:
-            raise ValueError("nothing is kept on disk: this cache has no root")
-        path, (num_queries, num_candidates) = store_path(self.root, "matches", recipe, MATCHES), sizes
-        options = {"num_queries": num_queries, "num_candidates": num_candidates}
-        part = None if rows is None else fingerprint(list(rows))
-        with match_stores.open_match_store(path, recipe, **options, lock=self._lock(part)) as store:
-            if missing := sum(not store.done[row] for row in (range(num_queries) if rows is None else rows)):
-                needed = match_stores.forecast_bytes(missing, num_candidates, typical)
-                require_space(store.folder, needed)
-                self.log(f"{label}: {missing} of {num_queries} queries to match with {num_candidates} candidates: "
-                          f"about {needed / _MB:.1f} MB in {store.folder}")  # fmt: skip
-            else:
-                amount = "all" if store.done.all() else "its part of"
-                self.log(f"{label}: {amount} {num_queries} queries from {store.folder}")
-            yield store
-
-    def _lock(self, part: str | None) -> Callable[[Path, str], AbstractContextManager[None]]:
+    def lock(self, part: str | None, folder: Path, content: str) -> AbstractContextManager[None]:
         """The lock of a part of a store, or of all of it; it waits for another process, or refuses."""
-
-        def lock(folder: Path, content: str) -> AbstractContextManager[None]:
-            folder = folder if part is None else folder / LOCKS / part
-            folder.mkdir(parents=True, exist_ok=True)
-            return lock_store(folder, content, self.log if self.wait else None)
-
-        return lock
+        folder = folder if part is None else folder / LOCKS / part
+        folder.mkdir(parents=True, exist_ok=True)
+        return lock_store(folder, content, self.log if self.wait else None)
 
     def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
         opened = source.open(folder, partial=self.skip_bad)
@@ -208,7 +166,7 @@ class FeatureCache:
         before = states(folder)
         if self.root is not None:
             contents, recipe = self.recipes.contents(folder), self.recipes.of_features(extractor)
-            lock = self._lock(contents.fingerprint)
+            lock = partial(self.lock, contents.fingerprint)
             return Extraction(extractor, open_sinks(self.root, extractor, recipe, contents.keys, lock=lock), before)
         sinks = open_sinks(None, extractor, {}, before)
         memory = self._memo.once("memory", lambda: [sink.items for sink in sinks], None, extractor)

@@ -1,7 +1,4 @@
-"""The manifest of a store: the recipe of its rows in plain text, so that no other recipe reuses them.
-
-It is written before anything else, and compared, part by part, whenever the store is opened.
-"""
+"""The manifest of a store: the recipe of its rows in plain text, written first and compared at every opening."""
 
 import json
 import os
@@ -19,7 +16,6 @@ from mfvpr.utils.fingerprints import difference, fingerprint, short_json
 
 MANIFEST = "manifest.json"
 LOCKS = "locks"  # folder of the locks of a store that several processes write
-_OLD_MANIFEST = "zarr.json"  # of format 1
 # Temporary files of a process that was killed while it wrote.
 _LEFTOVER = re.compile(r"\.(manifest|images|vocabulary|[0-9a-f]+-\d+)-\w+\.(json|npz)")
 _ABANDONED = 3600  # seconds, after which a temporary file belongs to no running process: files are written within one
@@ -27,21 +23,13 @@ _ABANDONED = 3600  # seconds, after which a temporary file belongs to no running
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of store, in the words of its manifest and of its messages.
-
-    Attributes:
-        version: of its arrays on disk.
-        content: of a row.
-        rows: the things that rows belong to.
-        remake: verb for making a row again; None = no run can make it again, so that nothing is removed, and no
-            message advises it.
-    """
+    """A kind of store, in the words of its manifest and of its messages."""
 
     store: str
-    version: int
-    content: str
-    rows: str
-    remake: str | None
+    version: int  # of its arrays on disk
+    content: str  # of a row
+    rows: str  # the things that rows belong to
+    remake: str | None  # verb for making a row again; None = no run can, so that nothing is removed
     compress: bool
 
     @property
@@ -74,11 +62,6 @@ def check_folder(folder: Path, kind: Kind) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of {kind.content}, got a file; choose another path")
     if folder.is_dir() and not (folder / MANIFEST).exists():
-        if (folder / _OLD_MANIFEST).exists():
-            raise InputError(
-                f"{folder}: expected {kind.format!r}, got the format of an earlier version; choose another path, or "
-                "delete this folder"
-            )
         foreign = sorted(
             path.name for path in folder.iterdir() if path.name not in ("lock", LOCKS) and not _is_leftover(path)
         )

@@ -56,10 +56,7 @@ MapImage = tuple[Features, Entry]
 
 @contextmanager
 def lock_map(folder: Path) -> Iterator[None]:
-    """Lock a map, which may be missing: no other process learns its vocabulary or adds images.
-
-    Raises `InputError` if another process has the lock, or the folder cannot be written.
-    """
+    """Lock a map, which may be missing: no other process learns its vocabulary or adds images."""
     with disk_errors_as_input_errors(folder, MAP.content):
         folder.mkdir(parents=True, exist_ok=True)
     with lock_store(folder, MAP.content):
@@ -67,10 +64,7 @@ def lock_map(folder: Path) -> Iterator[None]:
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a map, unless they are there; within `lock_map`.
-
-    Raises `InputError` if the map has other settings, or format 1, or the folder cannot be written.
-    """
+    """Write the settings of a map within `lock_map`; an InputError if it has other settings, or format 1."""
     if _is_old(folder):
         raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
                          "map anew in another folder.")  # fmt: skip
@@ -101,19 +95,13 @@ def _segment_folder(folder: Path, number: int) -> Path:
 
 @dataclass
 class _Segment:
-    """Both stores of a segment, and its tokens, when they were opened.
-
-    Attributes:
-        tokens: `[SEGMENT]` of the rows that exist; 0 = no row.
-        stamp: `file_stamp` of the file of tokens.
-        known: `[SEGMENT]` bool, rows that `MapRows.new` gave.
-    """
+    """Both stores of a segment, and its tokens, when they were opened."""
 
     features: FeatureStore
     entries: EntryStore
-    tokens: np.ndarray
-    stamp: tuple[int, ...] | None
-    known: np.ndarray
+    tokens: np.ndarray  # [SEGMENT] of the rows that exist; 0 = no row
+    stamp: tuple[int, ...] | None  # of the file of tokens
+    known: np.ndarray  # [SEGMENT] bool, rows that `MapRows.new` gave
 
     @property
     def folder(self) -> Path:
@@ -185,25 +173,14 @@ class _Segment:
 
 @dataclass(eq=False)
 class MapRows:
-    """The rows of the map in a folder, which may be missing until the first is added, within `lock_map`.
+    """The rows of the map in a folder, which may be missing until the first is added, within `lock_map`."""
 
-    Attributes:
-        folder: of the map.
-        recipe: of its rows (JSON values): a map with another recipe is refused.
-    """
-
-    folder: Path
-    recipe: Mapping[str, Any]
+    folder: Path  # absolute
+    recipe: Mapping[str, Any]  # of the rows (JSON values): a map with another recipe is refused
     _segments: list[_Segment] = field(default_factory=list, repr=False)
 
-    def __post_init__(self) -> None:
-        self.folder = self.folder.absolute()  # the working directory may change
-
     def new(self) -> Iterator[tuple[int, Entry]]:
-        """(row, entry) of all rows since the last call, in their order.
-
-        Raises `InputError` if the map has another recipe, is damaged, or was replaced.
-        """
+        """(row, entry) of new rows in their order; an InputError for a map of another recipe, damaged or replaced."""
         if self._segments:
             self._open(0)  # all maps have this segment: it shows whether the map was replaced
         growing = (number for number, segment in enumerate(self._segments) if not segment.known.all())

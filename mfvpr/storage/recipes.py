@@ -1,7 +1,4 @@
-"""Recipes of results: the content of images and files, the extractor, and the versions of decoders.
-
-Results with the same recipe are computed once in a process.
-"""
+"""Recipes of results, which are computed once in a process: content of files, extractor, versions of decoders."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -28,10 +25,7 @@ class Memo:
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
 
     def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder | None, by: Any) -> Value:
-        """The result of `compute`, called once while the images and the recipe of `by` stay the same.
-
-        Without a recipe, the `id` of `by` counts. Without a folder, the result belongs to all images.
-        """
+        """Call `compute` once while the images (None = any) and the recipe of `by`, or else its `id`, stay the same."""
         try:
             recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
         except TypeError:

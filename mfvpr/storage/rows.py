@@ -72,8 +72,6 @@ class RowStore(Generic[Item]):
         """Open the store, and find the rows that are done; an InputError if it was made from something else.
 
         Args:
-            folder: see `manifest.store_path`.
-            form: of the rows.
             recipe: of the rows (JSON values only). Kept in plain text.
             sizes: see above; a store by key has no other.
             keys: `[M]` of the rows, 32 hexadecimal digits each; rows with the same key are one. None = rows by number.
@@ -234,11 +232,8 @@ class RowStore(Generic[Item]):
 
     def _check_layouts(self, rows: Mapping[int, Parts]) -> None:
         """Refuse rows whose arrays differ from the other rows: they could not be put together."""
-        if self._layout is None:
-            stored = filter(None, map(self._read_parts, np.flatnonzero(self.done).tolist()))
-            layout = _layout_of(next(stored, next(iter(rows.values()))))
-        else:
-            layout = self._layout
+        stored = filter(None, map(self._read_parts, np.flatnonzero(self.done).tolist()))  # none is read yet
+        layout = self._layout or _layout_of(next(stored, next(iter(rows.values()))))
         for row, parts in rows.items():
             if differs := difference(_layout_of(parts), layout):
                 advice = self.kind.advice("describe all of them alike")

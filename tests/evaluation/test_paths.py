@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets import Positives
-from mfvpr.evaluation.paths import places_along_path
+from mfvpr.evaluation.selection import places_along_path
 from mfvpr.evaluation.statistics import block_sign_flips
 
 PLACES = 60

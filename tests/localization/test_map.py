@@ -91,7 +91,7 @@ def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
     assert low_x <= prediction.shift[0] <= high_x
     assert low_y <= prediction.shift[1] <= high_y
     assert prediction.scale == 1
-    assert not prediction.is_refused
+    assert prediction.reason is None
     assert len(prediction.as_json(2)["alternatives"]) == 2
 
 
@@ -120,7 +120,7 @@ def test_the_newest_rows_can_be_left_out(dataset, folder):
     assert known.localize_with_evidence(image, recent=np.int64(2), before=np.uint8(6)).prediction == prediction
     prediction, _, matches = known.localize_with_evidence(image, recent=2, before=2)
     assert (prediction.place, prediction.alternatives, matches) == (None, (), None)
-    assert (prediction.reason, prediction.is_refused) == ("no candidates", False)
+    assert prediction.reason == "no candidates"
     assert max(rows_of(known.localize(dataset.database.paths[last], recent=3))) == last - 3
     assert known.localize(dataset.database.paths[last], recent=last + 1).alternatives == ()
 
@@ -159,7 +159,6 @@ def test_unsure_answers_are_no_place(dataset, folder):
     assert sure.reason is None
     refused = opened(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
     assert refused.place is None
-    assert refused.is_refused
     assert refused.confidence < 1e-9
     assert (refused.reason, refused.shift, refused.shift_interval, refused.scale) == ("low confidence", *[None] * 3)
     assert refused.alternatives == sure.alternatives
@@ -423,7 +422,7 @@ def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
     if kind == "lens cap":  # with a little light at its rim
         image[:, :40] = np.arange(40, 0, -1)[:, None]
     prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
-    assert (prediction, prediction.is_refused, matches) == (without_place("too few features"), True, None)
+    assert (prediction, matches) == (without_place("too few features"), None)
     assert prediction.as_json()["reason"] == "too few features"
 
 

@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
 from mfvpr.datasets.truth import RADIUS, TOLERANCES
-from mfvpr.evaluation.results import KS
+from mfvpr.evaluation.evaluation import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
 from mfvpr.reranking import FrameCorrelation, Fusion

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
 from mfvpr.datasets import Positives
-from mfvpr.evaluation import Tally
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.retrieval import search as retrieval
 from mfvpr.retrieval.search import EXACT
@@ -120,21 +118,6 @@ def test_rankings_of_several_systems_are_refused():
 def test_no_database_and_no_queries_recall_nothing():
     np.testing.assert_array_equal(recall_at_k(np.full((2, 1), -1), np.zeros((2, 0), bool), [1, 5]), [0, 0])
     np.testing.assert_array_equal(recall_at_k(np.zeros((0, 3), int), np.zeros((0, 4), bool), [1]), [0])
-
-
-ORDERS = hnp.arrays(np.int64, (7, 4), elements=st.integers(-1, 5))
-
-
-@given(ORDERS, hnp.arrays(bool, (7, 6)), st.integers(0, 7), st.randoms())
-def test_tallies_add_up_to_the_recall_of_all(order, positives, cut, rng):
-    """To the last bit, for any parts in any order."""
-    ks, rows = [1, 2, 9], list(range(7))
-    rng.shuffle(rows)
-    parts = [Tally.of(order[part_rows], positives[part_rows], ks) for part_rows in (rows[:cut], rows[cut:])]
-    merged = parts[1].merge(parts[0])
-    np.testing.assert_array_equal(merged.recall, recall_at_k(order, positives, ks))
-    assert merged.queries == 7
-    np.testing.assert_array_equal(Tally.of(np.zeros((0, 4), int), positives[:0], ks).recall, [0, 0, 0])
 
 
 @pytest.mark.parametrize(

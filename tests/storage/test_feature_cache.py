@@ -12,8 +12,8 @@ from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.images import resize
 from mfvpr.features import Aggregated, Description, VladFitting
-from mfvpr.storage import FeatureCache, extraction, recipes, vectors
-from mfvpr.storage.features import forecast_bytes
+from mfvpr.storage import FeatureCache, extraction, recipes
+from mfvpr.storage.features import forecast_bytes, forecast_vector_bytes
 from mfvpr.storage.recipes import Recipes
 from mfvpr.utils import InputError
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
@@ -261,7 +261,7 @@ def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path)
 
 @pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 155), (1415, 681, 1942, 989)])
 def test_the_papers_databases_take_about_half(images, features, paper, readme):
-    ours = (forecast_bytes(images, features, 512) + vectors.forecast_bytes(images, 4096)) / 2**20
+    ours = (forecast_bytes(images, features, 512) + forecast_vector_bytes(images, 4096)) / 2**20
     assert ours <= 0.55 * paper
     assert round(ours) == readme
 

@@ -1,8 +1,4 @@
-"""Checkpoints of a training in a folder, written atomically.
-
-Every checkpoint has the recipe of the training and the shapes of its arrays. Both are compared before anything in the
-folder changes, so that another training cannot use it. The last two checkpoints are kept.
-"""
+"""Checkpoints of a training in a folder: the last two, written atomically, with the recipe and the shapes of arrays."""
 
 import json
 import logging
@@ -40,11 +36,7 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
 
 
 def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
-    """Write the checkpoint of a step above all earlier ones, and remove all but the last two.
-
-    `state` is a pytree of arrays; `recipe` and `progress` are JSON values. If the disk is full, earlier checkpoints
-    stay.
-    """
+    """Write the pytree `state`, with JSON values, at a step above all earlier ones; remove all but the last two."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     arrays = {str(place): leaf for place, leaf in enumerate(leaves)}
     record = {**_description(recipe, state), "progress": progress, "checksum": _checksum(leaves, progress)}
@@ -57,12 +49,9 @@ def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: A
 
 
 def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
-    """State and progress of the newest checkpoint, None without one. Nothing in the folder is changed.
+    """State and progress of the newest checkpoint, None without one; `state` has the same structure and shapes.
 
-    `state` is a pytree of the same structure and shapes. The folder may be missing.
-
-    Raises:
-        InputError: the folder is no folder of checkpoints, the checkpoint has another recipe, or it is damaged.
+    An InputError for a folder of something else, another recipe or damage; nothing in the folder is changed.
     """
     if not _holds_checkpoints(folder):
         return None
@@ -74,7 +63,10 @@ def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, A
         if not (where / "record").exists():
             raise InputError(f"{where}: expected a checkpoint of mfvpr, got another; choose another folder")
         record = _read(manager, where, record=ocp.args.JsonRestore())
-        if differs := _difference(record, _description(recipe, state)):
+        expected = _description(recipe, state)
+        parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
+        differences = (difference(record.get(part, {}), expected[part], name) for part, name in parts)
+        if differs := next(filter(None, differences), None):
             raise InputError(f"{folder}: this checkpoint is of {differs}; choose another folder, or delete this one")
         arrays = _read(manager, where, arrays=ocp.args.StandardRestore())
     leaves = [arrays[str(place)] for place in range(len(arrays))]
@@ -156,13 +148,6 @@ def _description(recipe: Mapping[str, Any], state: Any) -> dict[str, Any]:
     """Format, recipe and shapes of arrays of a checkpoint, JSON values."""
     arrays = {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in leaves_by_path(state).items()}
     return json.loads(json.dumps({"format": FORMAT, "recipe": recipe or {}, "arrays": arrays}))  # tuples become lists
-
-
-def _difference(record: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
-    """The first difference, see `fingerprints.difference`; the recipe before the arrays."""
-    parts = (("format", "format"), ("recipe", ""), ("arrays", ""))
-    differences = (difference(record.get(part, {}), expected[part], name) for part, name in parts)
-    return next(filter(None, differences), None)
 
 
 def _reason(error: Exception) -> str:

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from mfvpr.evaluation.precision import hits
 from mfvpr.evaluation.protocol import EvaluationProtocol
-from mfvpr.evaluation.recall import hits
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.scoring.weights import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
-from mfvpr.tuning.learning.models import Model
-from mfvpr.tuning.learning.parameters import can_learn
+from mfvpr.tuning.learning.models import Model, can_learn
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.teaching import Options, of_matches, start, train
 from mfvpr.tuning.learning.training import Checkpoints, Fit
@@ -30,20 +29,13 @@ _OF_THE_PAPER = (FeatureScoreWeight, DescriptorDistanceWeight, UnitWeight)
 
 @dataclass(frozen=True)
 class Row:
-    """One score, chosen or learned on one half and evaluated on the other.
-
-    Attributes:
-        half: name of the half to choose or learn on.
-        hits: of the queries of the other half.
-        values: chosen or learned parameters, as plain values.
-        fitted: the training; None if nothing was trained.
-    """
+    """One score, chosen or learned on the named half and evaluated on the other."""
 
     half: str
     name: str
     hits: Bool[np.ndarray, "tolerances reported"]
-    values: Mapping[str, Any]
-    fitted: Fit | None
+    values: Mapping[str, Any]  # chosen or learned parameters
+    fitted: Fit | None  # None if nothing was trained
 
 
 @dataclass(frozen=True)
@@ -76,8 +68,7 @@ def compare(
     Args:
         axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances retrieval and score.
         protocol: the ground truth, with halves.
-        match_set: matches of Q queries with C candidates, with their ratio.
-        candidates: their shortlist.
+        match_set: matches of all queries, with their ratio.
         checkpoints: where an interrupted training is continued; None = nowhere.
 
     Raises:
@@ -144,18 +135,14 @@ class _HalfComparison:
         """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
         axes = self.axes if fused else self.axes.without(FUSION)
         grid, queries, protocol = axes.grid(), self.split.half.tune, self.split.protocol
-        settings = [self.with_fusion(axes.setting(plain), self.split.balance(deviation), fused=fused) for plain in grid]
+        own = {FUSION: self.options.c} if fused and FUSION not in axes.values else {}
+        settings = [{**axes.setting(plain), **own} for plain in grid]
+        for setting in settings if FUSION in axes.values else ():  # a c in units of the scores
+            setting[FUSION] = None if (c := setting[FUSION]) is None else c * self.split.balance(deviation)
         rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
         recall = hits(rows, protocol.positives[protocol.main].take(queries)).mean(axis=-1)
         best = best_setting(recall, axes.values)
         return settings[best], grid[best]
-
-    def with_fusion(self, setting: Setting, balance: float, *, fused: bool) -> Setting:
-        """The setting with its c in units of the scores, or with the c of the options."""
-        if fused and FUSION not in setting:
-            return {**setting, FUSION: self.options.c}
-        c = setting.get(FUSION)
-        return setting if c is None else {**setting, FUSION: c * balance}
 
     def first_rows(
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray

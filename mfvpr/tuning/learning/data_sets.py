@@ -67,18 +67,12 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         np.concatenate([_pad(part.match_set.counts, width, 0) for part in parts]),
         max(part.match_set.capacity for part in parts),
     )
-    shortlists = [_shift(part.candidates, int(start), width) for part, start in zip(parts, starts, strict=True)]
+    shortlists = []
+    for candidates, start in zip([part.candidates for part in parts], starts, strict=True):
+        indices = np.where(candidates.indices >= 0, candidates.indices + start, -1).astype(np.int32)
+        scores, mask = np.asarray(candidates.scores), np.asarray(candidates.mask)
+        shortlists.append(Shortlist(_pad(indices, width, -1), _pad(scores, width, 0), _pad(mask, width, False)))
     return Part(" ".join(names), protocol, match_set, jax.tree.map(lambda *rows: np.concatenate(rows), *shortlists))
-
-
-def _shift(candidates: Shortlist, start: int, width: int) -> Shortlist:
-    """Add `start` to the database rows, and pad to `width` candidates."""
-    indices = np.where(candidates.indices >= 0, candidates.indices + start, -1).astype(np.int32)
-    return Shortlist(
-        indices=_pad(indices, width, -1),
-        scores=_pad(np.asarray(candidates.scores), width, 0),
-        mask=_pad(np.asarray(candidates.mask), width, False),
-    )
 
 
 def _pad(values: np.ndarray, width: int, fill: Any) -> np.ndarray:

@@ -77,10 +77,7 @@ def mean_loss(
 
 
 def _usable(scores: Array, positives: Array, mask: Array) -> tuple[Array, Array, Array, Array]:
-    """Scores, positives, real candidates, and whether the query has a positive.
-
-    A query without one gets zeros as scores and only positives, so that losses and gradients never divide by 0.
-    """
+    """Scores, positives, real candidates, and whether the query has a positive; without one, no loss divides by 0."""
     positives = positives & mask
     teaches = jnp.any(positives)
     return masked(as_float(scores), mask & teaches), positives | ~teaches, mask | ~teaches, teaches

@@ -1,5 +1,6 @@
 """Models of learning: parameters to start from, and a differentiable score of the candidates of a query."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,63 +10,33 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.reranking.ranking import combine, score_candidates
+from mfvpr.scoring.fields import SCORE, parameters_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.learned_weight import LearnedWeight
 from mfvpr.tuning.learning import losses
 from mfvpr.tuning.learning.losses import Loss
-from mfvpr.tuning.learning.parameters import from_logarithms, starts, to_logarithms
 from mfvpr.tuning.learning.splits import Batch
 from mfvpr.types import Array, Matches
-from mfvpr.utils.numerics import masked_mean
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import as_float, masked_mean
 
-Parameters = dict[str, Any]  # `numbers` by name and `c` as logarithms, `sharpness`, `weight`
+# `numbers` by name, `c` and `sharpness` as logarithms, which keeps them above 0, and `weight`
+Parameters = dict[str, Any]
 Objective = Callable[["Parameters", Batch], Array]
-
-SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
-LEAST_C = 1e-3  # weight of the retrieval at the start, in units of the scores
 
 
 @dataclass(frozen=True)
 class Model:
-    """A score with parameters to learn.
+    """A score with parameters to learn, from the ranking, or from a teacher's labels of single matches."""
 
-    Attributes:
-        scorer: its numbers are learned; its other parameters stay.
-        start: the parameters to begin with.
-        unit: spread of the scores at the start; the loss sees scores in this unit.
-        teacher: labels the matches of correct pairs as correct or incorrect, from which the match weight is learned;
-            None = learn from the ranking.
-    """
-
-    scorer: Any
+    scorer: Any  # its numbers are learned; its other parameters stay
     start: Parameters
-    unit: float
-    teacher: HistogramOfShifts | None = None
-
-    @classmethod
-    def of(cls, scorer: Any, unit: float, *, c: float | None = None, weight: LearnedWeight | None = None) -> "Model":
-        """A model that starts from the values of a hard scorer, whose scores have the spread `unit`.
-
-        It also learns the retrieval's weight c and the match weight, if they are given, from these values on.
-        """
-        start: Parameters = {
-            "numbers": to_logarithms(starts(scorer, unit)),
-            "sharpness": jnp.log(jnp.asarray(SHARPNESS)),
-        }
-        if c is not None:
-            start["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * unit) / unit))
-        if weight is not None:
-            start["weight"] = weight
-        return cls(scorer, start, unit)
-
-    @classmethod
-    def of_matches(cls, scorer: Any, weight: LearnedWeight, teacher: HistogramOfShifts) -> "Model":
-        """A model that learns only its match weight, starting with `weight`, from the labels of a teacher."""
-        return cls(scorer, {"numbers": {}, "weight": weight}, 1.0, teacher)
+    unit: float  # spread of the scores at the start; the loss sees scores in this unit
+    teacher: HistogramOfShifts | None = None  # labels the matches of correct pairs as correct or incorrect
 
     def scorer_of(self, parameters: Parameters) -> Any:
         """The soft scorer."""
-        numbers = from_logarithms(parameters["numbers"])
+        numbers = {name: jnp.exp(logarithm) for name, logarithm in parameters["numbers"].items()}
         weight = {"weight": parameters["weight"]} if "weight" in parameters else {}
         return replace(self.scorer, **numbers, **weight)
 
@@ -89,6 +60,28 @@ class Model:
         scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
         logits = scores / self.unit * jnp.exp(parameters["sharpness"])
         return losses.mean_loss(loss, logits, batch.positives, batch.mask)
+
+
+def can_learn(scorer: Any) -> bool:
+    """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
+    return any(parameter.learned for parameter in parameters_of(scorer).values())
+
+
+def first_numbers(scorer: Any, spread: float) -> dict[str, Array]:
+    """Logarithms of the values to start learning from, by field: the scorer's values, or declared ones for None.
+
+    `spread` is the standard deviation of the scores. A value that is not above 0 raises an `InputError`.
+    """
+    numbers = {}
+    for name, field in parameters_of(scorer).items():
+        if field.learned:
+            default = field.start * (spread if field.unit == SCORE else 1.0)
+            value = getattr(scorer, name)
+            number = float(default if value is None else value)
+            if not 0 < number < math.inf:
+                raise InputError(f"{name}={number}: expected a number above 0 to start from")
+            numbers[name] = jnp.log(as_float(number))
+    return numbers
 
 
 def _match_loss(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:

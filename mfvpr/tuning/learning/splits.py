@@ -34,23 +34,15 @@ class Batch:
 
 @dataclass(frozen=True)
 class TrainingSplit:
-    """One half of the path to learn on; matches, candidates and ground truth are those of all queries.
-
-    Attributes:
-        candidates: their scores are the retrieval's part of a combined score.
-        half: queries to choose on and to report on.
-        train: queries of the losses.
-        validation: queries that decide when learning stops.
-        seen: candidates that learning may use.
-    """
+    """One half of the path to learn on; matches, candidates and ground truth are those of all queries."""
 
     match_set: MatchSet
-    candidates: Shortlist
+    candidates: Shortlist  # their scores are the retrieval's part of a combined score
     protocol: EvaluationProtocol
     half: Half
-    train: Int[np.ndarray, " train"]
-    validation: Int[np.ndarray, " validation"]
-    seen: Bool[np.ndarray, "queries candidates"]
+    train: Int[np.ndarray, " train"]  # queries of the losses
+    validation: Int[np.ndarray, " validation"]  # queries that decide when learning stops
+    seen: Bool[np.ndarray, "queries candidates"]  # candidates that learning may use
     name: str
 
     @cached_property

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -13,45 +14,32 @@ from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.scoring.weights import RatioWeight, UnitWeight
 from mfvpr.tuning.learning.losses import Loss, cross_entropy
-from mfvpr.tuning.learning.models import Model, Parameters
+from mfvpr.tuning.learning.models import Model, Parameters, first_numbers
 from mfvpr.tuning.learning.splits import Batch, TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Schedule, fit
 
 TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image
 FIRST_SHARE = 0.3  # the retrieval's weight at the start, in units of the balanced weight
+LEAST_C = 1e-3  # the same, at least, in units of the scores
+SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of learning and comparing scores.
+    """Options of learning and comparing scores."""
 
-    Attributes:
-        c: the retrieval's weight if it is set by hand; None = balanced.
-        retrieval_score: the retrieval's part of a combined score, as in `mfvpr.reranking.ranking.retrieval_scores`.
-        ties: as in `mfvpr.reranking.ranking.rank_shortlist`.
-        loss: of one query.
-        steps: updates of a training, at most.
-        every: steps from one validation to the next.
-        patience: validations without a gain after which to stop.
-        batch: queries of a step.
-        learning_rate: of Adam.
-        hidden: width of the network of match weights.
-        inputs: properties of a match that the network sees, see `LearnedWeight`.
-        seed: of the network, and of the order of the queries.
-    """
-
-    c: float | None = None
-    retrieval_score: RetrievalScore = "cosine"
-    ties: Ties = "retrieval"
-    loss: Loss = cross_entropy
-    steps: int = 200
-    every: int = 5
-    patience: int = 10
-    batch: int = 8
-    learning_rate: float = 0.01
-    hidden: int = 16
-    inputs: tuple[str, ...] = RELATIVE
-    seed: int = 0
+    c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
+    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.reranking.ranking.retrieval_scores`
+    ties: Ties = "retrieval"  # as in `mfvpr.reranking.ranking.rank_shortlist`
+    loss: Loss = cross_entropy  # of one query
+    steps: int = 200  # updates of a training, at most
+    every: int = 5  # steps from one validation to the next
+    patience: int = 10  # validations without a gain after which to stop
+    batch: int = 8  # queries of a step
+    learning_rate: float = 0.01  # of Adam
+    hidden: int = 16  # width of the network of match weights
+    inputs: tuple[str, ...] = RELATIVE  # properties of a match that the network sees, see `LearnedWeight`
+    seed: int = 0  # of the network, and of the order of the queries
 
 
 def start(
@@ -61,13 +49,16 @@ def start(
 
     It learns the retrieval's weight as well (`fused`), and the match weight, starting from 1 (`learned_weight`).
     """
-    weight = None
-    if learned_weight:
-        scorer = replace(scorer, weight=UnitWeight())  # the start of a learned weight
-        weight = _first_weight(split, options)
+    scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
     deviation = split.score_deviation(scorer)
-    c = FIRST_SHARE * split.balance(deviation) if fused else None
-    return Model.of(parameters.with_capacity(scorer, *split.match_set.image_sizes), deviation, c=c, weight=weight)
+    scorer = parameters.with_capacity(scorer, *split.match_set.image_sizes)
+    first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
+    if fused:
+        c = FIRST_SHARE * split.balance(deviation)
+        first["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * deviation) / deviation))
+    if learned_weight:
+        first["weight"] = _first_weight(split, options)
+    return Model(scorer, first, deviation)
 
 
 def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
@@ -77,7 +68,8 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
     sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
     scorer = parameters.with_capacity(scorer, *sizes)
-    return Model.of_matches(scorer, _first_weight(split, options), parameters.with_capacity(teacher, *sizes))
+    first = {"numbers": {}, "weight": _first_weight(split, options)}
+    return Model(scorer, first, 1.0, parameters.with_capacity(teacher, *sizes))
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:

@@ -23,31 +23,20 @@ class TrainingError(InputError):
 
 
 class Record(NamedTuple):
-    """One validation.
+    """One validation."""
 
-    step: number of steps before it.
-    loss: mean over the steps since the previous record; None before the first step.
-    validation: its result, smaller = better; None without `validate`.
-    """
-
-    step: int
-    loss: float | None
-    validation: float | None
+    step: int  # number of steps before it
+    loss: float | None  # mean over the steps since the previous record; None before the first step
+    validation: float | None  # its result, smaller = better; None without `validate`
 
 
 class Fit(NamedTuple):
-    """The result of a training.
+    """The result of a training."""
 
-    parameters: of the best validation, which may be the start; the last ones without validation.
-    step: number of steps that lead to them.
-    history: every validation, the start first.
-    ended: why the training ended, in words.
-    """
-
-    parameters: Any
-    step: int
-    history: tuple[Record, ...]
-    ended: str
+    parameters: Any  # of the best validation, which may be the start; the last ones without validation
+    step: int  # number of steps that lead to them
+    history: tuple[Record, ...]  # every validation, the start first
+    ended: str  # why the training ended, in words
 
 
 class _State(NamedTuple):
@@ -57,31 +46,20 @@ class _State(NamedTuple):
 
 
 class Checkpoints(NamedTuple):
-    """A folder in which an interrupted training is continued, or a folder of such folders.
-
-    folder: a training in it is resumed, also to do more steps. With the same `every`, the result has the bits of a
-        training that was never interrupted.
-    recipe: JSON values that determine the result: the model, the data, all settings.
-    """
+    """A folder in which a training is resumed, to the bit with the same `every`, or a folder of such folders."""
 
     folder: Path
-    recipe: Mapping[str, Any]
+    recipe: Mapping[str, Any]  # JSON values that determine the result: the model, the data, all settings
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The schedule of a training.
-
-    Attributes:
-        steps: total number of updates, also of a resumed training.
-        every: steps from one validation, and checkpoint, to the next; the last step has both as well.
-        patience: validations without a gain after which to stop; None = do all steps.
-    """
+    """The schedule of a training."""
 
     optimizer: optax.GradientTransformation
-    steps: int
-    every: int = 10
-    patience: int | None = None
+    steps: int  # total number of updates, also of a resumed training
+    every: int = 10  # steps from one validation, and checkpoint, to the next; the last step has both as well
+    patience: int | None = None  # validations without a gain after which to stop; None = do all steps
 
 
 def fit(

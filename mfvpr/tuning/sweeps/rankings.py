@@ -71,17 +71,11 @@ DEFAULT_OPTIONS = SweepOptions()
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """The arguments of `rank_settings` for a part of the queries.
+    """The arguments of `rank_settings` for a part of the queries."""
 
-    Attributes:
-        match_set: of all queries.
-        queries: the part; candidates and views are of these queries.
-        settings: mean number of settings of a program, for the size of the batches.
-    """
-
-    match_set: MatchSet | Scales
-    queries: range
-    settings: float
+    match_set: MatchSet | Scales  # of all queries
+    queries: range  # the part: candidates and views are of these queries
+    settings: float  # mean number of a program, for the size of the batches
     candidates: Shortlist
     views: Sequence[np.ndarray]
     options: SweepOptions
@@ -112,22 +106,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of settings for a part of the queries.
-
-    Attributes:
-        part: of the queries.
-        group: settings with different scores.
-        number: of the program.
-        members: places of the settings of `rank_settings`; `repeats` of them share the scores of one of the group.
-        cs: by member.
-    """
+    """A block of settings for a part of the queries."""
 
     part: Work
-    group: Group
-    number: int
-    members: Sequence[int]
-    repeats: Sequence[int]
-    cs: Sequence[Any]
+    group: Group  # settings with different scores
+    number: int  # of the program
+    members: Sequence[int]  # places of the settings of `rank_settings`
+    repeats: Sequence[int]  # number of members that share the scores of one of the group
+    cs: Sequence[Any]  # by member
 
     @property
     def amount(self) -> int:
@@ -225,10 +211,7 @@ def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Bl
 
 
 def _compute(blocks: Sequence[Block], options: SweepOptions) -> Iterator[tuple[Block, np.ndarray]]:
-    """Rows of the blocks; long work logs its expected time, and advances its progress about every second.
-
-    The time is that of the first, the middle and the last program, on average.
-    """
+    """Rows of the blocks; long work logs its expected time, and advances its progress about every second."""
     size, amount = SETTINGS_PER_BLOCK, sum(block.amount for block in blocks)
     if amount > _MEASURED:
         programs = list({block.number: block for block in blocks if block.amount}.values())

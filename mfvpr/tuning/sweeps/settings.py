@@ -22,21 +22,13 @@ FUSION = "c"
 
 @dataclass(frozen=True)
 class Group:
-    """Settings of one program, the product of G settings and W weightings.
+    """Settings of one program, the product of G settings and W weightings."""
 
-    Attributes:
-        scorer: with the choices and the capacity for these settings.
-        settings: values by parameter.
-        weightings: values of `weight` (an option's number) and `max_distance`.
-        rows: numbers of the settings.
-        program: the scorer's program as text, if blocks are stored.
-    """
-
-    scorer: Any
+    scorer: Any  # with the choices and the capacity for these settings
     settings: Mapping[str, Shaped[np.ndarray, " settings"]]
-    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]
-    rows: Int[np.ndarray, "settings weightings"]
-    program: str = ""
+    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]  # of `weight` (an option's number) and `max_distance`
+    rows: Int[np.ndarray, "settings weightings"]  # numbers of the settings
+    program: str = ""  # the scorer's program as text, if blocks are stored
 
     def blocks(self, size: int) -> Iterator["Group"]:
         """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""
@@ -97,7 +89,8 @@ def _group_by(
     groups: dict[Any, tuple[dict, list[int]]] = {}
     for row in members:
         shared = {name: value for name, value in settings[row].items() if chosen(name, value)}
-        groups.setdefault(_key(shared), (shared, []))[1].append(row)
+        key = tuple((name, id(value) if name == "weight" else value) for name, value in shared.items())
+        groups.setdefault(key, (shared, []))[1].append(row)
     return list(groups.values())
 
 
@@ -113,10 +106,6 @@ def _arrays(
         else np.array([setting[name] for setting in settings], int if name in integers else np.float32)
         for name in names
     }
-
-
-def _key(setting: Setting) -> tuple:
-    return tuple((name, id(value) if name == "weight" else value) for name, value in setting.items())
 
 
 def _parts(total: int, size: int) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ from mfvpr.scoring.learned_weight import ABSOLUTE
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.comparison import Options, start
 from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss
-from mfvpr.tuning.learning.models import Model
+from mfvpr.tuning.learning.models import Model, first_numbers
 from mfvpr.tuning.sweeps import Axes
 from tests.builders import random_matches, stack
 from tests.tuning.learning.paths import QUERIES, SIZES, TOLERANCES, split
@@ -101,10 +101,16 @@ def test_images_of_two_sizes_are_learned_from_as_one_by_one():
 
 def test_anchors_start_near_the_hard_score():
     matches = stack([random_matches(np.random.default_rng(seed), 200) for seed in range(10)])
-    model = Model.of(AnchorPoints(), 1.0)
+    model = Model(AnchorPoints(), {"numbers": first_numbers(AnchorPoints(), 1.0)}, 1.0)
     soft = scores_of_one(model.scorer_of(model.start), matches)
     hard = scores_of_one(AnchorPoints(temperature=None), matches)
     assert np.median(np.abs(soft / hard - 1)) < 0.08
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_start_that_is_not_above_0_is_refused(value):
+    with pytest.raises(InputError, match=r"^sigma=.*: .*above 0"):
+        first_numbers(replace(HISTOGRAM, sigma=value), 1.0)
 
 
 def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():

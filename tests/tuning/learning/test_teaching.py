@@ -45,7 +45,8 @@ def batch(seed=0, queries=4, candidates=3):
 
 
 def model(taught):
-    return Model.of_matches(AggregatedScore(), LearnedWeight.create(jax.random.key(0), taught.matches, 4), TEACHER)
+    weight = LearnedWeight.create(jax.random.key(0), taught.matches, 4)
+    return Model(AggregatedScore(), {"numbers": {}, "weight": weight}, 1.0, TEACHER)
 
 
 def test_the_loss_is_that_of_a_loop():
