@@ -4,11 +4,12 @@ The cache identifies these files by their content, see `FeatureCache.recipe_of`,
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.images import Interpolation
@@ -127,7 +128,7 @@ class ShortlistFiles:
         require_one_image(file.path, database.paths, database_entries, images)
         require_one_image(file.path, sequence.images.paths, query_entries, images)
         if sequence.excluded is not None:
-            shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
+            shortlist = replace(shortlist, mask=shortlist.mask & ~sequence.excluded.contains(shortlist.indices))
         return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
 
 
@@ -140,21 +141,10 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     return files[folder.root]
 
 
-def _without(shortlist: Shortlist, excluded: Bool[np.ndarray, "queries candidates"]) -> Shortlist:
-    """Shortlist without the `excluded` candidates; the next candidates move up."""
-    mask = shortlist.mask & ~excluded
-    order = np.argsort(~mask, axis=1, kind="stable")
-    mask, indices, scores = (
-        np.take_along_axis(values, order, axis=1) for values in (mask, shortlist.indices, shortlist.scores)
-    )
-    return Shortlist(np.where(mask, indices, -1), np.where(mask, scores, 0), mask)
-
-
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
-    """Shortlist of `num_candidates`, cut or padded."""
+    """Shortlist of `num_candidates`, cut or padded; candidates beyond a masked one move up."""
     missing = max(0, num_candidates - shortlist.mask.shape[1])
-
-    def cut(values: np.ndarray, fill: float) -> np.ndarray:
-        return np.pad(values[:, :num_candidates], ((0, 0), (0, missing)), constant_values=fill)
-
-    return Shortlist(cut(shortlist.indices, -1), cut(shortlist.scores, 0), cut(shortlist.mask, False))
+    padded = jax.tree.map(lambda values: np.pad(values, ((0, 0), (0, missing))), shortlist)
+    order = np.argsort(~padded.mask, axis=1, kind="stable")[:, :num_candidates]
+    cut = jax.tree.map(lambda values: np.take_along_axis(values, order, axis=1), padded)
+    return Shortlist(np.where(cut.mask, cut.indices, -1), np.where(cut.mask, cut.scores, 0), cut.mask)
