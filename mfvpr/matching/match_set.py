@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -158,19 +158,6 @@ def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
     return match_set.match_sets if isinstance(match_set, Scales) else [match_set]
 
 
-class Batch(NamedTuple):
-    """Pairs with similar numbers of matches, which are scored in one call.
-
-    places: positions of the pairs in the flattened `[queries, candidates]`.
-    slots: per pair, at least its matches.
-    pairs: number of pairs with padding, at least n; padding has no matches.
-    """
-
-    places: Int[np.ndarray, " pairs"]
-    slots: int
-    pairs: int
-
-
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
     """Slots of the batch of each pair: few sizes to compile, with little padding.
 
@@ -192,15 +179,20 @@ def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 
 
-def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> list[Batch]:
-    """Batches of all pairs of some queries that have matches; the first of each shape comes first."""
+def partition(
+    match_set: MatchSet, queries: range, *, settings: float = math.inf
+) -> list[tuple[Int[np.ndarray, " _"], int, int]]:
+    """Batches of all pairs of some queries that have matches; the first of each shape comes first.
+
+    A batch has positions of pairs in the flattened `[queries, candidates]`, slots of a pair, and pairs with padding.
+    """
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)
     sizes = slots(match_set, settings=settings)[part].reshape(-1)
     by_shape = []
     for size, pairs in shapes(match_set, settings=settings).items():
         places = np.flatnonzero((sizes == size) & (counts > 0))
-        by_shape.append([Batch(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
+        by_shape.append([(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
     interleaved = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
     return [batch for batch in interleaved if batch is not None]
 

@@ -312,18 +312,8 @@ def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
 
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
+    """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
     scores, lattice, usable, _ = scorer._vote(matches)
-    return jnp.where(usable, _mass_interval(scores, lattice, level, sharpness), jnp.nan)
-
-
-def _mass_interval(
-    scores: Float[Array, "bins bins"], lattice: Lattice, level: float | Array, sharpness: float | Array
-) -> Float[jax.Array, "2 2"]:
-    """Interval (low, high) of (x, y) with the central share `level` of the mass along each axis.
-
-    The mass of a bin is s_ij^sharpness, for s_ij below 0 as for 0, and spread evenly within the bin. Without votes all
-    bins in the range of shifts have the same mass; beyond it s_ij is -inf.
-    """
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
@@ -335,4 +325,4 @@ def _mass_interval(
         below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
         return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], lattice.centers(axis, edges))
 
-    return jnp.stack([along(0), along(1)], axis=1)
+    return jnp.where(usable, jnp.stack([along(0), along(1)], axis=1), jnp.nan)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.scoring import planes, quads
+from mfvpr.scoring import planes
 from mfvpr.scoring.fields import check_choices, choice, flag, integer, number
 from mfvpr.scoring.shifts import query_features, require_sizes
 from mfvpr.scoring.weights import match_confidence
@@ -91,7 +91,7 @@ class Homography:
         )
         normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
         threshold = threshold / frame.scale[1]
-        order = quads.canonical_order(masked(points, real), real)
+        order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         search = _Search(
             self.measure, matches.confidence is None, normalized[order], counts[order], number, threshold,
@@ -128,14 +128,14 @@ class _Search(NamedTuple):
     def __call__(self, key: Array) -> tuple[Float[Array, "9"], Int[Array, ""]]:
         """The best model, NaN if there is none, and the number of samples."""
         dtype = self.points.dtype
-        rounds = _ROUNDS * jnp.ceil(self.max_iterations / quads.ROUND).astype(jnp.int32)
+        rounds = _ROUNDS * jnp.ceil(self.max_iterations / planes.ROUND).astype(jnp.int32)
 
         def is_searching(state: _State) -> Array:
             return state.has_samples & (state.samples < self._count_samples(state.inliers)) & (state.round < rounds)
 
         def search_round(state: _State) -> _State:
-            four, num_samples = quads.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
-            models, place = planes.through(four), jnp.arange(quads.ROUND, dtype=jnp.int32)
+            four, num_samples = planes.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
+            models, place = planes.through(four), jnp.arange(planes.ROUND, dtype=jnp.int32)
             quality, inliers, number = self._compare(models)
             quality = jnp.where((place < num_samples) & (number > 3), quality, 0.0)
             # As if samples came one after the other: samples after the one where that search stops do not count.
