@@ -85,9 +85,7 @@ def match_queries(
 ) -> Iterator[tuple[int, QueryMatches]]:
     """Match queries with their candidates: (row, matches) in the order of `todo`, NumPy.
 
-    A thread reads features while the devices work.
-
-    `memory` in GB is for features of the database, see `mfvpr.features.feature_set.memory_budget`.
+    A thread reads features while the devices work. `memory` is `mfvpr.Runtime.memory`.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)

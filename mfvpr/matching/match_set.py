@@ -84,10 +84,9 @@ class MatchSet:
         *,
         total: int | None = None,
     ) -> Matches:
-        """Matches `[P, K, ...]` of pairs, padded with zeros.
+        """Matches `[P, K, ...]` of pairs, padded with zeros to K = `capacity` slots, for `places` in the shortlists.
 
-        `places` are positions of the candidates in their shortlists, and `capacity` is K. There are `total` pairs with
-        padding, which has no matches, and the images of the last pair.
+        There are `total` pairs with padding, which has no matches, and the images of the last pair.
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
@@ -124,8 +123,7 @@ class MatchSet:
 class Scales:
     """Matches of every pair at several scales, such as patch sizes: one match set per scale.
 
-    Functions that score a MatchSet accept Scales, too: each scale is scored by itself, then the scores are fused over
-    the candidates of a query, see `mfvpr.reranking.ranking.fuse_scales`.
+    Functions that score a MatchSet accept Scales, too, and fuse the scores of the scales, see `fuse_scales`.
 
     Attributes:
         match_sets: S match sets of the same queries and candidates.
@@ -161,8 +159,7 @@ def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
     """Slots of the batch of each pair: few sizes to compile, with little padding.
 
-    The largest size is the set's capacity, so that subsets have the same sizes. There are fewer sizes for few settings
-    or a small set, because padding then costs less time than compiling for another size.
+    Few settings or a small set have fewer sizes: padding then costs less time than compiling for another size.
     """
     sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
@@ -171,10 +168,7 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
-    """Pairs per batch, by slots.
-
-    They do not depend on the number of pairs, so that larger sets have scores with the same bits.
-    """
+    """Pairs per batch, by slots, for any number of pairs: larger sets have scores with the same bits."""
     sizes = np.unique(slots(match_set, settings=settings)).tolist()
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 

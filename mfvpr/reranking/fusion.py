@@ -192,10 +192,9 @@ def rank_by_scores(
     candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of queries by name of the final score, in the order of `final_scores`.
+    """Rankings of queries by name of the final score, in the order of `final_scores`; a sequence if correlated.
 
-    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. The queries are a
-    sequence if scores are correlated.
+    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer.
     """
     known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
     for score in final_scores:

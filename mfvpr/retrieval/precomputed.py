@@ -1,7 +1,4 @@
-"""Files of other programs in place of extractors and retrievals.
-
-The cache identifies these files by their content, see `FeatureCache.recipe_of`, not by their path.
-"""
+"""Files of other programs in place of extractors and retrievals; the cache knows them by content, not by path."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -74,11 +71,10 @@ class FeatureFiles:
 
 @dataclass(frozen=True)
 class DescriptorFiles:
-    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors`.
+    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors` for `lengths`.
 
     Attributes:
         files: by the root of the folder of images.
-        lengths: see `mfvpr.io.read_global_descriptors`.
     """
 
     files: Mapping[Path, File]

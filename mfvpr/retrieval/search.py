@@ -35,10 +35,7 @@ class Search(Protocol):
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """Candidates of queries in the database, NumPy.
-
-        Images in `excluded` are no candidates of their queries.
-        """
+        """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
         ...
 
 

@@ -87,11 +87,7 @@ def _count_votes(
     excluded: Positives | None,
     search: ExactSearch,
 ) -> Int[np.ndarray, "queries database"]:
-    """Votes of queries for images.
-
-    The window b that is nearest to a maximizes a . b - |b|^2 / 2, so that the database windows end in -|b|^2 / 2, and
-    the query windows in 1.
-    """
+    """Votes for images. The window b nearest to a maximizes (a, 1) . (b, -|b|^2 / 2), with rows of `windows`."""
     number, per_image, _ = queries.shape
     num_images = len(windows) // per_image
     query_windows = np.concatenate([queries, np.ones((number, per_image, 1), np.float32)], axis=2)

@@ -1,7 +1,6 @@
 """Declarations in the metadata of scorers' fields: units, bounds, choices and notes.
 
-Scorers check their words against these declarations. Programs derive settings from them, with bounds, comments and
-sweep axes. Programs write plain values (numbers, words, lists, None); `Parameter.value` converts them to field values.
+Programs derive settings from them, with bounds, comments and sweep axes, in plain values: numbers, words, lists, None.
 """
 
 import math

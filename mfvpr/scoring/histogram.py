@@ -117,11 +117,7 @@ class HistogramOfShifts:
     def batch_scores_by_weights(
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
     ) -> Float[jax.Array, "candidates weightings"]:
-        """`scores_by_weights` of pairs `[C, K, ...]`.
-
-        On a CPU it scores pair by pair, which stays in the cache, and skips most bins by branch and bound where that
-        pays. The scores are the same; the time depends on the data.
-        """
+        """`scores_by_weights` of pairs `[C, K, ...]`; on a CPU pair by pair, without most bins where that pays."""
         score_all_bins = jax.vmap(self.scores_by_weights)
         if self.temperature is not None:
             return score_all_bins(matches, weights)
@@ -162,13 +158,10 @@ class HistogramOfShifts:
     ) -> Float[jax.Array, "2 2"]:
         """Interval of the dominant shift, (low, high) of (x, y) px.
 
-        The interval holds the central `level` of the mass s_ij^sharpness along each axis. It is wide if other bins are
-        nearly as tall, and never narrower than `level` bins; without votes it is that part of all possible shifts. On
-        three synthetic streets it contains the true shift of the same place in 95 to 100 % of pairs at level 0.95, in
-        90 to 99 % at 0.68; with bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
-
-        Raises:
-            InputError: `level` is not between 0 and 1.
+        The interval holds the central `level`, between 0 and 1, of the mass s_ij^sharpness along each axis. It is wide
+        if other bins are nearly as tall, and never narrower than `level` bins; without votes it is that part of all
+        possible shifts. On three synthetic streets it contains the true shift of the same place in 95 to 100 % of pairs
+        at level 0.95, in 90 to 99 % at 0.68; with bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
         """
         if not 0 < level < 1:
             raise InputError(f"level={level}: expected a number between 0 and 1")
@@ -183,13 +176,10 @@ class HistogramOfShifts:
     def with_capacity(
         self, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
     ) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to the bins that its concrete values need.
+        """This scorer with `max_bins` set to the bins that its concrete values need, rounded up to a `multiple`.
 
-        The number of bins is rounded up to a `multiple`. `bin_size` and the sizes may be batched: the capacity suffices
-        for all of them.
-
-        Raises:
-            InputError: `bin_size` is not above 0, or so small that more than 1024 bins are needed.
+        `bin_size` and the sizes may be batched: the capacity suffices for all of them. If more than 1024 bins are
+        needed, or `bin_size` is not above 0, an `InputError` is raised.
         """
         return replace(self, max_bins=round_up(self._count_bins(image_size0, image_size1, most=MAX_BINS), multiple))
 
@@ -225,10 +215,7 @@ class HistogramOfShifts:
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Histogram of the scale that has the tallest bin: bin scores, bins, whether they are usable, and the scale.
-
-        Scores are `[B, B]` (y, x), -inf beyond the range of shifts.
-        """
+        """Scores `[B, B]` (y, x) of the scale with the tallest bin, -inf out of range; bins; are they usable; scale."""
         lattice, capacity = self._lattice(matches), self._capacity(matches)
         shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
         scores = map_rows(lambda shifts: bin_scores(*votes(shifts, lattice, capacity), weights), shifts)

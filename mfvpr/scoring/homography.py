@@ -166,10 +166,7 @@ class _Search(NamedTuple):
         return _closeness(*planes.miss(model, points, self.threshold))
 
     def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
-        """Quality, sum of the inliers' counts, and number of inliers, of each model.
-
-        Matches are compared `_MATCHES_PER_STEP` at a time: all would leave the cache, one would make too short a step.
-        """
+        """Quality, sum of the inliers' counts, and number of inliers, of each model; few matches fit into the cache."""
         padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
         points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
         counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)

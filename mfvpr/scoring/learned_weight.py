@@ -52,16 +52,9 @@ class LearnedWeight:
     def create(
         cls, key: Array, matches: Matches, hidden: int = 16, *, names: tuple[str, ...] = RELATIVE
     ) -> "LearnedWeight":
-        """Weight that is 1 for every match, with the statistics of real matches.
+        """Weight that is 1 for every match, with `hidden` units and the statistics of the real matches `[..., K]`.
 
-        Args:
-            key: of `jax.random`, for the hidden layer.
-            matches: `[..., K]`; padding may hold anything. Without a real match, inputs are not standardized.
-            hidden: number of hidden units.
-            names: names of the inputs.
-
-        Raises:
-            InputError: a name is unknown.
+        Without a real match, inputs are not standardized.
         """
         if not names or isinstance(names, str) or len({*names}) < len(names):
             raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")

@@ -51,11 +51,10 @@ def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, 
 def draw_samples(
     points: Float[Array, "slots 4"], key: Array, round_number: Array, count: Array
 ) -> tuple[Float[Array, "coordinates=4 matches=4 samples"], Int[Array, ""]]:
-    """Draw samples: (x1, y1, x0, y0) of four matches each, and their number.
+    """Draw samples: (x1, y1, x0, y0) of four of the first `count` matches each, and the number of samples.
 
-    Only so many of the entries are samples. As in OpenCV's findHomography, a draw is rejected if no camera can see
-    it: three of the points lie on a line in one image, or some but not all triangles change their orientation. The
-    first `count` of the points, at least 4, are real matches.
+    As in OpenCV's findHomography, a draw is rejected if no camera can see it: three of the points lie on a line in one
+    image, or some but not all triangles change their orientation.
     """
     index = jax.lax.optimization_barrier(draw_four(key, round_number, count))  # each coordinate would draw again
     number = _running_count(~_is_degenerate(_gather(points, index)))
@@ -117,10 +116,9 @@ def _mix(code: Array) -> Array:
 
 
 class Frame(NamedTuple):
-    """Coordinates in which the points of an image lie within -1 and 1.
+    """Coordinates in which the points of an image lie within -1 and 1, where single precision is enough.
 
-    Single precision is enough in these coordinates. The frame follows from the image sizes, not from the points: one
-    far point would cost the others their digits.
+    The frame follows from the image sizes: one far point would cost the other points their digits.
     """
 
     center: Float[Array, "4"]  # px
@@ -189,10 +187,9 @@ def _shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
 
 
 def miss(model: Array, points: Array, threshold: Array) -> tuple[Array, Array]:
-    """Squared distance of H p1 from p0, and squared threshold, up to a common factor.
+    """Squared distance of H p1 from p0, and squared threshold, times the squared last coordinate of H p1.
 
-    The factor, the square of the last coordinate of H p1, avoids a division. Either models `[9, ...]` and one match
-    `[4]`, or one model and matches `[K, 4]`.
+    Either models `[9, ...]` and one match `[4]`, or one model and matches `[K, 4]`.
     """
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))

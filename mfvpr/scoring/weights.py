@@ -1,7 +1,4 @@
-"""Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot.
-
-Weights of padding are arbitrary; scorers use `match_weights`, where they are 0.
-"""
+"""Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot."""
 
 from dataclasses import replace
 from typing import Protocol

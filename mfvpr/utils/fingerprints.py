@@ -46,13 +46,9 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     but neither the functions that it calls nor attributes that are no fields. Fields with the metadata `recipe` False
     (batch sizes, seconds) change no result and are left out.
 
-    Args:
-        value: dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and objects with a property
-            `recipe`, which gives everything but the name of the class.
-        of_path: path -> JSON values; paths that are keys of mappings stay texts.
-
-    Raises:
-        TypeError: a part is none of these, such as a function. Give its class a property `recipe`.
+    Parts are dataclasses, mappings, lists, arrays, networks, texts, numbers, paths, and objects with a property
+    `recipe`, which gives everything but the name of the class. Other parts, such as functions, raise a `TypeError`.
+    `of_path` gives the JSON values of a path; paths that are keys of mappings stay texts.
     """
     value = value.item() if isinstance(value, np.number) else value
     if value is None or isinstance(value, bool | int | float | str):

@@ -38,10 +38,7 @@ def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: in
     """Fit a whitening to a finite sample, float32 or float64, in double precision; its arrays have the sample's type.
 
     As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
-    each component (the first of several) positive.
-
-    Raises:
-        InputError: the sample has too few vectors or too few dimensions, or all its vectors are equal.
+    each component (the first of several) positive. Too few or equal vectors raise an `InputError`.
     """
     count, size = sample.shape
     if not 1 <= dimension < count or dimension > size:
