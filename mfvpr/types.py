@@ -217,9 +217,7 @@ class Shortlist:
 class Ranking:
     """A re-ranked shortlist.
 
-    Attributes:
-        order: positions into the shortlist, int32, best first.
-        scores: re-ranking scores in the shortlist's order (not sorted).
+    `order` are positions into the shortlist, int32, best first; `scores` stay in the shortlist's order (not sorted).
     """
 
     order: Int[Array, "*queries candidates"]

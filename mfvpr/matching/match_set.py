@@ -29,20 +29,16 @@ Normalize = Literal["zscore", "none"]
 
 @dataclass(frozen=True)
 class QueryMatches:
-    """Candidates of one query, and their real matches one after the other. NumPy.
+    """Candidates of one query, best first, and their n real matches one after the other. NumPy.
 
-    Attributes:
-        matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]` and
-            `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the candidates'.
-        counts: matches of each candidate, int32; their sum is n.
-        indices: database rows, int32, best first, -1 = none.
-        filter_scores: float32.
+    In the matches, `image_size0` `[2]` and `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the
+    candidates'.
     """
 
     matches: Matches
-    counts: Int[np.ndarray, " candidates"]
-    indices: Int[np.ndarray, " candidates"]
-    filter_scores: Float[np.ndarray, " candidates"]
+    counts: Int[np.ndarray, " candidates"]  # matches of each candidate, int32; their sum is n
+    indices: Int[np.ndarray, " candidates"]  # database rows, int32, -1 = none
+    filter_scores: Float[np.ndarray, " candidates"]  # float32
 
 
 @dataclass(frozen=True)

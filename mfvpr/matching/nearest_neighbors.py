@@ -130,7 +130,8 @@ def compact(matches: Matches, capacity: int) -> Matches:
     The cost of all later steps is proportional to K or K^2, so that few slots are faster. Matches beyond the capacity
     are dropped: compare `matches.mask.sum()` with it.
     """
-    entries = ragged.compact(per_match(matches), jnp.asarray(matches.mask), capacity)
+    slots = jnp.nonzero(jnp.asarray(matches.mask), size=capacity, fill_value=0)[0]
+    entries = {name: jnp.asarray(values)[slots] for name, values in ragged.at_least_one_row(per_match(matches)).items()}
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 

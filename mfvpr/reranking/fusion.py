@@ -142,18 +142,11 @@ class Cohort:
 
 @dataclass(frozen=True)
 class FinalScore:
-    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores.
-
-    Attributes:
-        name: of the score and its ranking.
-        scorers: names of those that take part, the main one first; none = retrieval alone.
-        base: name of the final score that this one is made of, by `step`; "" = as retrieval or the scorer gives it.
-        step: how it is made.
-    """
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores."""
 
     name: str
-    scorers: tuple[str, ...] = ()
-    base: str = ""
+    scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
+    base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
     step: Cohort | Fusion | FrameCorrelation | None = None
 
 

@@ -137,17 +137,14 @@ def _on_host(
 @compiled
 def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]) -> Array:
     # The Gaussians of a histogram are the same for all weightings. A subclass may score in another way.
-    if isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__:
-        weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches)
+    is_histogram = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
+    weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches) if is_histogram else None
 
-        def score_setting(setting: dict[str, Array]) -> Array:
-            return with_parameters(scorer, setting).batch_scores_by_weights(matches, weights).T
-
-    else:
-
-        def score_setting(setting: dict[str, Array]) -> Array:
-            varied = with_parameters(scorer, setting)
-            return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
+    def score_setting(setting: dict[str, Array]) -> Array:
+        varied = with_parameters(scorer, setting)
+        if weights is not None:
+            return varied.batch_scores_by_weights(matches, weights).T
+        return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
 
     return _map(score_setting, settings)
 

@@ -42,17 +42,11 @@ class File:
 
 @dataclass(frozen=True)
 class FeatureFiles:
-    """Local features of another program, see `mfvpr.io.open_features`.
+    """Local features of another program, see `mfvpr.io.open_features`."""
 
-    Attributes:
-        files: by the root of the folder of images.
-        lengths: of descriptors, see `mfvpr.io.open_features`.
-        image_size: (width, height) px, if the files do not store it.
-    """
-
-    files: Mapping[Path, File]
-    lengths: Lengths = "unit"
-    image_size: tuple[int, int] | None = None
+    files: Mapping[Path, File]  # by the root of the folder of images
+    lengths: Lengths = "unit"  # of descriptors
+    image_size: tuple[int, int] | None = None  # (width, height) px, if the files do not store it
     interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
     scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
     _images: ImageOfEntry = field(
@@ -71,13 +65,9 @@ class FeatureFiles:
 
 @dataclass(frozen=True)
 class DescriptorFiles:
-    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors` for `lengths`.
+    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors` for `lengths`."""
 
-    Attributes:
-        files: by the root of the folder of images.
-    """
-
-    files: Mapping[Path, File]
+    files: Mapping[Path, File]  # by the root of the folder of images
     lengths: Lengths = "unit"
     search: Search = EXACT
     _images: ImageOfEntry = field(
@@ -103,15 +93,10 @@ class DescriptorFiles:
 
 @dataclass(frozen=True)
 class ShortlistFiles:
-    """Candidates of another program, see `mfvpr.io.read_shortlist`.
+    """Candidates of another program, see `mfvpr.io.read_shortlist`."""
 
-    Attributes:
-        files: by the root of the folder of queries, with the prefix of the queries' names.
-        database_prefix: prefix of the database images' names.
-    """
-
-    files: Mapping[Path, File]
-    database_prefix: str = ""
+    files: Mapping[Path, File]  # by the root of the folder of queries, with the prefix of the queries' names
+    database_prefix: str = ""  # of the database images' names
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache

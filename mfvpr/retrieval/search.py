@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,20 +24,6 @@ Queries = Float[np.ndarray, "queries dimensions"]
 Database = Float[np.ndarray, "database dimensions"]
 
 
-class Search(Protocol):
-    """Interface of a search by global descriptors."""
-
-    def fit(self, database: Database) -> "Search":
-        """Search that has learned from the database's descriptors."""
-        ...
-
-    def shortlist(
-        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
-    ) -> Shortlist:
-        """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
-        ...
-
-
 @dataclass(frozen=True)
 class ExactSearch:
     """Search for the largest dot products in chunks, with the result of `retrieve`.
@@ -57,7 +42,7 @@ class ExactSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """See `Search`; dot products are cosine similarities if descriptors have unit length."""
+        """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
         if queries.shape[1] != database.shape[1]:
             raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
                              f"queries and {database.shape[1]} for the database")  # fmt: skip
@@ -101,7 +86,7 @@ class WhitenedSearch:
 
     dimension: int
     max_samples: int = 4096
-    search: Search = EXACT
+    search: ExactSearch = EXACT
     whitening: Whitening | None = field(default=None, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
@@ -120,11 +105,14 @@ class WhitenedSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """See `Search`; learns from the database first unless it is fitted."""
+        """As `ExactSearch.shortlist`; learns from the database first unless it is fitted."""
         if self.whitening is None:
             return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
         queries, database = _whiten(queries, self.whitening), _whiten(database, self.whitening)
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
+
+
+Search = ExactSearch | WhitenedSearch
 
 
 def _whiten(rows: np.ndarray, whitening: Whitening) -> Float[np.ndarray, "images dimensions"]:

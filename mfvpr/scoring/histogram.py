@@ -1,7 +1,6 @@
 """Histogram of shifts (paper, section III-A): the tallest bin of a Gaussian-voted histogram of points1 - points0.
 
-A match k votes for the bin (i, j) by equation 1 of the paper, and the score is the maximum over all bins. The Gaussian
-is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
+The Gaussian is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
 `(w * votes_y) [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
 """
 
@@ -29,10 +28,7 @@ MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pa
 
 
 class ShiftHistogram(NamedTuple):
-    """Bin scores s_ij, and bin centers in px.
-
-    Bins beyond the range of shifts score -inf; there are some only if the capacity exceeds the bins.
-    """
+    """Bin scores s_ij, -inf beyond the range of shifts, and bin centers in px."""
 
     scores: Float[Array, "bins_y bins_x"]
     centers_x: Float[Array, " bins_x"]
@@ -48,9 +44,7 @@ class HistogramOfShifts:
         s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)),
 
     where (x_k, y_k) is the shift of match k, w_k its weight, and (x_ij, y_ij) the center of the bin. The score does not
-    change with the order of the matches, nor with a translation of all points of one image by a multiple of `bin_size`
-    while the peak stays in range. Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices
-    are static.
+    change if all points of one image move by a multiple of `bin_size` while the peak stays in range.
 
     Attributes:
         bin_size: width of the square bins, px.
@@ -65,9 +59,8 @@ class HistogramOfShifts:
         max_bins: capacity of bins per axis; by default as many as concrete values need, at most 1024. If image sizes
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
-        scales: sizes of the place in the candidate relative to the query. Each scale has its own histogram, and the
-            score is the largest of their tallest bins. Useful for a camera that moves forward, because the correct
-            image then differs in scale. The paper has scale 1 only.
+        scales: sizes of the place in the candidate relative to the query, for a camera that moves forward. Each scale
+            has its own histogram, and the score is the largest of their tallest bins. The paper has scale 1 only.
         scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), because more
             scales give incorrect pairs more chances as well.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum

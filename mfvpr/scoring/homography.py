@@ -1,9 +1,7 @@
 """Homography by RANSAC, SSM-RAN's re-ranking (paper, section IV): how many matches one plane's motion explains.
 
-The paper compares its scores with this geometric model. A homography through four matches maps points of the candidate
-to points of the query; the score is the number of inliers of the best of many homographies. The result is that of
-OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted at once, and samples
-after the one where OpenCV would stop do not count.
+The result is that of OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted
+at once, and samples after the one where OpenCV would stop do not count.
 """
 
 from typing import NamedTuple
@@ -24,12 +22,9 @@ _ROUNDS = 8  # the search ends after so many times the rounds that samples witho
 
 
 class Estimate(NamedTuple):
-    """Result of RANSAC for one pair, after a number of samples.
+    """Result of RANSAC for one pair, after a number of samples."""
 
-    matrix: maps (x, y, 1) of the candidate to the query, px, last entry 1; NaN = no homography.
-    """
-
-    matrix: Float[Array, "3 3"]
+    matrix: Float[Array, "3 3"]  # (x, y, 1) of the candidate -> query, px, last entry 1; NaN = no homography
     inliers: Bool[Array, " slots"]
     score: Float[Array, ""]
     samples: Int[Array, ""]
@@ -40,8 +35,7 @@ class Homography:
     """Number of inliers of the best homography that RANSAC finds.
 
     An inlier is a match with its candidate point mapped to within `threshold` of its query point. The samples of a pair
-    depend on its matches alone: the score is the same in any batch, on any number of devices, and for any order of the
-    matches. Each match counts with its confidence. There is no gradient.
+    depend on its matches alone. Each match counts with its confidence. There is no gradient.
 
     Attributes:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
@@ -104,7 +98,10 @@ class Homography:
                 model, masked(normalized, real), masked(counts, planes.is_inlier(model, normalized, threshold))
             )
         inliers = jnp.where(number == 4, real, planes.is_inlier(model, normalized, threshold))
-        score = jnp.sum(masked(search.inlier_quality(model, normalized), inliers) * counts)
+        quality = jnp.ones_like(counts)
+        if self.measure == "msac":
+            quality = _closeness(*planes.miss(model, normalized, threshold))
+        score = jnp.sum(masked(quality, inliers) * counts)
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         score = score / query_features(matches) if self.per_feature else score
@@ -158,12 +155,6 @@ class _Search(NamedTuple):
         state = _State(start, start, zero, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
         state = jax.lax.while_loop(is_searching, search_round, state)
         return state.model, state.samples
-
-    def inlier_quality(self, model: Float[Array, "9"], points: Float[Array, "slots 4"]) -> Float[Array, " slots"]:
-        """Contribution of each match to the quality of a model, if it is an inlier."""
-        if self.measure == "inliers":
-            return jnp.ones_like(points[:, 0])
-        return _closeness(*planes.miss(model, points, self.threshold))
 
     def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
         """Quality, sum of the inliers' counts, and number of inliers, of each model; few matches fit into the cache."""

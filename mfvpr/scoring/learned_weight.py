@@ -29,23 +29,16 @@ class LearnedWeight:
     does not change them. Exclude them from weight decay with `optax.masked`. A weight with the input `ratio` raises an
     InputError for matches without a ratio.
 
-    Attributes:
-        center: mean of every input.
-        scale: standard deviation of every input.
-        hidden: M.
-        hidden_bias: b.
-        output: v.
-        output_bias: c.
-        names: names of the inputs, out of `INPUTS`. RELATIVE inputs compare a match with the other matches of its
-            pair, so that they carry over to other detectors, cameras and places; ABSOLUTE inputs have their units.
+    `names` are some of `INPUTS`. RELATIVE inputs compare a match with the other matches of its pair, so that they carry
+    over to other detectors, cameras and places; ABSOLUTE inputs have their units.
     """
 
-    center: Float[Array, " inputs"]
-    scale: Float[Array, " inputs"]
-    hidden: Float[Array, "inputs hidden"]
-    hidden_bias: Float[Array, " hidden"]
-    output: Float[Array, " hidden"]
-    output_bias: Float[Array, ""]
+    center: Float[Array, " inputs"]  # mean
+    scale: Float[Array, " inputs"]  # standard deviation
+    hidden: Float[Array, "inputs hidden"]  # M
+    hidden_bias: Float[Array, " hidden"]  # b
+    output: Float[Array, " hidden"]  # v
+    output_bias: Float[Array, ""]  # c
     names: tuple[str, ...] = field(default=RELATIVE, metadata={"static": True})
 
     @classmethod

@@ -40,12 +40,16 @@ def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, 
     share = (bits >> 8).astype(jnp.float32) * 2.0**-24
     remaining = count - jnp.arange(4, dtype=jnp.int32)  # numbers that are not taken yet
     place = jnp.minimum((share * remaining[:, None].astype(jnp.float32)).astype(jnp.int32), remaining[:, None] - 1)
-    taken: list[Array] = []
+    numbers: list[Array] = []
+    taken: list[Array] = []  # the same numbers, ascending
     for number in place:
-        for other in _ascending(taken):
+        for other in taken:
             number = number + (number >= other).astype(jnp.int32)
+        numbers.append(number)
+        for index, other in enumerate(taken):
+            taken[index], number = jnp.minimum(other, number), jnp.maximum(other, number)
         taken.append(number)
-    return jnp.stack(taken)
+    return jnp.stack(numbers)
 
 
 def draw_samples(
@@ -95,17 +99,6 @@ def _running_count(hits: Bool[Array, " samples"]) -> Float[Array, " samples"]:
     within = jnp.matmul(hits.astype(jnp.float32).reshape(-1, _BLOCK), _TRIANGLE)
     before = jnp.cumsum(within[:, -1]) - within[:, -1]
     return (within + before[:, None]).reshape(-1)
-
-
-def _ascending(values: list[Array]) -> list[Array]:
-    """Sort up to three arrays element by element."""
-    if len(values) < 2:
-        return values
-    low, high = jnp.minimum(*values[:2]), jnp.maximum(*values[:2])
-    if len(values) == 2:
-        return [low, high]
-    lowest, highest = jnp.minimum(low, values[2]), jnp.maximum(high, values[2])
-    return [lowest, low + high + values[2] - lowest - highest, highest]
 
 
 def _mix(code: Array) -> Array:

@@ -45,11 +45,7 @@ def keep_compiled_programs() -> None:
 def _folder() -> Path:
     """The folder of programs for this processor and these versions."""
     root = os.path.expanduser(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")
-    packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
-    return Path(root, "compiled", "_".join([*packages, platform.machine(), _processor()]))
-
-
-def _processor() -> str:
-    """A hash of the processor's model and instruction sets; of the machine's name where the system does not say."""
     lines = re.findall(_PROCESSOR, _CPUINFO.read_text(), re.MULTILINE) if _CPUINFO.exists() else []
-    return sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]
+    processor = sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]
+    packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
+    return Path(root, "compiled", "_".join([*packages, platform.machine(), processor]))

@@ -77,12 +77,3 @@ def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np
 def at_least_one_row(tree: Tree) -> Tree:
     """Arrays `[n, ...]`; those with n = 0 become one entry of zeros, which can be indexed. Traced or not."""
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
-
-
-def compact(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tree:
-    """Entries of arrays `[n, ...]` where the mask is set, in their order, in `capacity` slots. Traced or not.
-
-    Entries beyond the capacity are dropped; the values of unused slots are arbitrary.
-    """
-    slots = jnp.nonzero(mask, size=capacity, fill_value=0)[0]
-    return jax.tree.map(lambda leaf: at_least_one_row(jnp.asarray(leaf))[slots], tree)

@@ -17,16 +17,11 @@ _BLOCK = 2**25  # numbers in double precision at a time
 
 @dataclass(frozen=True)
 class Whitening:
-    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`.
-
-    Attributes:
-        components: most variance first; 0 without variance.
-        origin: fingerprint of the vectors' recipe, the only one that may be whitened with it; "" = any vectors.
-    """
+    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`."""
 
     mean: Float[np.ndarray, " dimensions"]
-    components: Float[np.ndarray, "components dimensions"]
-    origin: str = ""
+    components: Float[np.ndarray, "components dimensions"]  # most variance first; 0 without variance
+    origin: str = ""  # fingerprint of the recipe of the only vectors that may be whitened with it; "" = any
 
     @property
     def dimension(self) -> int:
