@@ -158,16 +158,12 @@ def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, 
 
 
 def _check_gradients(name: str, gradients: Callable[[Matches], Any], pair: Matches) -> None:
-    count = int(pair.mask.sum())
     of_numbers, of_entries = gradients(pair)
-    for gradient in of_numbers:
-        if not np.isfinite(gradient).all():
-            raise AssertionError(f"a gradient for a number of {name} is not finite with {count} matches")
-    for entry, gradient in of_entries.items():
+    for entry, gradient in [*((f"a number of {name}", gradient) for gradient in of_numbers), *of_entries.items()]:
         if not np.isfinite(gradient).all():
             raise AssertionError(
-                f"the gradient for {entry} is not finite with {count} matches: mask values before any arithmetic, not "
-                "its result, and use mfvpr.safe_sqrt for lengths"
+                f"the gradient for {entry} is not finite with {pair.mask.sum()} matches: mask values before any "
+                "arithmetic, not its result, and use mfvpr.safe_sqrt for lengths"
             )
 
 

@@ -127,15 +127,8 @@ class Features:
     ) -> "Features":
         """Features of arrays or lists, NumPy's, JAX's, torch's or of any library with DLPack; shapes as above.
 
-        Args:
-            keypoints: (x, y), px.
-            descriptors: the weight 2 - distance expects unit length.
-            scores: None = 1 each.
-            mask: None = all are keypoints.
-            image_size: (width, height), px. None = unknown: a scorer that needs the size raises an `InputError`.
-
-        Raises:
-            InputError: the arrays have different lengths.
+        The weight 2 - distance expects descriptors of unit length. Without `scores` all are 1, without a `mask` all are
+        keypoints; without an image size, a scorer that needs it raises an `InputError`, as do different lengths.
         """
         shape = np.shape(keypoints := as_array(keypoints))[:-1]
         scores = np.ones(shape, np.float32) if scores is None else scores
@@ -153,20 +146,15 @@ class Matches:
     """Putative matches between a query image (0) and a candidate (1).
 
     Attributes:
-        points0: `[..., K, 2]` (x, y) in the query, px.
-        points1: `[..., K, 2]` (x, y) in the candidate, px.
+        points0, points1: `[..., K, 2]` (x, y), px.
         distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] for unit length.
-        scores0: `[..., K]` detection scores in the query.
-        scores1: `[..., K]` detection scores in the candidate.
-        image_size0: `[..., 2]` (width, height) of the query, px; None = unknown.
-        image_size1: `[..., 2]` (width, height) of the candidate, px; None = unknown.
+        scores0, scores1: `[..., K]` detection scores.
+        image_size0, image_size1: `[..., 2]` (width, height), px; None = unknown.
         ratio: `[..., K]` distance to the nearest descriptor of the candidate over the distance to the second nearest,
             in [0, 1]; None unless the matcher was asked for it (`with_ratio=True`).
         confidence: `[..., K]` in [0, 1], how certain a match is; multiplies its weight. None = 1.
-        index0: `[..., K]` int32, number of the match's keypoint in the query; None = unknown.
-        index1: `[..., K]` int32, number of the match's keypoint in the candidate; None = unknown.
-        count0: `[...]` int32, number of keypoints of the query, matched or not; None = unknown.
-        count1: `[...]` int32, number of keypoints of the candidate, matched or not; None = unknown.
+        index0, index1: `[..., K]` int32, number of the match's keypoint in its image; None = unknown.
+        count0, count1: `[...]` int32, number of keypoints of the image, matched or not; None = unknown.
 
     In a `MatchSet`, the slots of one query hold the matches with all C candidates: `image_size1` is `[C, 2]` and
     `count1` `[C]` there.
@@ -229,9 +217,7 @@ class Shortlist:
 class Ranking:
     """A re-ranked shortlist.
 
-    Attributes:
-        order: positions into the shortlist, int32, best first.
-        scores: re-ranking scores in the shortlist's order (not sorted).
+    `order` are positions into the shortlist, int32, best first; `scores` stay in the shortlist's order (not sorted).
     """
 
     order: Int[Array, "*queries candidates"]

@@ -14,14 +14,14 @@ from mfvpr.datasets.streets import draw_streets, streets_folder
 from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
-from mfvpr.scoring import weight_files
-from mfvpr.scoring.weight_files import read_weight
+from mfvpr.scoring import weight_registry
+from mfvpr.scoring.weight_registry import read_weight
 from tests.builders import fill
 from tests.io.other_programs import feature
 
 
 def public_functions():
-    modules = (calibration, datasets, io, truth_files, videos, weight_files)
+    modules = (calibration, datasets, io, truth_files, videos, weight_registry)
     functions = [value for module in modules for name, value in vars(module).items() if not name.startswith("_")]
     return {function for function in (*functions, draw_streets, published_dataset, streets_folder)
             if inspect.isfunction(function) and function.__module__.startswith("mfvpr.")}  # fmt: skip

@@ -17,8 +17,7 @@ from mfvpr.matching.lightglue import LightGlueMatcher
 from mfvpr.matching.match_set import Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher, NearestNeighborMatcher
 from mfvpr.matching.nearest_neighbors import CrossCheck
-from mfvpr.reranking.frame_correlation import FrameCorrelation
-from mfvpr.reranking.fusion import FinalScore, Fusion, final_scores
+from mfvpr.reranking.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval.retriever import Retriever

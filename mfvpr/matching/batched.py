@@ -26,15 +26,11 @@ Calls = list[tuple[Int[np.ndarray, " pairs"], Matches]]  # (positions in the pai
 
 
 class Part(NamedTuple):
-    """Pairs of a batch of queries with candidates that fit on the device at the same time.
+    """Pairs of a batch of queries with candidates that fit on the device at the same time."""
 
-    pairs: row of the query, position of the candidate in its shortlist, row of the database.
-    ends: rows of the queries without further pairs.
-    """
-
-    pairs: Int[np.ndarray, "pairs 3"]
+    pairs: Int[np.ndarray, "pairs 3"]  # row of the query, position of the candidate in its shortlist, database row
     device: Device
-    ends: Int[np.ndarray, " queries"]
+    ends: Int[np.ndarray, " queries"]  # rows of the queries without further pairs
 
 
 class Pair(NamedTuple):
@@ -85,9 +81,7 @@ def match_queries(
 ) -> Iterator[tuple[int, QueryMatches]]:
     """Match queries with their candidates: (row, matches) in the order of `todo`, NumPy.
 
-    A thread reads features while the devices work.
-
-    `memory` in GB is for features of the database, see `mfvpr.features.feature_set.memory_budget`.
+    A thread reads features while the devices work. `memory` is `mfvpr.Runtime.memory`.
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
@@ -141,9 +135,8 @@ def _parts(
 def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tuple[tuple[int, int], Pair]]:
     """((row of the query, place of the candidate), pair) of every pair of a call."""
     real = jax.tree.map(lambda values: np.asarray(values)[: len(positions)], matches)
-    entries = zip(part.pairs[positions].tolist(), split_pairs(real), real.image_size0, real.image_size1, strict=True)
-    for (query, place, _), row, *sizes in entries:
-        yield (query, place), Pair(row, *sizes)
+    places = part.pairs[positions, :2].tolist()
+    return zip(map(tuple, places), map(Pair, split_pairs(real), real.image_size0, real.image_size1), strict=True)
 
 
 def _join_candidates(

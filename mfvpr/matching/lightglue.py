@@ -63,12 +63,9 @@ class LightGlueMatcher:
         return {name: getattr(self, name) for name in ("network", "filter_threshold", "depth_confidence")}
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`.
+        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`: max(N0, 1) slots, slot k is keypoint k of the query.
 
-        There are max(N0, 1) slots; slot k is keypoint k of the query.
-
-        Raises:
-            InputError: the descriptors have another dimension.
+        Descriptors of another dimension raise an `InputError`.
         """
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -29,20 +29,16 @@ Normalize = Literal["zscore", "none"]
 
 @dataclass(frozen=True)
 class QueryMatches:
-    """Candidates of one query, and their real matches one after the other. NumPy.
+    """Candidates of one query, best first, and their n real matches one after the other. NumPy.
 
-    Attributes:
-        matches: Matches `[n, ...]` of all candidates, best candidate first, without padding; `image_size0` `[2]` and
-            `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the candidates'.
-        counts: matches of each candidate, int32; their sum is n.
-        indices: database rows, int32, best first, -1 = none.
-        filter_scores: float32.
+    In the matches, `image_size0` `[2]` and `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the
+    candidates'.
     """
 
     matches: Matches
-    counts: Int[np.ndarray, " candidates"]
-    indices: Int[np.ndarray, " candidates"]
-    filter_scores: Float[np.ndarray, " candidates"]
+    counts: Int[np.ndarray, " candidates"]  # matches of each candidate, int32; their sum is n
+    indices: Int[np.ndarray, " candidates"]  # database rows, int32, -1 = none
+    filter_scores: Float[np.ndarray, " candidates"]  # float32
 
 
 @dataclass(frozen=True)
@@ -84,10 +80,9 @@ class MatchSet:
         *,
         total: int | None = None,
     ) -> Matches:
-        """Matches `[P, K, ...]` of pairs, padded with zeros.
+        """Matches `[P, K, ...]` of pairs, padded with zeros to K = `capacity` slots, for `places` in the shortlists.
 
-        `places` are positions of the candidates in their shortlists, and `capacity` is K. There are `total` pairs with
-        padding, which has no matches, and the images of the last pair.
+        There are `total` pairs with padding, which has no matches, and the images of the last pair.
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
@@ -124,8 +119,7 @@ class MatchSet:
 class Scales:
     """Matches of every pair at several scales, such as patch sizes: one match set per scale.
 
-    Functions that score a MatchSet accept Scales, too: each scale is scored by itself, then the scores are fused over
-    the candidates of a query, see `mfvpr.reranking.ranking.fuse_scales`.
+    Functions that score a MatchSet accept Scales, too, and fuse the scores of the scales, see `fuse_scales`.
 
     Attributes:
         match_sets: S match sets of the same queries and candidates.
@@ -158,24 +152,10 @@ def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
     return match_set.match_sets if isinstance(match_set, Scales) else [match_set]
 
 
-class Batch(NamedTuple):
-    """Pairs with similar numbers of matches, which are scored in one call.
-
-    places: positions of the pairs in the flattened `[queries, candidates]`.
-    slots: per pair, at least its matches.
-    pairs: number of pairs with padding, at least n; padding has no matches.
-    """
-
-    places: Int[np.ndarray, " pairs"]
-    slots: int
-    pairs: int
-
-
 def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
     """Slots of the batch of each pair: few sizes to compile, with little padding.
 
-    The largest size is the set's capacity, so that subsets have the same sizes. There are fewer sizes for few settings
-    or a small set, because padding then costs less time than compiling for another size.
+    Few settings or a small set have fewer sizes: padding then costs less time than compiling for another size.
     """
     sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
@@ -184,23 +164,25 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
-    """Pairs per batch, by slots.
-
-    They do not depend on the number of pairs, so that larger sets have scores with the same bits.
-    """
+    """Pairs per batch, by slots, for any number of pairs: larger sets have scores with the same bits."""
     sizes = np.unique(slots(match_set, settings=settings)).tolist()
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 
 
-def partition(match_set: MatchSet, queries: range, *, settings: float = math.inf) -> list[Batch]:
-    """Batches of all pairs of some queries that have matches; the first of each shape comes first."""
+def partition(
+    match_set: MatchSet, queries: range, *, settings: float = math.inf
+) -> list[tuple[Int[np.ndarray, " _"], int, int]]:
+    """Batches of all pairs of some queries that have matches; the first of each shape comes first.
+
+    A batch has positions of pairs in the flattened `[queries, candidates]`, slots of a pair, and pairs with padding.
+    """
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)
     sizes = slots(match_set, settings=settings)[part].reshape(-1)
     by_shape = []
     for size, pairs in shapes(match_set, settings=settings).items():
         places = np.flatnonzero((sizes == size) & (counts > 0))
-        by_shape.append([Batch(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
+        by_shape.append([(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
     interleaved = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
     return [batch for batch in interleaved if batch is not None]
 

@@ -34,13 +34,9 @@ class Matcher(Protocol):
 
 @value
 class NearestNeighborMatcher:
-    """Nearest neighbors with their ratio, see `mfvpr.match` and `mfvpr.filter_matches`.
+    """Nearest neighbors with their ratio; settings as in `mfvpr.match` and `mfvpr.filter_matches`.
 
-    Attributes:
-        cross_check: see `match`.
-        max_distance: see `filter_matches`.
-        max_matches: see `filter_matches`.
-        chunk_size: see `match_candidates`; changes only memory and the last bits.
+    `chunk_size` is that of `match_candidates`; it changes only memory and the last bits.
     """
 
     recipe_name: ClassVar[str] = "Matching"  # in stored recipes
@@ -66,22 +62,17 @@ def match_pairs(
     count: int | Int[Array, ""],
     matcher: Matcher = NEIGHBORS,
 ) -> Matches:
-    """Match the first `count` pairs of images.
-
-    Another count needs no new program, and unused pairs cost no time.
+    """Match the first `count` pairs of images; another count needs no new program, and unused pairs cost no time.
 
     Args:
         queries: keypoints `[B, N0, 2]`.
         candidates: keypoints `[S, N1, 2]`.
-        pairs: int32 rows of queries and candidates.
+        pairs: int32 rows of queries and candidates, `[P, 2]`; an `InputError` if there are no such images.
         count: number of pairs to match.
         matcher: of one pair.
 
     Returns:
         Matches with leading axis P and the slots of the matcher; pairs beyond `count` have no matches.
-
-    Raises:
-        InputError: there are no pairs, or no images in these rows.
     """
     pairs = as_array(pairs)
     _require_rows(pairs, queries, candidates)

@@ -1,7 +1,6 @@
 """Features of two images -> Matches: nearest neighbors, and filters of the matches.
 
-The similarity matrix dominates the cost. It is computed once per pair, read once along its rows and once along its
-columns while it is in cache (see `similarity`), and never stored for more than one chunk of candidates.
+The similarity matrix dominates the cost. It is computed once per pair, and read twice while it is in the cache.
 """
 
 from dataclasses import fields, replace
@@ -66,18 +65,11 @@ def match_candidates(
     with_ratio: bool = False,
     chunk_size: int | None = None,
 ) -> Matches:
-    """`match` of one query with C candidates.
+    """`match` of one query, keypoints `[N0, 2]`, with C candidates, keypoints `[C, N1, 2]`.
 
-    Args:
-        query: keypoints `[N0, 2]`.
-        candidates: keypoints `[C, N1, 2]`.
-        cross_check: see `match`.
-        with_ratio: see `match`.
-        chunk_size: number of candidates with similarity matrices in memory at the same time; by default one on a CPU,
-            where the matrix stays in the cache, and as many as fit a small part of an accelerator's memory.
-
-    Returns:
-        Matches with leading axis C and the slots of `match`.
+    `chunk_size` is the number of candidates with similarity matrices in memory at the same time; by default one on a
+    CPU, where the matrix stays in the cache, and as many as fit a small part of an accelerator's memory. The matches
+    have a leading axis C and the slots of `match`.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
@@ -138,15 +130,13 @@ def compact(matches: Matches, capacity: int) -> Matches:
     The cost of all later steps is proportional to K or K^2, so that few slots are faster. Matches beyond the capacity
     are dropped: compare `matches.mask.sum()` with it.
     """
-    entries = ragged.compact(per_match(matches), jnp.asarray(matches.mask), capacity)
+    slots = jnp.nonzero(jnp.asarray(matches.mask), size=capacity, fill_value=0)[0]
+    entries = {name: jnp.asarray(values)[slots] for name, values in ragged.at_least_one_row(per_match(matches)).items()}
     return replace(matches, mask=jnp.arange(capacity) < jnp.sum(matches.mask), **entries)
 
 
 def ready(features: Features) -> Features:
-    """Features on the device, in at least single precision.
-
-    In half precision, products would decide near-ties in another way, and sums of points would overflow.
-    """
+    """Features on the device, in at least single precision: half precision decides near-ties in another way."""
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
     return replace(features, **wide, mask=jnp.asarray(features.mask), image_size=single_size(features.image_size))
 
@@ -206,10 +196,7 @@ def at_least_one(features: Features) -> Features:
 
 
 def _pad_to_blocks(features: Features) -> Features:
-    """Pad the slots to a multiple of the blocks in which similarities are searched.
-
-    A few padded rows are cheap; padding the matrix itself takes several times as long as all of the matching.
-    """
+    """Pad the slots to whole blocks of `similarity`, which is much faster than to pad the matrix."""
     size = features.mask.shape[-1]
     missing = even_size(size) - size
     if not missing:

@@ -1,7 +1,7 @@
 """Scores of all candidates of a query, their fusion, and the ranking.
 
 Read first: ranking (score, fuse, rank), grids (whole grids of parameters), fusion (several scores as one),
-batched_scoring (many queries), frame_correlation, cohort_normalization, results.
+batched_scoring (many queries), cohort_normalization, results.
 
 Imports datasets, matching, scoring, types, utils.
 """

@@ -13,8 +13,7 @@ __all__ = [
     "score_grid",
 ]
 
-from .frame_correlation import FrameCorrelation
-from .fusion import FinalScore, Fusion
+from .fusion import FinalScore, FrameCorrelation, Fusion
 from .grids import score_grid
 from .ranking import balancing_c, combine, fuse_scales, rank, rerank, score_candidates
 from .results import Matched, Ranked

@@ -27,13 +27,11 @@ def score(
     scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
     runtime: Runtime = DEFAULT_RUNTIME,
 ) -> dict[str, Scores]:  # fmt: skip
-    """Scores, float32, by name of the scorer; NaN without a candidate.
+    """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values
-    (histograms: up to the next multiple of 8 bins). A pair without matches scores 0.
-
-    Several scales are scored one by one and fused. The devices of `runtime` share the batches, without effect on the
-    bits of the scores.
+    (histograms: up to the next multiple of 8 bins). Several scales are scored one by one and fused. The devices of
+    `runtime` share the batches, without effect on the bits of the scores.
     """
     if not scorers:
         return {}
@@ -71,10 +69,9 @@ def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float
 def run_batches(
     program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
 ) -> Iterator[tuple[np.ndarray, Any]]:
-    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy.
+    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy; devices take turns.
 
-    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`. Devices take turns; only a few
-    batches are in memory at the same time.
+    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`.
     """
     to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
     device_inputs = [put(inputs) for put in to_device]

@@ -1,6 +1,4 @@
-"""Score normalization with a cohort: lower the scores of hubs.
-
-Hubs are database images that score high with any query.
+"""Score normalization with a cohort: lower the scores of hubs, database images that score high with any query.
 
     sequence = cohort_sequence(FeatureCache().recipes.contents(dataset.database), 5)
     cohort = match_sequence(dataset, sequence, system.pipeline)
@@ -23,13 +21,11 @@ from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
-# Number of average scores that are added to the scores of each image. On synthetic streets the variance of an image's
-# scores is about ten times the variance of the images' means.
-PRIOR = 10
+PRIOR = 10  # average scores: on synthetic streets an image's scores vary ten times as much as the images' means
 
 
 def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
-    """The database images, in the order of the drive, as queries; database images of the same place are excluded.
+    """The database images, in the order of the drive, as queries without candidates of the same place.
 
     The `neighbors` on both sides of an image show the same place, and images of equal content do, too.
     """
@@ -47,13 +43,11 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
 def hubness(
     candidates: Shortlist, scores: Scores, num_database: int, *, name: str = "a scorer"
 ) -> Float[np.ndarray, " database"]:
-    """Hubness of each database image, float64 above 0.
+    """Hubness of each database image, float64 above 0, from candidates and scores of the cohort's images.
 
     The hubness is the mean score of the image with other places, over the mean of all scores. `PRIOR` average scores
-    are added to the scores of each image. The hubness is 1 for an image without scores, and if all scores are 0.
-
-    `candidates` and their `scores` are those of the cohort's images. Scores that are not finite are ignored; a score
-    below 0 of the scorer `name` raises an `InputError`.
+    are added to the scores of each image. The hubness is 1 for an image without scores, and if all scores are 0. Scores
+    that are not finite are ignored; a score below 0 of the scorer `name` raises an `InputError`.
     """
     known = np.asarray(candidates.mask) & np.isfinite(scores)
     rows, values = np.asarray(candidates.indices)[known], np.asarray(scores, np.float64)[known]

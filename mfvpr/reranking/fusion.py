@@ -1,5 +1,6 @@
 """Final scores of a system, which candidates are ranked by: of retrieval, of each scorer, and combined ones."""
 
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -8,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.reranking.cohort_normalization import by_hubness
-from mfvpr.reranking.frame_correlation import FrameCorrelation
 from mfvpr.reranking.ranking import (
     RetrievalScore,
     Scores,
@@ -83,6 +83,57 @@ class Fusion:
 
 
 @dataclass(frozen=True)
+class FrameCorrelation:
+    """Increase the scores of candidates near the places of the previous queries (Camara & Preucil, RAS 2020).
+
+    The place of a query is its best candidate. A candidate d database rows from the place of a previous query gains
+    strength * gain * (1 - d / reach) of its score; the largest gain over the previous queries counts. The strength is
+    the score of that place over the best score of the previous places, and 1 if `previous` is 1 or all scores are 0.
+    Queries and database images must be in the order of the drive.
+
+    The public code differs in two details: it rounds the scores of places to two digits, and it assigns row 0 to a
+    query without a score above 0, which has no place here.
+
+    Attributes:
+        previous: number of previous queries, from 1; the first `previous` queries keep their scores.
+        reach: database rows.
+        gain: largest relative increase of a score.
+    """
+
+    previous: int = 2
+    reach: float = 15.0
+    gain: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
+            raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
+                             "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
+
+    def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
+        """Correlated scores of a sequence, float32.
+
+        Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
+        """
+        mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
+        before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
+        for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
+            positive = usable & (row_scores > 0)
+            if len(before) == self.previous:
+                row_scores[positive] *= 1 + self._gains(rows[positive], np.array(before))
+            best = row_scores.max(where=positive, initial=0)
+            before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
+        return correlated.astype(np.float32)
+
+    def _gains(self, rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
+        """Largest relative gains of rows; `before` are places and scores."""
+        places, scores = before.T
+        best = scores.max()
+        strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
+        nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
+        return self.gain * np.max(strength * nearness, axis=1, initial=0)
+
+
+@dataclass(frozen=True)
 class Cohort:
     """Normalization of a score with a cohort; `cohort` is that of `mfvpr.System`."""
 
@@ -91,18 +142,11 @@ class Cohort:
 
 @dataclass(frozen=True)
 class FinalScore:
-    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores.
-
-    Attributes:
-        name: of the score and its ranking.
-        scorers: names of those that take part, the main one first; none = retrieval alone.
-        base: name of the final score that this one is made of, by `step`; "" = as retrieval or the scorer gives it.
-        step: how it is made.
-    """
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores."""
 
     name: str
-    scorers: tuple[str, ...] = ()
-    base: str = ""
+    scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
+    base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
     step: Cohort | Fusion | FrameCorrelation | None = None
 
 
@@ -141,10 +185,9 @@ def rank_by_scores(
     candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of queries by name of the final score, in the order of `final_scores`.
+    """Rankings of queries by name of the final score, in the order of `final_scores`; a sequence if correlated.
 
-    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. The queries are a
-    sequence if scores are correlated.
+    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer.
     """
     known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
     for score in final_scores:

@@ -34,20 +34,15 @@ WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a matc
 
 
 def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Float[jax.Array, "*grid candidates"]:
-    """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`.
+    """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`, from matches `[C, K, ...]`.
 
     Each capacity of bins is one traced computation, so that fine bins do not slow coarse bins down. Other values within
-    the same capacities cost no compilation, other lengths do. With a plain function, every call compiles.
+    the same capacities cost no compilation, other lengths do. With a plain function, every call compiles. An axis that
+    is empty, not one-dimensional, or names no numeric parameter of the scorer raises a `ValueError`.
 
-    Args:
-        scorer: its other parameters stay.
-        matches: `[C, K, ...]`.
-        **axes: values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of numbers of its parts,
-            `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of `weight`,
-            e.g. `weight=["ratio", UnitWeight(), ...]`.
-
-    Raises:
-        ValueError: an axis is empty, not one-dimensional, or names no numeric parameter of the scorer.
+    The axes are values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of numbers of its parts,
+    `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of `weight`, e.g.
+    `weight=["ratio", UnitWeight(), ...]`.
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
@@ -96,11 +91,7 @@ def by_capacity(
     image_size0: Num[Array, "*pairs0 2"],
     image_size1: Num[Array, "*pairs1 2"],
 ) -> list[tuple[Any, Int[np.ndarray, " _"]]]:
-    """Group settings by the capacity of bins that they need: (scorer, rows of settings).
-
-    There is one group if the scorer needs no capacity or has one, or if settings are traced. Capacities are multiples
-    of 8 bins, which keeps programs few and padding small.
-    """
+    """Group settings by the capacity of bins that they need: (scorer, rows of settings); one group if traced."""
     if not is_concrete(settings):
         first = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
         return [(with_capacity(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
@@ -119,16 +110,11 @@ def score_settings(
     settings: Mapping[str, Num[Array, " settings"]],
     weightings: Mapping[str, Num[Array, " weightings"]],
 ) -> Num[Array, "_ _ ..."]:
-    """Scores `[G, W, C]` of candidates for every combination of G settings and W weightings.
+    """Scores `[G, W, C]` of matches `[C, K, ...]` for every combination of G settings and W weightings.
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
     so that other values cost no compilation. A histogram needs a capacity that suffices for every `bin_size`.
-
-    Args:
-        scorer: its other parameters stay.
-        matches: `[C, K, ...]`.
-        settings: G values of the scorer's numeric parameters; none: G = 1.
-        weightings: W values of `max_distance` and of `weight`, the index of the scorer's `ChosenWeight`; none: W = 1.
+    Weightings are values of `max_distance` and of `weight`, the index of the scorer's `ChosenWeight`. None: G or W = 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
     require_real("scorer", scores)
@@ -138,8 +124,6 @@ def score_settings(
 def _on_host(
     scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> np.ndarray:
-    """`score_settings` by a scorer that runs outside of JAX."""
-
     def rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
         columns = [np.asarray(axis) for axis in values.values()]
         return [dict(zip(values, row, strict=True)) for row in zip(*columns, strict=True)] if columns else [{}]
@@ -153,17 +137,14 @@ def _on_host(
 @compiled
 def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]) -> Array:
     # The Gaussians of a histogram are the same for all weightings. A subclass may score in another way.
-    if isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__:
-        weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches)
+    is_histogram = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
+    weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches) if is_histogram else None
 
-        def score_setting(setting: dict[str, Array]) -> Array:
-            return with_parameters(scorer, setting).batch_scores_by_weights(matches, weights).T
-
-    else:
-
-        def score_setting(setting: dict[str, Array]) -> Array:
-            varied = with_parameters(scorer, setting)
-            return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
+    def score_setting(setting: dict[str, Array]) -> Array:
+        varied = with_parameters(scorer, setting)
+        if weights is not None:
+            return varied.batch_scores_by_weights(matches, weights).T
+        return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
 
     return _map(score_setting, settings)
 
@@ -204,10 +185,9 @@ def _map(function: Callable[[dict[str, Array]], Array], values: Mapping[str, Arr
 
 
 def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
-    """`function` of matches `[C, K, ...]`, split over the cores.
+    """`function` of matches `[C, K, ...]`, with candidates as the last axis of its results, split over the cores.
 
-    Candidates are the last axis of its results. There is a single call for few candidates, on accelerators, and with
-    settings of JAX that threads do not inherit.
+    There is a single call for few candidates, on accelerators, and with settings of JAX that threads do not inherit.
     """
     cores, count = available_cpus(), len(matches.mask)
     if cores == 1 or count < 4 * cores or device_of(matches).platform != "cpu" or not knows_own_context():

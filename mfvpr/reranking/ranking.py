@@ -1,7 +1,4 @@
-"""Scores of the candidates of one query, fusion with the retrieval scores, and the ranking.
-
-Scorers score one pair; this module maps them over candidates. See `mfvpr.reranking.grids` for grids of parameters.
-"""
+"""Scores of the candidates of one query, fusion with the retrieval scores, and the ranking."""
 
 from functools import partial
 from typing import Literal
@@ -77,12 +74,9 @@ def combine(
     *,
     c: float | Array = 1e6,
 ) -> Num[Array, "*batch candidates"]:
-    """Combined score s = c s_f + s_r, equation 4 (paper, section IV-E).
+    """Combined score s = c s_f + s_r of retrieval and re-ranking scores, equation 4 (paper, section IV-E).
 
-    Args:
-        filter_scores: s_f, retrieval scores (the paper's filter).
-        rerank_scores: s_r, re-ranking scores.
-        c: in units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
+    c has units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
     filter_scores, rerank_scores = map(_wide, (filter_scores, rerank_scores))
     return c * filter_scores + rerank_scores
@@ -99,10 +93,7 @@ def balancing_c(
     rerank_scores: Num[Array, " candidates"],
     mask: Bool[Array, " candidates"],
 ) -> Float[jax.Array, ""]:
-    """The c with which both scores of one query's candidates have the same standard deviation.
-
-    The paper sets c by hand; this value adapts to detectors with scores in other units.
-    """
+    """The c with which both scores of one query's candidates have the same standard deviation, in any unit."""
 
     def deviation(scores: Array) -> Array:
         return masked_std(_wide(scores), mask & jnp.isfinite(scores))
@@ -153,17 +144,12 @@ def fuse_scales(
     *,
     normalize: Literal["zscore", "none"] = "zscore",
 ) -> Float[jax.Array, "*batch candidates"]:
-    """Weighted sum of the scores of S scales or scorers; NaN without a candidate.
+    """Weighted sum of the scores of S scales or scorers; NaN without a candidate. None as `weights` is 1 each.
 
-    Patch-NetVLAD fuses patch sizes in this way.
-
-    Args:
-        scores: of a query's candidates.
-        mask: leading axes may be missing.
-        weights: of the scales; None = 1 each.
-        normalize: "zscore" first gives each scale mean 0 and standard deviation 1 over the query's candidates, or 0 if
-            all scores are equal. A score that is not finite is left out of mean and deviation, and affects only the sum
-            of its own candidate. "none" leaves the scores as they are, for pairs without other candidates.
+    Patch-NetVLAD fuses patch sizes in this way. "zscore" first gives each scale mean 0 and standard deviation 1 over
+    the query's candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation,
+    and affects only the sum of its own candidate. "none" leaves the scores as they are, for pairs without other
+    candidates.
     """
     return or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
 
@@ -204,10 +190,7 @@ def breaks_ties_by_row(ties: Ties) -> bool:
 def rank_shortlist(
     candidates: Shortlist, scores: Scores, *, ties: Ties = "retrieval"
 ) -> Int[np.ndarray, "queries candidates"]:
-    """Positions into the shortlist, best first, missing candidates last.
-
-    Equal scores keep the order of the retrieval, or are ordered by database index.
-    """
+    """Positions into the shortlist, best first, missing candidates last; ties by retrieval or by database index."""
     tie_break = candidates.indices if breaks_ties_by_row(ties) else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 

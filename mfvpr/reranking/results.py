@@ -18,20 +18,14 @@ COHORT = "cohort"  # in names of rankings by scores that are normalized with a c
 
 @dataclass(frozen=True, repr=False)
 class Matched:
-    """Candidates of the Q queries of a sequence, and their matches.
-
-    Attributes:
-        matches: of each scale.
-        bad_queries, bad_database: row -> reason, of images that could not be used.
-        weights: of the scales; None = 1 each.
-    """
+    """Candidates of the Q queries of a sequence, and their matches."""
 
     sequence: QuerySequence
     candidates: Shortlist
-    matches: tuple[MatchSet, ...]
-    bad_queries: Mapping[int, str]
+    matches: tuple[MatchSet, ...]  # of each scale
+    bad_queries: Mapping[int, str]  # row -> reason, of images that could not be used
     bad_database: Mapping[int, str]
-    weights: tuple[float, ...] | None = None
+    weights: tuple[float, ...] | None = None  # of the scales; None = 1 each
 
     def __repr__(self) -> str:
         return f"Matched({self.sequence!r}, {self.candidates.indices.shape[1]} candidates each)"
@@ -44,15 +38,10 @@ class Matched:
 
 @dataclass(frozen=True, repr=False)
 class Ranked:
-    """Ranking of the candidates of a sequence.
+    """Ranking of the candidates of a sequence."""
 
-    Attributes:
-        rows: `[Q, C]` database rows, best first; -1 = none.
-        scores: `[Q, C]` in this order.
-    """
-
-    rows: Int[np.ndarray, "queries candidates"]
-    scores: Scores
+    rows: Int[np.ndarray, "queries candidates"]  # of the database, best first; -1 = none
+    scores: Scores  # in this order
 
     def __repr__(self) -> str:
         return "Ranked({} queries, {} candidates each)".format(*self.rows.shape)

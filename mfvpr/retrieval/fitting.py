@@ -1,9 +1,4 @@
-"""Learn the parts of extractors and retrievals that depend on the database, and store them.
-
-    cells = fit_to_database(SsmCells(model), database, cache)
-
-`mfvpr.evaluate` does this for its extractor and its retrieval.
-"""
+"""Learn the parts of extractors and retrievals that depend on the database, and store them."""
 
 import json
 from collections.abc import Iterator
@@ -31,14 +26,12 @@ Tool = TypeVar("Tool")
 def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> Tool:
     """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
 
+        cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
+
     If the cache has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
-    and of all settings; this hash is part of the recipe of everything that is computed with it.
-
-    Parts that are learned already stay the same, even if they were learned from another database. If there is nothing
-    to learn, the tool itself is returned.
-
-    Raises:
-        InputError: images cannot be read, are too few or too many, or a stored file is damaged or of another kind.
+    and of all settings; this hash is part of the recipe of everything that is computed with it. Parts that are learned
+    already stay the same, even if they were learned from another database. Images that cannot be read, are too few or
+    too many, and a stored file that is damaged or of another kind raise an `InputError`.
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
         fitting = tool.whitening

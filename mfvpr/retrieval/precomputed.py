@@ -1,14 +1,12 @@
-"""Files of other programs in place of extractors and retrievals.
-
-The cache identifies these files by their content, see `FeatureCache.recipe_of`, not by their path.
-"""
+"""Files of other programs in place of extractors and retrievals; the cache knows them by content, not by path."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.images import Interpolation
@@ -44,17 +42,11 @@ class File:
 
 @dataclass(frozen=True)
 class FeatureFiles:
-    """Local features of another program, see `mfvpr.io.open_features`.
+    """Local features of another program, see `mfvpr.io.open_features`."""
 
-    Attributes:
-        files: by the root of the folder of images.
-        lengths: of descriptors, see `mfvpr.io.open_features`.
-        image_size: (width, height) px, if the files do not store it.
-    """
-
-    files: Mapping[Path, File]
-    lengths: Lengths = "unit"
-    image_size: tuple[int, int] | None = None
+    files: Mapping[Path, File]  # by the root of the folder of images
+    lengths: Lengths = "unit"  # of descriptors
+    image_size: tuple[int, int] | None = None  # (width, height) px, if the files do not store it
     interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
     scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
     _images: ImageOfEntry = field(
@@ -73,14 +65,9 @@ class FeatureFiles:
 
 @dataclass(frozen=True)
 class DescriptorFiles:
-    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors`.
+    """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors` for `lengths`."""
 
-    Attributes:
-        files: by the root of the folder of images.
-        lengths: see `mfvpr.io.read_global_descriptors`.
-    """
-
-    files: Mapping[Path, File]
+    files: Mapping[Path, File]  # by the root of the folder of images
     lengths: Lengths = "unit"
     search: Search = EXACT
     _images: ImageOfEntry = field(
@@ -106,15 +93,10 @@ class DescriptorFiles:
 
 @dataclass(frozen=True)
 class ShortlistFiles:
-    """Candidates of another program, see `mfvpr.io.read_shortlist`.
+    """Candidates of another program, see `mfvpr.io.read_shortlist`."""
 
-    Attributes:
-        files: by the root of the folder of queries, with the prefix of the queries' names.
-        database_prefix: prefix of the database images' names.
-    """
-
-    files: Mapping[Path, File]
-    database_prefix: str = ""
+    files: Mapping[Path, File]  # by the root of the folder of queries, with the prefix of the queries' names
+    database_prefix: str = ""  # of the database images' names
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
@@ -127,7 +109,7 @@ class ShortlistFiles:
         require_one_image(file.path, database.paths, database_entries, images)
         require_one_image(file.path, sequence.images.paths, query_entries, images)
         if sequence.excluded is not None:
-            shortlist = _without(shortlist, sequence.excluded.contains(shortlist.indices))
+            shortlist = replace(shortlist, mask=shortlist.mask & ~sequence.excluded.contains(shortlist.indices))
         return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
 
 
@@ -140,21 +122,10 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     return files[folder.root]
 
 
-def _without(shortlist: Shortlist, excluded: Bool[np.ndarray, "queries candidates"]) -> Shortlist:
-    """Shortlist without the `excluded` candidates; the next candidates move up."""
-    mask = shortlist.mask & ~excluded
-    order = np.argsort(~mask, axis=1, kind="stable")
-    mask, indices, scores = (
-        np.take_along_axis(values, order, axis=1) for values in (mask, shortlist.indices, shortlist.scores)
-    )
-    return Shortlist(np.where(mask, indices, -1), np.where(mask, scores, 0), mask)
-
-
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
-    """Shortlist of `num_candidates`, cut or padded."""
+    """Shortlist of `num_candidates`, cut or padded; candidates beyond a masked one move up."""
     missing = max(0, num_candidates - shortlist.mask.shape[1])
-
-    def cut(values: np.ndarray, fill: float) -> np.ndarray:
-        return np.pad(values[:, :num_candidates], ((0, 0), (0, missing)), constant_values=fill)
-
-    return Shortlist(cut(shortlist.indices, -1), cut(shortlist.scores, 0), cut(shortlist.mask, False))
+    padded = jax.tree.map(lambda values: np.pad(values, ((0, 0), (0, missing))), shortlist)
+    order = np.argsort(~padded.mask, axis=1, kind="stable")[:, :num_candidates]
+    cut = jax.tree.map(lambda values: np.take_along_axis(values, order, axis=1), padded)
+    return Shortlist(np.where(cut.mask, cut.indices, -1), np.where(cut.mask, cut.scores, 0), cut.mask)

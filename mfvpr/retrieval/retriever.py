@@ -22,10 +22,7 @@ class RetrievalResult(NamedTuple):
 
 
 class Retriever(Protocol):
-    """Interface of a retrieval.
-
-    A cache of matches needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`: a frozen dataclass has one.
-    """
+    """Interface of a retrieval, a frozen dataclass or an object with a recipe, see `mfvpr.utils.recipe_of`."""
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache

@@ -1,9 +1,8 @@
 """Search by global descriptors -> Shortlist: exact, in chunks, optionally after whitening."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,23 +24,6 @@ Queries = Float[np.ndarray, "queries dimensions"]
 Database = Float[np.ndarray, "database dimensions"]
 
 
-class Search(Protocol):
-    """Interface of a search by global descriptors."""
-
-    def fit(self, database: Database) -> "Search":
-        """Search that has learned from the database's descriptors."""
-        ...
-
-    def shortlist(
-        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
-    ) -> Shortlist:
-        """Candidates of queries in the database, NumPy.
-
-        Images in `excluded` are no candidates of their queries.
-        """
-        ...
-
-
 @dataclass(frozen=True)
 class ExactSearch:
     """Search for the largest dot products in chunks, with the result of `retrieve`.
@@ -60,7 +42,7 @@ class ExactSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """See `Search`; dot products are cosine similarities if descriptors have unit length."""
+        """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
         if queries.shape[1] != database.shape[1]:
             raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
                              f"queries and {database.shape[1]} for the database")  # fmt: skip
@@ -90,66 +72,56 @@ EXACT = ExactSearch()
 
 @dataclass(frozen=True)
 class WhitenedSearch:
-    """Search by whitened descriptors.
+    """Search by whitened descriptors: principal components with unit variance, scaled to unit length.
 
-    These are principal components with unit variance, scaled to unit length. See Jegou & Chum, ECCV 2012. The
-    components are those of the database: queries lose directions in which the database does not vary.
+    See Jegou & Chum, ECCV 2012. The components are those of the database: queries lose directions in which the database
+    does not vary.
 
     Attributes:
         dimension: D', number of components.
         max_samples: maximum number of descriptors to learn from, evenly spread over the database.
         search: search among the whitened descriptors.
+        whitening: of the database, by `fit`.
     """
 
     dimension: int
     max_samples: int = 4096
-    search: Search = EXACT
+    search: ExactSearch = EXACT
+    whitening: Whitening | None = field(default=None, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
         if self.dimension < 1:
             raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
-    def fit(self, database: Database) -> Search:
+    def fit(self, database: Database) -> "WhitenedSearch":
         """Search with the principal components of a database."""
         usable = database[np.isfinite(database).all(axis=1)]
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
         sample = usable[rows].astype(np.float64)
         fitted = fit_whitening(sample, self.dimension)
         single = Whitening(fitted.mean.astype(np.float32), fitted.components.astype(np.float32))
-        return Whitened(single, self.search)
+        return replace(self, whitening=single)
 
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """See `Search`; learns from the database first."""
-        return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
-
-
-@dataclass(frozen=True)
-class Whitened:
-    """`WhitenedSearch` with the components of a database."""
-
-    whitening: Whitening
-    search: Search
-
-    def fit(self, database: Database) -> "Whitened":
-        """Return itself: the components are known."""
-        return self
-
-    def shortlist(
-        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
-    ) -> Shortlist:
-        """See `Search`."""
-        queries, database = self._whiten(queries), self._whiten(database)
+        """As `ExactSearch.shortlist`; learns from the database first unless it is fitted."""
+        if self.whitening is None:
+            return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
+        queries, database = _whiten(queries, self.whitening), _whiten(database, self.whitening)
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
 
-    def _whiten(self, descriptors: Float[np.ndarray, "images _"]) -> Float[np.ndarray, "images dimensions"]:
-        mean, components = self.whitening.mean, self.whitening.components
-        return np.concatenate([_whiten(descriptors[part], mean, components) for part in _parts(len(descriptors), ROWS)])
+
+Search = ExactSearch | WhitenedSearch
+
+
+def _whiten(rows: np.ndarray, whitening: Whitening) -> Float[np.ndarray, "images dimensions"]:
+    mean, components = whitening.mean, whitening.components
+    return np.concatenate([_project(rows[part], mean, components) for part in _parts(len(rows), ROWS)])
 
 
 @compiled
-def _whiten(
+def _project(
     descriptors: Float[Array, "images _"], mean: Float[Array, " _"], components: Float[Array, "dimensions _"]
 ) -> Float[Array, "images dimensions"]:
     """Principal components of unit length; a row does not depend on the other rows."""

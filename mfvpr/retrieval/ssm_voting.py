@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
@@ -23,14 +23,10 @@ class SsmVoting:
 
     Among images with equal votes the lowest row comes first; the public code's unstable sort leaves their order open.
     Images without votes fill the rest of the shortlist.
-
-    Attributes:
-        describer: computes the windows of an image.
-        search: search for the nearest windows.
     """
 
     describer: SsmWindows
-    search: ExactSearch = EXACT
+    search: ExactSearch = EXACT  # for the nearest windows
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
@@ -71,35 +67,18 @@ def vote(
         if excluded is not None:
             unusable |= excluded.dense(part)
             excluded_windows = _windows_of(excluded.take(part), database.shape[1])
-        votes = _count_votes(queries[part], windows, num_candidates, excluded_windows, search)
-        votes = np.where(unusable, -1, votes)
+        # The window b nearest to a maximizes (a, 1) . (b, -|b|^2 / 2).
+        query_windows = np.pad(queries[part], ((0, 0), (0, 0), (0, 1)), constant_values=1)
+        query_windows = query_windows.reshape(-1, windows.shape[1])
+        nearest = search.shortlist(query_windows, windows, num_candidates, excluded=excluded_windows)
+        images = np.where(nearest.mask, nearest.indices // database.shape[1], len(database))
+        votes = [np.bincount(row, minlength=len(database) + 1) for row in images.reshape(len(unusable), -1)]
+        votes = np.where(unusable, -1, np.array(votes)[:, :-1])
         order = np.argsort(-votes, axis=1, kind="stable")[:, :num_candidates]
         counts = np.take_along_axis(votes, order, axis=1)
         indices[part, : order.shape[1]] = np.where(counts < 0, -1, order)
         scores[part, : order.shape[1]] = np.maximum(counts, 0)
     return Shortlist(indices, scores, indices >= 0)
-
-
-def _count_votes(
-    queries: Float[np.ndarray, "queries windows dimensions"],
-    windows: Float[np.ndarray, "_ dimensions+1"],
-    num_neighbors: int,
-    excluded: Positives | None,
-    search: ExactSearch,
-) -> Int[np.ndarray, "queries database"]:
-    """Votes of queries for images.
-
-    The window b that is nearest to a maximizes a . b - |b|^2 / 2, so that the database windows end in -|b|^2 / 2, and
-    the query windows in 1.
-    """
-    number, per_image, _ = queries.shape
-    num_images = len(windows) // per_image
-    query_windows = np.concatenate([queries, np.ones((number, per_image, 1), np.float32)], axis=2)
-    query_windows = query_windows.reshape(number * per_image, -1)
-    nearest = search.shortlist(query_windows, windows, num_neighbors, excluded=excluded)
-    images = np.where(nearest.mask, nearest.indices // per_image, num_images).reshape(number, -1)
-    places = images + (num_images + 1) * np.arange(number)[:, None]
-    return np.bincount(places.reshape(-1), minlength=number * (num_images + 1)).reshape(number, -1)[:, :num_images]
 
 
 def _windows_of(excluded: Positives, per_image: int) -> Positives:

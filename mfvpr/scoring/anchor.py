@@ -1,9 +1,8 @@
 """Anchor points (paper, section III-B): how many grid cells agree on their displacement with the cells around them.
 
 Both images are divided into `num_bins` x `num_bins` cells (the paper's bins). The matches that start in cell (i, j) of
-the first image vote for cells of the second image; the cell with the most votes is m_ij, the match of (i, j). The
-displacement of a cell is d_ij = m_ij - (i, j), so that ||((i, j) - (k, l)) - (m_ij - m_kl)|| in equation 2 of the paper
-is the distance |d_ij - d_kl| of two displacements. Lengths are cells.
+the first image vote for cells of the second image; the cell with the most votes is m_ij. The displacement of a cell is
+d_ij = m_ij - (i, j); the norm in equation 2 of the paper is the distance |d_ij - d_kl|. Lengths are cells.
 """
 
 import jax
@@ -84,10 +83,7 @@ class AnchorPoints:
         return where_finite(score, match_weights(self.weight, matches), *self._positions(matches))
 
     def _cells(self, matches: Matches) -> tuple[Array, Array, Array, Array, Array]:
-        """Cells of the first image that may be anchors; all occupied cells are among them.
-
-        `[n]` each: row-major number, displacement in rows and in columns, occupancy, and weight of the cells.
-        """
+        """Cells of the first image, all occupied ones: number, displacement in rows and columns, occupancy, weight."""
         num_cells = self.num_bins**2
         weights = match_weights(self.weight, matches)
         anchor, target = (self._cell(position) for position in self._positions(matches))

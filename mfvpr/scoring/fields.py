@@ -1,7 +1,6 @@
 """Declarations in the metadata of scorers' fields: units, bounds, choices and notes.
 
-Scorers check their words against these declarations. Programs derive settings from them, with bounds, comments and
-sweep axes. Programs write plain values (numbers, words, lists, None); `Parameter.value` converts them to field values.
+Programs derive settings from them, with bounds, comments and sweep axes, in plain values: numbers, words, lists, None.
 """
 
 import math
@@ -22,39 +21,21 @@ _KEY = "parameter"  # of the field's metadata
 
 @dataclass(frozen=True)
 class Parameter:
-    """Declaration of one field in terms of plain values.
-
-    Attributes:
-        default: plain value.
-        unit: of a number.
-        note: further explanation.
-        choices: all allowed values; empty = numbers within `bounds`.
-        bounds: smallest and largest number.
-        whole: numbers are integers.
-        length: of a list of numbers; 0 = one number, ANY = a list of one or more.
-        optional: None is allowed as well.
-        none: field value for None.
-        named: field values by the words of `choices`.
-        file: suffix of files that are allowed in place of a word; "" = no files.
-        swept: offered as an axis of a sweep.
-        learned: a gradient may change the field.
-        start: start of learning if the value is None; for the unit `SCORE` in units of the scores' spread.
-    """
+    """Declaration of one field in terms of plain values."""
 
     default: Any
     unit: str = ""
     note: str = ""
-    choices: tuple[Any, ...] = ()
+    choices: tuple[Any, ...] = ()  # all allowed values; empty = numbers within `bounds`
     bounds: tuple[float, float] = POSITIVE
-    whole: bool = False
-    length: int = 0
-    optional: bool = False
-    none: float | None = None
-    named: Mapping[str, Any] | None = None
-    file: str = ""
-    swept: bool = True
-    learned: bool = False
-    start: float = 1.0
+    whole: bool = False  # numbers are integers
+    length: int = 0  # of a list of numbers; 0 = one number, ANY = a list of one or more
+    none: float | None = None  # field value for None, which is allowed if it is the default
+    named: Mapping[str, Any] | None = None  # field values by the words of `choices`
+    file: str = ""  # suffix of files that are allowed in place of a word; "" = no files
+    swept: bool = True  # offered as an axis of a sweep
+    learned: bool = False  # a gradient may change the field
+    start: float = 1.0  # of learning if the value is None; for the unit `SCORE` in units of the scores' spread
 
     @property
     def words(self) -> str:
@@ -67,7 +48,7 @@ class Parameter:
         """Limits of a plain value, themselves plain, by name; limits that are not set are left out."""
         kind = "choices" if self.choices else "whole" if self.whole else "number"
         limits = {kind: list(self.choices or self.bounds)}
-        limits |= {"length": self.length, "optional": self.optional, "file": self.file}
+        limits |= {"length": self.length, "optional": self.default is None, "file": self.file}
         return {name: limit for name, limit in limits.items() if limit}
 
     def value(self, plain: Any) -> Any:
@@ -85,7 +66,7 @@ def number(
     """Declare a number; None is allowed if the default is None, or infinite (None = infinite)."""
     unlimited = default == math.inf
     plain, none = (None, math.inf) if unlimited else (default, None)
-    return _field(default, Parameter(plain, unit, note, bounds=bounds, optional=plain is None, none=none, **more))
+    return _field(default, Parameter(plain, unit, note, bounds=bounds, none=none, **more))
 
 
 def numbers(
@@ -93,14 +74,13 @@ def numbers(
 ) -> Any:
     """Declare a tuple of `length` numbers, static for the length ANY; None is allowed if it is the default."""
     plain = None if default is None else list(default)
-    optional = default is None
-    parameter = Parameter(plain, unit, note, bounds=bounds, length=length, optional=optional, swept=False)
+    parameter = Parameter(plain, unit, note, bounds=bounds, length=length, swept=False)
     return _field(default, parameter, static=length == ANY)
 
 
 def integer(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
     """Declare a static integer, such as a capacity; None is allowed if it is the default."""
-    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, optional=default is None, swept=swept)
+    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, swept=swept)
     return _field(default, parameter, static=True)
 
 

@@ -59,12 +59,9 @@ class GridAnchors:
         return max(1, size - (size % 2 == 0))
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32.
+        """Score of one pair, float32; NaN if the number of keypoints is not side^2, or an index is out of range.
 
-        The score is NaN if the number of keypoints is not side^2, or an index is out of range.
-
-        Raises:
-            InputError: the matches have no `index0` or no `index1`.
+        Matches without `index0` or `index1` raise an `InputError`.
         """
         if matches.index0 is None or matches.index1 is None:
             raise InputError("GridAnchors: expected matches that know their keypoints (index0, index1), got none")
@@ -85,8 +82,7 @@ class GridAnchors:
     def _agreements(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
         """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
 
-        Agreement is symmetric, so that half of the offsets suffice: those to the right, and those in the rows below.
-        Rows are padded, so that an offset is a shift of the flat array.
+        Agreement is symmetric: the offsets to the right and in the rows below suffice, shifts of the padded flat array.
         """
         side, half = self.side, self.size // 2
         shift = index - cells

@@ -1,7 +1,6 @@
 """Histogram of shifts (paper, section III-A): the tallest bin of a Gaussian-voted histogram of points1 - points0.
 
-A match k votes for the bin (i, j) by equation 1 of the paper, and the score is the maximum over all bins. The Gaussian
-is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
+The Gaussian is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
 `(w * votes_y) [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
 """
 
@@ -29,10 +28,7 @@ MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pa
 
 
 class ShiftHistogram(NamedTuple):
-    """Bin scores s_ij, and bin centers in px.
-
-    Bins beyond the range of shifts score -inf; there are some only if the capacity exceeds the bins.
-    """
+    """Bin scores s_ij, -inf beyond the range of shifts, and bin centers in px."""
 
     scores: Float[Array, "bins_y bins_x"]
     centers_x: Float[Array, " bins_x"]
@@ -48,9 +44,7 @@ class HistogramOfShifts:
         s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)),
 
     where (x_k, y_k) is the shift of match k, w_k its weight, and (x_ij, y_ij) the center of the bin. The score does not
-    change with the order of the matches, nor with a translation of all points of one image by a multiple of `bin_size`
-    while the peak stays in range. Numbers are pytree leaves and may be traced or batched; `max_bins` and the choices
-    are static.
+    change if all points of one image move by a multiple of `bin_size` while the peak stays in range.
 
     Attributes:
         bin_size: width of the square bins, px.
@@ -65,9 +59,8 @@ class HistogramOfShifts:
         max_bins: capacity of bins per axis; by default as many as concrete values need, at most 1024. If image sizes
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
-        scales: sizes of the place in the candidate relative to the query. Each scale has its own histogram, and the
-            score is the largest of their tallest bins. Useful for a camera that moves forward, because the correct
-            image then differs in scale. The paper has scale 1 only.
+        scales: sizes of the place in the candidate relative to the query, for a camera that moves forward. Each scale
+            has its own histogram, and the score is the largest of their tallest bins. The paper has scale 1 only.
         scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), because more
             scales give incorrect pairs more chances as well.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
@@ -117,11 +110,7 @@ class HistogramOfShifts:
     def batch_scores_by_weights(
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
     ) -> Float[jax.Array, "candidates weightings"]:
-        """`scores_by_weights` of pairs `[C, K, ...]`.
-
-        On a CPU it scores pair by pair, which stays in the cache, and skips most bins by branch and bound where that
-        pays. The scores are the same; the time depends on the data.
-        """
+        """`scores_by_weights` of pairs `[C, K, ...]`; on a CPU pair by pair, without most bins where that pays."""
         score_all_bins = jax.vmap(self.scores_by_weights)
         if self.temperature is not None:
             return score_all_bins(matches, weights)
@@ -162,13 +151,10 @@ class HistogramOfShifts:
     ) -> Float[jax.Array, "2 2"]:
         """Interval of the dominant shift, (low, high) of (x, y) px.
 
-        The interval holds the central `level` of the mass s_ij^sharpness along each axis. It is wide if other bins are
-        nearly as tall, and never narrower than `level` bins; without votes it is that part of all possible shifts. On
-        three synthetic streets it contains the true shift of the same place in 95 to 100 % of pairs at level 0.95, in
-        90 to 99 % at 0.68; with bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
-
-        Raises:
-            InputError: `level` is not between 0 and 1.
+        The interval holds the central `level`, between 0 and 1, of the mass s_ij^sharpness along each axis. It is wide
+        if other bins are nearly as tall, and never narrower than `level` bins; without votes it is that part of all
+        possible shifts. On three synthetic streets it contains the true shift of the same place in 95 to 100 % of pairs
+        at level 0.95, in 90 to 99 % at 0.68; with bins of 5 px and sigma 10 in 72 to 100 % and 53 to 98 %.
         """
         if not 0 < level < 1:
             raise InputError(f"level={level}: expected a number between 0 and 1")
@@ -183,13 +169,10 @@ class HistogramOfShifts:
     def with_capacity(
         self, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
     ) -> "HistogramOfShifts":
-        """This scorer with `max_bins` set to the bins that its concrete values need.
+        """This scorer with `max_bins` set to the bins that its concrete values need, rounded up to a `multiple`.
 
-        The number of bins is rounded up to a `multiple`. `bin_size` and the sizes may be batched: the capacity suffices
-        for all of them.
-
-        Raises:
-            InputError: `bin_size` is not above 0, or so small that more than 1024 bins are needed.
+        `bin_size` and the sizes may be batched: the capacity suffices for all of them. If more than 1024 bins are
+        needed, or `bin_size` is not above 0, an `InputError` is raised.
         """
         return replace(self, max_bins=round_up(self._count_bins(image_size0, image_size1, most=MAX_BINS), multiple))
 
@@ -225,10 +208,7 @@ class HistogramOfShifts:
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Histogram of the scale that has the tallest bin: bin scores, bins, whether they are usable, and the scale.
-
-        Scores are `[B, B]` (y, x), -inf beyond the range of shifts.
-        """
+        """Scores `[B, B]` (y, x) of the scale with the tallest bin, -inf out of range; bins; are they usable; scale."""
         lattice, capacity = self._lattice(matches), self._capacity(matches)
         shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
         scores = map_rows(lambda shifts: bin_scores(*votes(shifts, lattice, capacity), weights), shifts)
@@ -312,18 +292,8 @@ def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
 
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
+    """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
     scores, lattice, usable, _ = scorer._vote(matches)
-    return jnp.where(usable, _mass_interval(scores, lattice, level, sharpness), jnp.nan)
-
-
-def _mass_interval(
-    scores: Float[Array, "bins bins"], lattice: Lattice, level: float | Array, sharpness: float | Array
-) -> Float[jax.Array, "2 2"]:
-    """Interval (low, high) of (x, y) with the central share `level` of the mass along each axis.
-
-    The mass of a bin is s_ij^sharpness, for s_ij below 0 as for 0, and spread evenly within the bin. Without votes all
-    bins in the range of shifts have the same mass; beyond it s_ij is -inf.
-    """
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
@@ -335,4 +305,4 @@ def _mass_interval(
         below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
         return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], lattice.centers(axis, edges))
 
-    return jnp.stack([along(0), along(1)], axis=1)
+    return jnp.where(usable, jnp.stack([along(0), along(1)], axis=1), jnp.nan)

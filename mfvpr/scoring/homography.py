@@ -1,9 +1,7 @@
 """Homography by RANSAC, SSM-RAN's re-ranking (paper, section IV): how many matches one plane's motion explains.
 
-The paper compares its scores with this geometric model. A homography through four matches maps points of the candidate
-to points of the query; the score is the number of inliers of the best of many homographies. The result is that of
-OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted at once, and samples
-after the one where OpenCV would stop do not count.
+The result is that of OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted
+at once, and samples after the one where OpenCV would stop do not count.
 """
 
 from typing import NamedTuple
@@ -12,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.scoring import planes, quads
+from mfvpr.scoring import planes
 from mfvpr.scoring.fields import check_choices, choice, flag, integer, number
 from mfvpr.scoring.shifts import query_features, require_sizes
 from mfvpr.scoring.weights import match_confidence
@@ -24,12 +22,9 @@ _ROUNDS = 8  # the search ends after so many times the rounds that samples witho
 
 
 class Estimate(NamedTuple):
-    """Result of RANSAC for one pair, after a number of samples.
+    """Result of RANSAC for one pair, after a number of samples."""
 
-    matrix: maps (x, y, 1) of the candidate to the query, px, last entry 1; NaN = no homography.
-    """
-
-    matrix: Float[Array, "3 3"]
+    matrix: Float[Array, "3 3"]  # (x, y, 1) of the candidate -> query, px, last entry 1; NaN = no homography
     inliers: Bool[Array, " slots"]
     score: Float[Array, ""]
     samples: Int[Array, ""]
@@ -40,8 +35,7 @@ class Homography:
     """Number of inliers of the best homography that RANSAC finds.
 
     An inlier is a match with its candidate point mapped to within `threshold` of its query point. The samples of a pair
-    depend on its matches alone: the score is the same in any batch, on any number of devices, and for any order of the
-    matches. Each match counts with its confidence. There is no gradient.
+    depend on its matches alone. Each match counts with its confidence. There is no gradient.
 
     Attributes:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
@@ -91,7 +85,7 @@ class Homography:
         )
         normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
         threshold = threshold / frame.scale[1]
-        order = quads.canonical_order(masked(points, real), real)
+        order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         search = _Search(
             self.measure, matches.confidence is None, normalized[order], counts[order], number, threshold,
@@ -104,7 +98,10 @@ class Homography:
                 model, masked(normalized, real), masked(counts, planes.is_inlier(model, normalized, threshold))
             )
         inliers = jnp.where(number == 4, real, planes.is_inlier(model, normalized, threshold))
-        score = jnp.sum(masked(search.inlier_quality(model, normalized), inliers) * counts)
+        quality = jnp.ones_like(counts)
+        if self.measure == "msac":
+            quality = _closeness(*planes.miss(model, normalized, threshold))
+        score = jnp.sum(masked(quality, inliers) * counts)
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         score = score / query_features(matches) if self.per_feature else score
@@ -128,14 +125,14 @@ class _Search(NamedTuple):
     def __call__(self, key: Array) -> tuple[Float[Array, "9"], Int[Array, ""]]:
         """The best model, NaN if there is none, and the number of samples."""
         dtype = self.points.dtype
-        rounds = _ROUNDS * jnp.ceil(self.max_iterations / quads.ROUND).astype(jnp.int32)
+        rounds = _ROUNDS * jnp.ceil(self.max_iterations / planes.ROUND).astype(jnp.int32)
 
         def is_searching(state: _State) -> Array:
             return state.has_samples & (state.samples < self._count_samples(state.inliers)) & (state.round < rounds)
 
         def search_round(state: _State) -> _State:
-            four, num_samples = quads.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
-            models, place = planes.through(four), jnp.arange(quads.ROUND, dtype=jnp.int32)
+            four, num_samples = planes.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
+            models, place = planes.through(four), jnp.arange(planes.ROUND, dtype=jnp.int32)
             quality, inliers, number = self._compare(models)
             quality = jnp.where((place < num_samples) & (number > 3), quality, 0.0)
             # As if samples came one after the other: samples after the one where that search stops do not count.
@@ -159,17 +156,8 @@ class _Search(NamedTuple):
         state = jax.lax.while_loop(is_searching, search_round, state)
         return state.model, state.samples
 
-    def inlier_quality(self, model: Float[Array, "9"], points: Float[Array, "slots 4"]) -> Float[Array, " slots"]:
-        """Contribution of each match to the quality of a model, if it is an inlier."""
-        if self.measure == "inliers":
-            return jnp.ones_like(points[:, 0])
-        return _closeness(*planes.miss(model, points, self.threshold))
-
     def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
-        """Quality, sum of the inliers' counts, and number of inliers, of each model.
-
-        Matches are compared `_MATCHES_PER_STEP` at a time: all would leave the cache, one would make too short a step.
-        """
+        """Quality, sum of the inliers' counts, and number of inliers, of each model; few matches fit into the cache."""
         padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
         points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
         counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)

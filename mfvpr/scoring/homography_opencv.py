@@ -38,11 +38,7 @@ class OpenCvHomography:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
-        """Score of one pair, float32.
-
-        Raises:
-            InputError: the scorer or the matches are traced, or a number is out of bounds.
-        """
+        """Score of one pair, float32; an `InputError` if anything is traced, or a number is out of bounds."""
         if not is_concrete((self, matches)):
             raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
                              "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip

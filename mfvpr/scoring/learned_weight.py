@@ -29,39 +29,25 @@ class LearnedWeight:
     does not change them. Exclude them from weight decay with `optax.masked`. A weight with the input `ratio` raises an
     InputError for matches without a ratio.
 
-    Attributes:
-        center: mean of every input.
-        scale: standard deviation of every input.
-        hidden: M.
-        hidden_bias: b.
-        output: v.
-        output_bias: c.
-        names: names of the inputs, out of `INPUTS`. RELATIVE inputs compare a match with the other matches of its
-            pair, so that they carry over to other detectors, cameras and places; ABSOLUTE inputs have their units.
+    `names` are some of `INPUTS`. RELATIVE inputs compare a match with the other matches of its pair, so that they carry
+    over to other detectors, cameras and places; ABSOLUTE inputs have their units.
     """
 
-    center: Float[Array, " inputs"]
-    scale: Float[Array, " inputs"]
-    hidden: Float[Array, "inputs hidden"]
-    hidden_bias: Float[Array, " hidden"]
-    output: Float[Array, " hidden"]
-    output_bias: Float[Array, ""]
+    center: Float[Array, " inputs"]  # mean
+    scale: Float[Array, " inputs"]  # standard deviation
+    hidden: Float[Array, "inputs hidden"]  # M
+    hidden_bias: Float[Array, " hidden"]  # b
+    output: Float[Array, " hidden"]  # v
+    output_bias: Float[Array, ""]  # c
     names: tuple[str, ...] = field(default=RELATIVE, metadata={"static": True})
 
     @classmethod
     def create(
         cls, key: Array, matches: Matches, hidden: int = 16, *, names: tuple[str, ...] = RELATIVE
     ) -> "LearnedWeight":
-        """Weight that is 1 for every match, with the statistics of real matches.
+        """Weight that is 1 for every match, with `hidden` units and the statistics of the real matches `[..., K]`.
 
-        Args:
-            key: of `jax.random`, for the hidden layer.
-            matches: `[..., K]`; padding may hold anything. Without a real match, inputs are not standardized.
-            hidden: number of hidden units.
-            names: names of the inputs.
-
-        Raises:
-            InputError: a name is unknown.
+        Without a real match, inputs are not standardized.
         """
         if not names or isinstance(names, str) or len({*names}) < len(names):
             raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")

@@ -25,7 +25,7 @@ class LostScore:
     of the images' global descriptors, which matches do not hold, and matches by channels and semantic labels.
 
     If all distances are equal, for instance of a single match, v is 0 and L infinite, so that s = 0. Two matches are
-    always perfect, because the one with the larger distance has weight 0: with few matches the score says little.
+    always perfect: with few matches the score says little.
     1 - cos and the `described` L are at least 1e-12; 1 - cos is 1 if all positions with a weight are 0.
 
     Attributes:

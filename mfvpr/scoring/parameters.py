@@ -50,11 +50,10 @@ def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
 def with_capacity(
     scorer: Any, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
 ) -> Any:
-    """The scorer with the capacities that pairs of these image sizes need.
+    """The scorer with the capacities that pairs of these image sizes need, before `vmap` or `jit` hide the sizes.
 
-    Call it before `vmap` or `jit` hide the sizes. Capacities are set by the method `fit_capacity(image_size0,
-    image_size1, multiple)` of parts at any depth; see `HistogramOfShifts`. They are rounded up to a `multiple`, so that
-    many values share few programs.
+    The method `fit_capacity(image_size0, image_size1, multiple)` of parts at any depth sets them, see
+    `HistogramOfShifts`; values up to the same `multiple` share programs.
     """
     has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731
 

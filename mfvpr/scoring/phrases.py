@@ -22,8 +22,7 @@ class VisualPhrases:
     counts the product of its matches' confidences, so that matches of confidence 0 do not count. The score is 0 if no
     cell has `length` matches.
 
-    The score is smooth in the confidences, and constant in the points within a cell (gradient 0). Matches are sorted
-    by cell, so that time and memory depend on the number of matches, not of cells.
+    The score is smooth in the confidences, and constant in the points within a cell (gradient 0).
 
     Attributes:
         length: matches per phrase.

@@ -26,9 +26,7 @@ class Scorer(Protocol):
     does not depend on the order of the matches, nor on the amount and content of padding.
 
     Any callable is a scorer. A class decorated with `mfvpr.value` can do more than a plain function: its numbers may be
-    swept, traced and learned, and its compiled programs are reused. A class registered with
-    `jax.tree_util.register_dataclass` can do the same; see `mfvpr.value` for its limits. `mfvpr.testing.check_scorer`
-    checks this contract.
+    swept, traced and learned, and its compiled programs are reused. `mfvpr.testing.check_scorer` checks this contract.
 
     A scorer that JAX cannot compile, for instance of another library, also has a method `score_pairs(matches) -> [P]`
     that takes pairs `[P, K, ...]` and returns NumPy; it is called outside of `jit`. Its class is a value.

@@ -22,8 +22,7 @@ def compensate_scale(matches: Matches, scale: float) -> Matches:
     """Matches of one pair, rescaled as if both images showed the place at the same size.
 
     `scale` is the size of the place in the candidate relative to the query. Points are scaled about the centers of
-    their images: those of the query by sqrt(scale), those of the candidate by 1 / sqrt(scale). This treats both images
-    alike, and position errors count the same in both.
+    their images, by sqrt(scale) in the query and 1 / sqrt(scale) in the candidate: errors count the same in both.
     """
     if scale == 1:
         return matches
@@ -47,10 +46,7 @@ def require_sizes(*image_sizes: Array | None) -> None:
 
 
 def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
-    """Sizes (width, height) of query and candidate, px.
-
-    An invalid size of a pair without matches is replaced by 1; unknown sizes raise an `InputError`.
-    """
+    """Sizes (width, height) of query and candidate, px; invalid ones are 1 without matches, unknown ones an error."""
     require_sizes(matches.image_size0, matches.image_size1)
     has_matches = jnp.any(matches.mask)
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
@@ -73,10 +69,7 @@ def where_usable(
     weights: Float[Array, "_ slots"],
     usable: Bool[Array, ""],
 ) -> Float[jax.Array, "*weightings"]:
-    """Values of one pair; 0 without matches, NaN if not usable.
-
-    A shift that is not finite makes all values NaN; a weight that is not finite makes the values of its weighting NaN.
-    """
+    """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
     usable = usable & are_finite(shifts, weights)
     return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
 

@@ -43,9 +43,9 @@ def tallest_bins(
     lattice: Lattice,
     capacity: int,
 ) -> Float[Array, "candidates weightings"]:
-    """Scores of the tallest bins of pairs, with several weights of each match; a weight not finite scores NaN.
+    """Scores of the tallest of `capacity` x `capacity` bins of pairs, with several weights of each match.
 
-    The derivative is the one of the maximum over all bins, of which there are at most `capacity` along each axis.
+    The derivative is the one of the maximum over all bins. A weight that is not finite scores NaN.
     """
     pairs, num_weights = (shifts, weights, lattice), weights.shape[1]
     if capacity**2 * num_weights <= WORTHWHILE:

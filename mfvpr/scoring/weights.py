@@ -1,7 +1,4 @@
-"""Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot.
-
-Weights of padding are arbitrary; scorers use `match_weights`, where they are 0.
-"""
+"""Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot."""
 
 from dataclasses import replace
 from typing import Protocol
@@ -50,12 +47,9 @@ class DescriptorDistanceWeight:
 class RatioWeight:
     """w = (1 - ratio)^exponent, in [0, 1], from the ratio of descriptor distances.
 
-    The ratio is the distance to the nearest over the distance to the second nearest descriptor. It tells how ambiguous
-    a match is (Lowe, IJCV 2004, section 7.1): a keypoint that resembles two keypoints of the candidate equally has
-    weight 0. This weight is not from the paper. Matches without a ratio raise an InputError.
-
-    Attributes:
-        exponent: a larger exponent emphasizes unambiguous matches; no value is better than 1.
+    A keypoint that resembles two keypoints of the candidate equally has weight 0 (Lowe, IJCV 2004, section 7.1). This
+    weight is not from the paper. Matches without a ratio raise an InputError. A larger exponent emphasizes unambiguous
+    matches; no value is better than 1.
     """
 
     exponent: float | Array = 1.0

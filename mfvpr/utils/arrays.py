@@ -26,8 +26,7 @@ _PARSING = threading.Lock()
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
     """Write arrays of numbers, flags or text by name. When this returns they are on disk; until then, the file stays.
 
-    `read_arrays` must get the same label `about`, so exchanged files are noticed. Use `compress` for values that
-    repeat; numbers that look random shrink by a tenth only.
+    `read_arrays` must get the same label `about`, so exchanged files are noticed; `compress` is for repeated values.
     """
     buffer = io.BytesIO()
     kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
@@ -45,12 +44,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", 
 
 
 def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
-    """Read the arrays of `write_arrays`.
-
-    Raises:
-        InputError: any bit differs, or the arrays have another label.
-        OSError: there is no such file, or it cannot be read.
-    """
+    """Read the arrays of `write_arrays`; an `InputError` if a bit or the label differs, an `OSError` without a file."""
     content = path.read_bytes()
     view = memoryview(content)
     if view[-_DIGEST:] != _digest(view[:-_DIGEST], about):

@@ -1,11 +1,4 @@
-"""Work on many processes or machines, by Dask Distributed (extra `cluster`).
-
-    with Cluster.local(4) as cluster:
-        mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
-
-Blocks of images are described, and blocks of queries matched, in worker processes. Dask repeats those of a worker that
-dies.
-"""
+"""Work on many processes or machines, by Dask Distributed (extra `cluster`)."""
 
 import os
 import shlex
@@ -38,6 +31,9 @@ Result = TypeVar("Result")
 
 class Cluster:
     """Workers that describe images and match queries in blocks, and write the results to the folder of one cache.
+
+        with Cluster.local(4) as cluster:
+            mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
 
     All machines need the folders of the cache and of the images under the same paths, and the same versions, which
     every block checks. If a worker dies, another worker repeats its block. Results are those of one process to the bit

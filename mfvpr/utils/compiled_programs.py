@@ -24,13 +24,8 @@ def keep_compiled_programs() -> None:
 
     They lie in a subfolder of `$MFVPR_CACHE/compiled`, by default `~/.cache/mfvpr/compiled`, for each processor and
     version: they hold machine code for one processor, and the folder may be shared or copied. Delete it at any time.
-    Where it cannot be written, it is only read.
-
-    Does nothing with `MFVPR_COMPILED=false`, or if JAX has a folder of its own (`jax_compilation_cache_dir`) or no
-    compilation cache.
-
-    Raises:
-        InputError: MFVPR_COMPILED is neither `true` nor `false`.
+    Where it cannot be written, it is only read. Nothing changes with `MFVPR_COMPILED=false`, or if JAX has a folder of
+    its own (`jax_compilation_cache_dir`) or no compilation cache.
     """
     is_on, config = os.environ.get(VARIABLE) or "true", dict[str, Any](jax.config.values)
     require_word(VARIABLE, is_on, Literal["true", "false"])
@@ -50,11 +45,7 @@ def keep_compiled_programs() -> None:
 def _folder() -> Path:
     """The folder of programs for this processor and these versions."""
     root = os.path.expanduser(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")
-    packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
-    return Path(root, "compiled", "_".join([*packages, platform.machine(), _processor()]))
-
-
-def _processor() -> str:
-    """A hash of the processor's model and instruction sets; of the machine's name where the system does not say."""
     lines = re.findall(_PROCESSOR, _CPUINFO.read_text(), re.MULTILINE) if _CPUINFO.exists() else []
-    return sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]
+    processor = sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]
+    packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
+    return Path(root, "compiled", "_".join([*packages, platform.machine(), processor]))

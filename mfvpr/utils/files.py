@@ -50,10 +50,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def printable(text: str) -> str:
-    """`text` for a stream, figure or file of UTF-8: characters that UTF-8 lacks are written as \\udcXX.
-
-    Python has these characters in file names that are not UTF-8; in JSON, \\udcXX reads back as the same name.
-    """
+    """`text` for UTF-8: characters that it lacks, of names in other encodings, as \\udcXX, which JSON reads back."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 

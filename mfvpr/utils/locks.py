@@ -1,7 +1,4 @@
-"""Locks of files and folders, which end with the process that holds them, however it ends.
-
-They are `flock` locks of a handle: two blocks of one process exclude each other as two processes do.
-"""
+"""Locks of files and folders by `flock` of a handle: they end with their process, and hold within one, too."""
 
 import os
 from collections.abc import Callable, Iterator

@@ -42,20 +42,14 @@ def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLi
 
 
 def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
-    """`values` where `mask`, NaN elsewhere.
-
-    Without tracing, NumPy makes the NaN: `jax_debug_nans` would stop at a NaN from a compiled program.
-    """
-    if is_concrete((values, mask)):
+    """`values` where `mask`, NaN elsewhere."""
+    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
         return jax.device_put(np.where(mask, values, np.nan))
     return jnp.where(mask, values, jnp.nan)
 
 
 def as_array(values: Any) -> Any:
-    """`values`; lists as NumPy's arrays, arrays of other libraries (DLPack) as NumPy's, or JAX's on an accelerator.
-
-    Gradients of the other library end here. NumPy and JAX may share the memory.
-    """
+    """`values`; lists as NumPy's arrays, arrays of other libraries (DLPack) as NumPy's, or JAX's on an accelerator."""
     if isinstance(values, list | tuple):
         return np.asarray(values)
     if not _is_foreign(values):
@@ -149,9 +143,7 @@ def masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> F
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """`jax.jit` for functions of many pairs; under a caller's `jit` they are inlined.
-
-    The classes of all nodes of the arguments choose the program as well, even if two classes were registered alike.
+    """`jax.jit` for functions of many pairs; the classes of all nodes of the arguments choose the program as well.
 
     With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
     the values of the function's closure from the first call. For many calls in a row, `with_static_functions` allows

@@ -1,8 +1,4 @@
-"""Ragged rows <-> padded arrays and a mask.
-
-Images have different numbers of keypoints, and pairs of matches. On the host they are rows of different lengths, arrays
-by name. Compiled functions take padded arrays of few shapes, with zeros beyond the end of a row.
-"""
+"""Ragged rows, on the host arrays by name <-> padded arrays of few shapes and a mask, for compiled functions."""
 
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
@@ -19,10 +15,7 @@ Tree = TypeVar("Tree")
 def pad_rows(
     rows: Sequence[Row], capacity: int, *, total: int | None = None
 ) -> tuple[dict[str, Shaped[np.ndarray, "rows slots ..."]], Bool[np.ndarray, "rows slots"]]:
-    """At least one row as padded arrays by name, 0 beyond the ends of the rows, and the mask.
-
-    No row is longer than `capacity`. The arrays have `total` rows; those beyond `rows` are empty.
-    """
+    """At least one row as `total` padded arrays by name, 0 beyond the ends of the rows, and the mask."""
     total = len(rows) if total is None else total
     arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
     counts = np.zeros(total, int)
@@ -48,10 +41,7 @@ def join_rows(rows: Sequence[Row]) -> dict[str, np.ndarray]:
 
 
 def sizes(counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int) -> Int[np.ndarray, " capacities"]:
-    """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts` with little padding.
-
-    They are quantiles over all rows that are not empty, so that the shape of a row does not depend on its batch.
-    """
+    """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts`: quantiles of those above 0."""
     lengths = counts[counts > 0]
     if not lengths.size:
         return np.array([step])
@@ -87,12 +77,3 @@ def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np
 def at_least_one_row(tree: Tree) -> Tree:
     """Arrays `[n, ...]`; those with n = 0 become one entry of zeros, which can be indexed. Traced or not."""
     return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)
-
-
-def compact(tree: Tree, mask: Bool[jax.Array, " entries"], capacity: int) -> Tree:
-    """Entries of arrays `[n, ...]` where the mask is set, in their order, in `capacity` slots. Traced or not.
-
-    Entries beyond the capacity are dropped; the values of unused slots are arbitrary.
-    """
-    slots = jnp.nonzero(mask, size=capacity, fill_value=0)[0]
-    return jax.tree.map(lambda leaf: at_least_one_row(jnp.asarray(leaf))[slots], tree)

@@ -13,9 +13,7 @@ from mfvpr.utils.progress import Track, no_progress
 
 @dataclass(frozen=True)
 class Runtime:
-    """Settings of a call that change no result.
-
-        mfvpr.evaluate(data, system, runtime=Runtime(log=print))
+    """Settings of a call that change no result: `mfvpr.evaluate(data, system, runtime=Runtime(log=print))`.
 
     Attributes:
         devices: that share the work; None = the default device of JAX.

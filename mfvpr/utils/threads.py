@@ -11,10 +11,7 @@ Result = TypeVar("Result")
 
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
-    """`map` on threads: results in order, computed at most 2 x `workers` ahead.
-
-    Decoding, reading and compiled programs release the interpreter lock, so they overlap with the caller's work.
-    """
+    """`map` on threads, for work that releases the interpreter lock: in order, at most 2 x `workers` ahead."""
     remaining = iter(items)
     with ThreadPoolExecutor(workers) as pool:
         futures: deque[Future[Result]] = deque(

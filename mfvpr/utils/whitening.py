@@ -17,16 +17,11 @@ _BLOCK = 2**25  # numbers in double precision at a time
 
 @dataclass(frozen=True)
 class Whitening:
-    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`.
-
-    Attributes:
-        components: most variance first; 0 without variance.
-        origin: fingerprint of the vectors' recipe, the only one that may be whitened with it; "" = any vectors.
-    """
+    """Principal components divided by the standard deviations: `(vectors - mean) @ components.T`."""
 
     mean: Float[np.ndarray, " dimensions"]
-    components: Float[np.ndarray, "components dimensions"]
-    origin: str = ""
+    components: Float[np.ndarray, "components dimensions"]  # most variance first; 0 without variance
+    origin: str = ""  # fingerprint of the recipe of the only vectors that may be whitened with it; "" = any
 
     @property
     def dimension(self) -> int:
@@ -38,10 +33,7 @@ def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: in
     """Fit a whitening to a finite sample, float32 or float64, in double precision; its arrays have the sample's type.
 
     As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
-    each component (the first of several) positive.
-
-    Raises:
-        InputError: the sample has too few vectors or too few dimensions, or all its vectors are equal.
+    each component (the first of several) positive. Too few or equal vectors raise an `InputError`.
     """
     count, size = sample.shape
     if not 1 <= dimension < count or dimension > size:

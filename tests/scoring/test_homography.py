@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from mfvpr import Homography, score_candidates
-from mfvpr.scoring import quads
+from mfvpr.scoring import planes
 from mfvpr.utils import NoGradientError
 from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
@@ -57,7 +57,7 @@ def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, thr
         matches = pair([seed, count], count, share)
         got = estimate(Homography(threshold, 500.0, seed=seed), matches)
         points = np.where(matches.mask[:, None], np.concatenate([matches.points1, matches.points0], axis=-1), 0)
-        order = np.asarray(quads.canonical_order(points, matches.mask))[:count]
+        order = np.asarray(planes.canonical_order(points, matches.mask))[:count]
         inliers, samples, errors = ransac_oracle.estimate(
             points[order, :2], points[order, 2:], threshold=threshold, max_iterations=500, seed=seed
         )
@@ -68,7 +68,7 @@ def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, thr
 
 
 def test_draws_are_distinct_and_every_set_is_as_likely():
-    drawn = np.sort(np.asarray(quads.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
+    drawn = np.sort(np.asarray(planes.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
     assert (np.diff(drawn, axis=0) > 0).all()
     assert (drawn.min(), drawn.max()) == (0, 5)
     _, counts = np.unique(drawn, axis=1, return_counts=True)
@@ -81,10 +81,10 @@ def test_samples_are_the_first_draws_that_a_camera_can_see():
     points = np.concatenate(plane_points(5, 30, 0.5), axis=1) / 168 - 1
     points[5:10] = np.linspace(0, 0.75, 5, dtype=np.float32)[:, None]  # on a line in both images
     key = jax.random.key(7)
-    samples, count = quads.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
-    drawn = np.asarray(quads.draw_four(key, 3, np.int32(30))).T
+    samples, count = planes.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
+    drawn = np.asarray(planes.draw_four(key, 3, np.int32(30))).T
     visible = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
-    assert int(count) == min(len(visible), quads.ROUND)
+    assert int(count) == min(len(visible), planes.ROUND)
     expected = points[np.array(visible[: int(count)])]
     np.testing.assert_array_equal(np.moveaxis(np.asarray(samples), 0, 2)[:, : int(count)].swapaxes(0, 1), expected)
 

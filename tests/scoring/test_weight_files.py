@@ -9,7 +9,7 @@ import pytest
 
 from mfvpr import InputError
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
-from mfvpr.scoring.weight_files import read_weight, write_weight
+from mfvpr.scoring.weight_registry import read_weight, write_weight
 from tests.builders import random_matches
 
 PROVENANCE = {"command": "by hand", "seeds": [1, 2]}

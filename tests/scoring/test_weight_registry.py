@@ -14,8 +14,7 @@ import mfvpr
 from mfvpr import HistogramOfShifts
 from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
-from mfvpr.scoring.weight_files import read_weight, write_weight
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, provenance
+from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, provenance, read_weight, write_weight
 from mfvpr.scoring.weights import WEIGHTS
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed

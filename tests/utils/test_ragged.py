@@ -1,7 +1,6 @@
 """Rows of their own length, padded and back."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -67,19 +66,3 @@ def test_a_capacity_is_worth_what_it_saves():
 def test_empty_rows_make_no_capacity_smaller():
     for empty in (0, 50):
         assert ragged.sizes(np.array([0] * empty + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]
-
-
-compact = jax.jit(ragged.compact, static_argnums=2)
-
-
-@given(st.lists(st.booleans(), min_size=12, max_size=12), st.sampled_from([1, 5, 14]))
-def test_marked_entries_come_to_the_front(mask, capacity):
-    values = np.arange(12, dtype=np.float32) + 1
-    front = compact({"a": values}, np.array(mask), capacity)["a"]
-    expected = values[np.array(mask)][:capacity]
-    assert front.shape == (capacity,)
-    np.testing.assert_array_equal(front[: len(expected)], expected)
-
-
-def test_no_entries_can_be_indexed():
-    assert ragged.compact({"a": np.zeros((0, 2))}, jnp.zeros(0, bool), 3)["a"].shape == (3, 2)
