@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives
+from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives, plan_return
 from mfvpr.datasets.streets.cars import traffic
 from mfvpr.datasets.streets.exposure import expose
 from mfvpr.datasets.streets.ground_truth import write_ground_truth
@@ -21,6 +21,8 @@ from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
 SIGHT = 100.0  # panels farther away are not drawn, meters
+CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")  # those of RobotCar Seasons
+TRUTH = "ground_truth.csv"
 Progress = Callable[[int, int], None]
 
 
@@ -41,6 +43,7 @@ class Drive:
 def draw_streets(
     folder: Path | str,
     *,
+    seasons: bool = False,
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
@@ -57,12 +60,16 @@ def draw_streets(
       of the image, x to the right, y down. The shift is the median, per axis, over facade points that are visible in
       both images (trees, signs and cars disregarded); see `image_shift`.
 
-    The files depend on `seed`, `num_frames` and `image_size` only, to the bit.
+    With `seasons`, a folder per condition replaces the queries. Each has its own drive, between the frames of the
+    database, and its own ground_truth.csv.
+
+    The files depend on the arguments only, to the bit.
 
     Args:
         folder: must not exist yet.
+        seasons: whether the queries are drives in seven conditions.
         seed: of the street, its cars and the drives.
-        num_frames: number of places, 1.75 m apart; there are twice as many images.
+        num_frames: number of places, 1.75 m apart; there are twice as many images, with `seasons` eight times.
         image_size: (width, height) in px.
         progress: `progress(done, total)` is called in the caller's thread after every image.
 
@@ -71,35 +78,39 @@ def draw_streets(
     """
     folder = Path(folder)
     database, queries = plan_drives(seed, num_frames, image_size)
-    weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
-    drives = [
-        Drive(folder / "database", database, ["day"] * num_frames, (seed, 7)),
-        Drive(folder / "queries", queries, weathers, (seed, 8), folder / "ground_truth.csv"),
-    ]
-    draw_drives(drives, seed, SPACING * num_frames, progress)
+    key = (seed, 10, 0) if seasons else (seed, 7)
+    drives = [Drive(folder / "database", database, ["day"] * num_frames, key)]
+    if not seasons:
+        weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
+        drives.append(Drive(folder / "queries", queries, weathers, (seed, 8), folder / TRUTH))
+    for number, condition in enumerate(CONDITIONS if seasons else ()):
+        cameras, place = plan_return(seed, number, num_frames, image_size), folder / condition
+        drives.append(Drive(place, cameras, [condition] * num_frames, (seed, 10, number + 1), place / TRUTH))
+    draw_drives(drives, seed, SPACING * (num_frames + seasons), progress)
 
 
 def streets_folder(
     cache: Path | str,
     *,
-    kind: str = "streets",
-    draw: Callable[..., None] = draw_streets,
+    seasons: bool = False,
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> Path:
-    """The folder of the synthetic street inside `cache`, drawn if it is missing; other options as in `draw_streets`.
+    """The folder of the synthetic street inside `cache`, drawn if it is missing; options as in `draw_streets`.
 
-    `draw` draws it under another name. It is renamed when complete, so that a killed run leaves nothing that looks
-    complete.
+    It is renamed when complete, so that a killed run leaves nothing that looks complete.
     """
+    kind = "seasons" if seasons else "streets"
     folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
             drawing = Path(temporary) / folder.name
-            draw(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
+            draw_streets(
+                drawing, seasons=seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
+            )
             try:
                 os.replace(drawing, folder)
             except OSError:
