@@ -10,10 +10,9 @@ import pytest
 
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, draw_streets, streets_folder
 from mfvpr.datasets.streets.camera import LANE, SPACING, Camera, plan_drives, plan_return
-from mfvpr.datasets.streets.exposure import expose, fall_rain
 from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
 from mfvpr.datasets.streets.sheets import Sheet, texture
-from mfvpr.datasets.streets.weather import WEATHERS, Exposure
+from mfvpr.datasets.streets.weather import WEATHERS, expose, fall_rain
 
 pytestmark = pytest.mark.thorough
 
@@ -96,10 +95,10 @@ def test_queries_show_something_dark_at_night_and_bright_in_snow(streets):
 def test_without_effects_the_image_stays_and_each_effect_changes_it(effect, size):
     image = np.zeros((72, 96, 3), np.uint8)
     image[20:50, 30:60] = 240
-    quiet = Exposure(noise=0.0)
+    quiet = replace(WEATHERS["day"], noise=0.0)
 
-    def exposed(exposure):
-        return expose(image, replace(WEATHERS["day"], exposure=exposure), np.random.default_rng(0))
+    def exposed(weather):
+        return expose(image, weather, np.random.default_rng(0))
 
     np.testing.assert_array_equal(exposed(quiet), image)
     assert (exposed(replace(quiet, **{effect: size})) != image).any()

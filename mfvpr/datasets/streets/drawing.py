@@ -12,11 +12,10 @@ import numpy as np
 
 from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives, plan_return
 from mfvpr.datasets.streets.cars import traffic
-from mfvpr.datasets.streets.exposure import expose
 from mfvpr.datasets.streets.ground_truth import write_ground_truth
 from mfvpr.datasets.streets.painting import paint
 from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
-from mfvpr.datasets.streets.weather import WEATHERS
+from mfvpr.datasets.streets.weather import WEATHERS, expose
 from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
