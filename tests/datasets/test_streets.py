@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, draw_streets, streets_folder
-from mfvpr.datasets.streets.camera import LANE, SPACING, Camera, plan_drives, plan_return
-from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
+from mfvpr.datasets.streets.camera import (
+    LANE,
+    SPACING,
+    Camera,
+    Facade,
+    image_shift,
+    plan_drives,
+    plan_return,
+    visible_points,
+)
 from mfvpr.datasets.streets.sheets import Sheet, texture
 from mfvpr.datasets.streets.weather import WEATHERS, expose, fall_rain
 

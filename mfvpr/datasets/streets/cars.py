@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera
-from mfvpr.datasets.streets.colors import ACCENTS, CARS, Color, Rng, pick, tone
+from mfvpr.datasets.streets.colors import ACCENTS, CARS, Color, Image, Rng, pick, tone
 from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, draw_glyphs, move, texture
+from mfvpr.datasets.streets.weather import Weather
 
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
 TRAFFIC = (
@@ -14,28 +15,19 @@ TRAFFIC = (
     (4.0, 5, 18, False), (4.0, 25, 50, False), (-4.0, 5, 18, True),
 )  # fmt: skip
 
-
-End = tuple[float, float]  # where the glass and the roof start, meters from this end
-
-
-@dataclass(frozen=True)
-class Car:
-    """A car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming."""
-
-    ahead: Prop
-    oncoming: Prop
+Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
 
 
 @dataclass(frozen=True)
 class Body:
-    """Shape of a car, in meters: heights of hood and roof, and its ends."""
+    """Shape of a car, in meters: heights of hood and roof; where glass and roof start, from the rear and the front."""
 
     length: float
     width: float
     hood: float
     roof: float
-    rear: End
-    front: End
+    rear: tuple[float, float]
+    front: tuple[float, float]
 
 
 BODIES = (
@@ -46,41 +38,32 @@ BODIES = (
 
 
 def build_car(seed: int, index: int) -> Car:
-    """Car number `index` of the street with this seed."""
+    """Car number `index` of the street with this seed; panels that face away are included, but never painted."""
     rng = np.random.default_rng([seed, 4, index])
     body, color = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
-    side = draw_side(rng, body, color)
-    sides = texture(side.mirror()), texture(side)
+    right = texture(draw_side(rng, body, color))
     rear = texture(draw_end(body, color, (160, 30, 30), (255, 50, 40)))
     front = texture(draw_end(body, color, (236, 236, 228), (255, 250, 230)))
-    covers = texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color))
-    return Car(
-        assemble(body, (body.rear, body.front), rear, sides, covers),
-        assemble(body, (body.front, body.rear), front, sides[::-1], covers),
-    )
+    shadow, top, glass = texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color))
 
+    def left(weather: Weather) -> Image:
+        return right(weather)[:, ::-1]
 
-def assemble(
-    body: Body, ends: tuple[End, End], end: Texture, sides: tuple[Texture, ...], covers: tuple[Texture, ...]
-) -> Prop:
-    """Build a car from its textures, with its near and far ends, the near one's texture, and the left and right sides.
+    def assemble(near: tuple[float, float], far: tuple[float, float], end: Texture, sides: tuple[Texture, ...]) -> Prop:
+        width, length, x = body.width, body.length, -body.width / 2
+        roof, across = length - far[1], (width, 0, 0)
+        panels = (
+            Panel(shadow, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
+            Panel(top, (x, -body.hood, length), across, (0, 0, -length)),
+            Panel(end, (x, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
+            Panel(top, (x, -body.roof, roof), across, (0, 0, near[1] - roof)),
+            Panel(glass, (x, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
+            Panel(sides[0], (x, -body.roof, length), (0, 0, -length), (0, body.roof, 0)),
+            Panel(sides[1], (-x, -body.roof, 0), (0, 0, length), (0, body.roof, 0)),
+        )
+        return Prop(length / 2, panels)
 
-    `covers` are shadow, top and glass. Panels that face away are included, but never painted.
-    """
-    shadow, top, glass = covers
-    near, far = ends
-    width, length, left = body.width, body.length, -body.width / 2
-    roof, across = length - far[1], (width, 0, 0)
-    panels = (
-        Panel(shadow, (left - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
-        Panel(top, (left, -body.hood, length), across, (0, 0, -length)),
-        Panel(end, (left, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
-        Panel(top, (left, -body.roof, roof), across, (0, 0, near[1] - roof)),
-        Panel(glass, (left, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
-        Panel(sides[0], (left, -body.roof, length), (0, 0, -length), (0, body.roof, 0)),
-        Panel(sides[1], (-left, -body.roof, 0), (0, 0, length), (0, body.roof, 0)),
-    )
-    return Prop(length / 2, panels)
+    return assemble(body.rear, body.front, rear, (left, right)), assemble(body.front, body.rear, front, (right, left))
 
 
 def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
@@ -90,7 +73,7 @@ def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
         car = cars[int(rng.integers(len(cars)))]
         if rng.random() < 0.7:
             x, z = x + rng.uniform(-0.2, 0.2), camera.z + rng.uniform(nearest, farthest)
-            props.append(move(car.oncoming if oncoming else car.ahead, x, z))
+            props.append(move(car[oncoming], x, z))
     return props
 
 

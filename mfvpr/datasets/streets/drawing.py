@@ -10,9 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives, plan_return
+from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives, plan_return, write_ground_truth
 from mfvpr.datasets.streets.cars import traffic
-from mfvpr.datasets.streets.ground_truth import write_ground_truth
 from mfvpr.datasets.streets.painting import paint
 from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
 from mfvpr.datasets.streets.weather import WEATHERS, expose
