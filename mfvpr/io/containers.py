@@ -65,15 +65,16 @@ def choose_reader(path: Path, readers: Mapping[str, Callable]) -> Callable:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn any error of a reader into an InputError of one line."""
+def reading(path: Path, kind: str = "a file", mend: str = "is it whole, and of this kind?") -> Iterator[None]:
+    """Require a regular file, and turn any error of its reader into an InputError of one line with the path."""
+    require_file(path, kind)
     try:
         yield
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except Exception as error:  # zipfile, zlib, NumPy and HDF5 share no class of errors
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); is it whole, and of this kind?") from None
+        raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); {mend}") from None
 
 
 def shorten(text: str, limit: int = 60) -> str:

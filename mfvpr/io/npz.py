@@ -15,7 +15,7 @@ from jaxtyping import Shaped
 
 from mfvpr.io.containers import Container, Contents, FileEntry, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing, require_file
+from mfvpr.utils.files import printable, replacing
 
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
@@ -80,10 +80,11 @@ class NpzFolder(Container):
         return FileEntry(self._paths[image], "")
 
 
-def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the arrays among `parts` that the archive has; InputError if it is damaged, or holds objects."""
+def read_npz(path: Path, parts: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays, or those among `parts`, of an archive; InputError if it is damaged, or holds objects."""
     with _open_archive(path) as archive:
-        return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
+        members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        return {part: _array(archive, members[part]) for part in parts or members if part in members}
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
@@ -97,7 +98,6 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
 @contextmanager
 def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive; raise an InputError if two members share a name, since readers choose either."""
-    require_file(path)
     with reading(path), zipfile.ZipFile(path) as archive:
         if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
             raise InputError(f"{path}: expected every array once, got {shorten(twice[0])} again; write the file anew")

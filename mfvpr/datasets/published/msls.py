@@ -9,7 +9,8 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.ground_truth import FARTHEST, RadiusTruth
 from mfvpr.datasets.positives import rows_within
-from mfvpr.datasets.published.lists import dataset_of_lists, listed_images, reading_list
+from mfvpr.datasets.published.lists import dataset_of_lists, listed_images
+from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numbers import parse_number
 
@@ -76,10 +77,7 @@ def _flag(text: str) -> bool:
 
 def _table(path: Path) -> dict[str, dict[str, str]]:
     """Lines of a table by key."""
-    with (
-        reading_list(path, "expected a table of commas; get it again", "a table of the data set"),
-        path.open(newline="", encoding="utf-8") as file,
-    ):
+    with reading(path, "a table", "get it again"), path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     table = {line.get("key") or "": line for line in lines}
     if len(table) < len(lines) or "" in table:

@@ -6,7 +6,8 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.ground_truth import RadiusTruth
-from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images, reading_list
+from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images
+from mfvpr.io.containers import reading
 from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 
@@ -30,7 +31,8 @@ def pitts30k(root: Path, name: str) -> Dataset:
 
 
 def _dataset_of_structure(root: Path, name: str, path: Path) -> Dataset:
-    with reading_list(path, f"expected the structure dbStruct of {name}; get the file again"), path.open("rb") as file:
+    mend = f"expected the structure dbStruct of {name}; get the file again"
+    with reading(path, mend=mend), path.open("rb") as file:
         arrays = read_matlab(file, text=True)
         sides = [_cell_texts(arrays, f"dbStruct.{field}.") for field in ("dbImageFns", "qImageFns")]
         positions = [arrays[f"dbStruct.{field}"].T.astype(np.float64) for field in ("utmDb", "utmQ")]
