@@ -1,6 +1,6 @@
 """Common interface of files with arrays by image: hloc's h5, npz, folders of npz."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -10,12 +10,7 @@ import numpy as np
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
-
-class Contents(NamedTuple):
-    """Names of an image's arrays, and shapes of the requested ones."""
-
-    names: Set[str]
-    shapes: Mapping[str, tuple[int, ...]]
+Shapes = Mapping[str, tuple[int, ...]]  # by the name of the array
 
 
 class FileEntry(NamedTuple):
@@ -43,8 +38,8 @@ class Container:
     images: tuple[str, ...]
     transposed = False
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
-        """For each image, the names of all arrays and the shapes of those in `parts`; reads no values."""
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
+        """For each image, the shapes of its arrays among `parts`, and () for its other arrays; reads no values."""
         raise NotImplementedError
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:

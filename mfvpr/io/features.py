@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
-from mfvpr.io.containers import Container, Contents, FileEntry, choose_reader, shorten
+from mfvpr.io.containers import Container, FileEntry, Shapes, choose_reader, shorten
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
@@ -140,13 +140,13 @@ def open_features(
     if not partial or not any(images):
         require_all(path, names, images, "features")
     rows = {image: row for row, image in enumerate(images) if image is not None}
-    contents = dict(zip(rows, container.contents(rows, ("keypoints", "descriptors")), strict=True))
+    shapes = dict(zip(rows, container.shapes(rows, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
     for image, row in rows.items():
-        counts[row] = _count(f"{path}: {shorten(image)}", contents[image], needs_size=sizes is None)
-    transposed, dimension = _layout(path, contents, container.transposed)
-    without = [image for image, parts in contents.items() if _score_part(parts.names) is None]
-    if without and len(without) < len(contents):  # a missing score would become 1
+        counts[row] = _count(f"{path}: {shorten(image)}", shapes[image], needs_size=sizes is None)
+    transposed, dimension = _layout(path, shapes, container.transposed)
+    without = [image for image, parts in shapes.items() if _score_part(parts) is None]
+    if without and len(without) < len(shapes):  # a missing score would become 1
         raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
     return ImportedFeatures(
         path=path,
@@ -206,29 +206,26 @@ def _require_parts(where: str, parts: Collection[str]) -> None:
         raise InputError(f"{where}: expected keypoints and descriptors, got no {' and no '.join(missing)}")
 
 
-def _count(where: str, contents: Contents, *, needs_size: bool) -> int:
+def _count(where: str, shapes: Shapes, *, needs_size: bool) -> int:
     """Number of an image's keypoints."""
-    _require_parts(where, contents.names)
-    shape = contents.shapes["keypoints"]
+    _require_parts(where, shapes)
+    shape = shapes["keypoints"]
     if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
         raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
-    if needs_size and "image_size" not in contents.names:
+    if needs_size and "image_size" not in shapes:
         raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
     return shape[0]
 
 
-def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tuple[bool, int]:
+def _layout(path: Path, shapes: Mapping[str, Shapes], default: bool) -> tuple[bool, int]:
     """Whether descriptors are `[D, N]`, and D, both the same for all images.
 
     An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
     """
     votes: dict[bool, str] = {}
-    shapes = {
-        image: (parts.shapes["keypoints"][0], parts.shapes["descriptors"])
-        for image, parts in contents.items()
-        if parts.shapes["keypoints"][0]
-    }
-    for image, (count, shape) in shapes.items():
+    descriptors = {image: parts["descriptors"] for image, parts in shapes.items() if parts["keypoints"][0]}
+    for image, shape in descriptors.items():
+        count = shapes[image]["keypoints"][0]
         if len(shape) != 2 or count not in shape:
             expected = f"[{count}, D] or [D, {count}] like the keypoints"
             raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
@@ -238,7 +235,7 @@ def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tupl
         got = f"[D, N] for {shorten(votes[True])} and [N, D] for {shorten(votes[False])}"
         raise InputError(f"{path}: expected descriptors of one layout, got {got}")
     transposed = next(iter(votes), default)
-    dimensions = {image: shape[0 if transposed else 1] for image, (_, shape) in shapes.items()}
+    dimensions = {image: shape[0 if transposed else 1] for image, shape in descriptors.items()}
     dimension = next(iter(dimensions.values()), 0)
     for image, numbers in dimensions.items():
         if numbers != dimension:

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 from jaxtyping import Shaped
 
-from mfvpr.io.containers import Container, Contents, FileEntry, reading, require_plain, shorten
+from mfvpr.io.containers import Container, FileEntry, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing
 
@@ -36,20 +36,21 @@ class NpzFile(Container):
             raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; "
                              "if every image has its own file, give their folder")  # fmt: skip
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         with _open_archive(self.path) as archive:
             members: dict[str, set[str]] = defaultdict(set)
             for name in archive.namelist():
                 image, _, part = name.rpartition("/")
                 members[image].add(part)
             for image in images:
-                yield _contents(archive, members[image], f"{image}/", parts)
+                yield _shapes(archive, members[image], f"{image}/", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         with _open_archive(self.path) as archive:
             members = set(archive.namelist())
             for image in images:
-                yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
+                names = {part: f"{image}/{part}.npy" for part in parts}
+                yield {part: _array(archive, name) for part, name in names.items() if name in members}
 
 
 class NpzFolder(Container):
@@ -67,10 +68,10 @@ class NpzFolder(Container):
         if not self.images:
             raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         for image in images:
             with _open_archive(self._paths[image]) as archive:
-                yield _contents(archive, set(archive.namelist()), "", parts)
+                yield _shapes(archive, archive.namelist(), "", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         for image in images:
@@ -104,18 +105,13 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _members(members: set[str], prefix: str, parts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    return ((part, name) for part in parts if (name := f"{prefix}{part}.npy") in members)
-
-
-def _contents(archive: zipfile.ZipFile, members: set[str], prefix: str, parts: Sequence[str]) -> Contents:
-    names = {name.removesuffix(".npy") for name in members}
-    return Contents(names, {part: _shape(archive, f"{prefix}{part}.npy") for part in parts if part in names})
-
-
-def _shape(archive: zipfile.ZipFile, member: str) -> tuple[int, ...]:
-    with archive.open(member) as file:
-        return _read_header(f"{archive.filename}: {shorten(member)}", file)[0]
+def _shapes(archive: zipfile.ZipFile, members: Iterable[str], prefix: str, parts: Sequence[str]) -> Shapes:
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys((name.removesuffix(".npy") for name in members), ())
+    for part in parts:
+        if part in shapes:
+            with archive.open(f"{prefix}{part}.npy") as file:
+                shapes[part] = _read_header(f"{archive.filename}: {shorten(prefix + part)}.npy", file)[0]
+    return shapes
 
 
 def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
