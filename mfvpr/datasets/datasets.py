@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.ground_truth import CHOICES, truth_by_order, truth_from_names
 from mfvpr.datasets.images import read_image
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Truth
+from mfvpr.datasets.truth import CHOICES, Truth, truth_by_order, truth_from_names
 from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES

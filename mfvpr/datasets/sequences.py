@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.datasets import QuerySequence
-from mfvpr.datasets.ground_truth import AllowedTruth, FrameTruth
+from mfvpr.datasets.truth import AllowedTruth, FrameTruth
 from mfvpr.utils.errors import InputError
 
 OwnRows = tuple[tuple[int, ...], ...]

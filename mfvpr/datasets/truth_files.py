@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
-from mfvpr.datasets.truth import Truth
+from mfvpr.datasets.truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth, Truth
 from mfvpr.io.containers import reading, shorten
 from mfvpr.io.npz import read_npz
 from mfvpr.utils.errors import InputError

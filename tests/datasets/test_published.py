@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.published import published_dataset, published_differences
+from mfvpr.datasets.published.frames import CONDITIONS, REFERENCE
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
-from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE
 from mfvpr.utils import InputError
 from tests.builders import fill
 from tests.io.checks import one_line_error
