@@ -1,10 +1,11 @@
-"""Read and resize images: files -> RGB arrays `[H, W, 3]`.
+"""Read and resize images: files, also frames of videos -> RGB arrays `[H, W, 3]`.
 
 Decoding and the default resampling are Pillow's, as in the published networks' code. In addition, images are turned by
 their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
 import warnings
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
 MAX_PIXELS = 64_000_000
+VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 Interpolation = Literal[
     "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
@@ -127,6 +129,28 @@ def resize(
     if interpolation in _PIL:
         return np.asarray(Image.fromarray(image).resize(size, _PIL[interpolation]))
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
+
+
+def read_frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+    """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame.
+
+    Raises:
+        InputError: no video, or a video without readable frames.
+    """
+    path = Path(path)
+    require_file(path, "a video file")
+    video, number = cv2.VideoCapture(str(path)), 0
+    try:
+        while video.grab():
+            if number % every == 0:
+                is_valid, image = video.retrieve()
+                if is_valid:
+                    yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            number += 1
+    finally:
+        video.release()
+    if not number:
+        raise InputError(f"{path}: expected a video, got a file without frames that can be read; convert it")
 
 
 def _orientation(image: Image.Image) -> int:

@@ -58,8 +58,8 @@ class Positives:
         if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
-        flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
-        return cls._from_csr(_csr(flat, offsets, num_database))
+        offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
+        return cls._from_csr(_csr(flat.astype(np.int32, copy=False), offsets, num_database))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -83,31 +83,14 @@ class Positives:
         """Number of rows of each query."""
         return np.diff(self.offsets)
 
-    def any(self) -> bool:
-        """Whether at least one query has rows."""
-        return len(self.rows) > 0
-
     def of(self, query: int) -> Int[np.ndarray, " _"]:
         """Rows of one query, ascending."""
         query = range(len(self))[query]
         return self.rows[self.offsets[query] : self.offsets[query + 1]]
 
-    def union(self) -> Bool[np.ndarray, " database"]:
-        """Mask of the rows of all queries."""
-        union = np.zeros(self.num_database, bool)
-        union[self.rows] = True
-        return union
-
     def take(self, queries: Any) -> "Positives":
         """Select queries by numbers `[q]` in any order, a mask `[Q]`, or a slice."""
         return self._from_csr(self._csr()[np.arange(len(self))[queries]])
-
-    def among(self, allowed: np.ndarray) -> "Positives":
-        """Select the rows that a mask `[N]` of the database allows."""
-        if np.shape(allowed) != (self.num_database,):
-            raise InputError(f"allowed: expected shape ({self.num_database},), got {np.shape(allowed)}")
-        is_allowed = np.asarray(allowed, bool)[self.rows]
-        return Positives(self.rows[is_allowed], _offsets(is_allowed)[self.offsets], self.num_database)
 
     def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
         """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
@@ -207,8 +190,3 @@ def radius_positives(
 
 def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> "scipy.sparse.csr_array":
     return scipy.sparse.csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))
-
-
-def _offsets(counts: Any) -> np.ndarray:
-    """Start of each of n runs of `counts` `[n]` entries, and the end, `[n + 1]` int64."""
-    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

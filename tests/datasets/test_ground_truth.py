@@ -161,7 +161,7 @@ def test_nordland_takes_a_few_megabytes():
     np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
     assert [len(half.tune) for half in protocol.halves] == [number // 2 - 2 * tolerance] * 2
     np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
-    assert not difference.any()
+    assert not difference.rows.size
 
 
 def test_a_radius_takes_no_more_than_its_neighbors():
@@ -203,7 +203,7 @@ def test_excluded_images_are_not_correct():
     truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
     np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
-    assert not truth.positives(0).any()
+    assert not truth.positives(0).rows.size
     np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
     assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
