@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Num, UInt8
 from PIL import Image, ImageFile
 
+from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
@@ -58,16 +59,16 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             or of 32 bits a channel, whose range is unknown (unless `bits` is None).
     """
     path = Path(path)
-    try:
-        require_file(path, "an image file")
+    with reading(path, "an image file", "replace or remove it"):
         if path.stat().st_size == 0:
-            raise InputError(f"{path}: expected an image file, got 0 bytes; replace or remove it")
+            raise InputError("expected an image file, got 0 bytes; replace or remove it")
         with Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise InputError(_too_large(path, f"{image.width} x {image.height} px"))
+                size = f"{image.width} x {image.height} px"
+                raise InputError(f"expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image")
             used = _bits_in_use(image, bits)
             if used is None and bits is not None and image.mode in ("I", "F"):
-                raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
+                raise InputError("expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
             orientation = _orientation(image)
             rgb = _as_rgb(image, path, used)
             if image.format == "TIFF":  # already turned by Pillow
@@ -75,13 +76,6 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             elif not orient:
                 orientation = 1
             return np.asarray(rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb)
-    except InputError:
-        raise
-    except Image.DecompressionBombError:
-        raise InputError(_too_large(path, "several times as many")) from None
-    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more on broken files
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from None
 
 
 def read_header(content: bytes) -> tuple[int, int | None]:
@@ -200,7 +194,3 @@ def _color_values(content: np.ndarray) -> np.ndarray:
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise ValueError("its 16 bits of color cannot be decoded")
     return image[..., 2::-1]
-
-
-def _too_large(path: Path, size: str) -> str:
-    return f"{path}: expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image"

@@ -67,8 +67,8 @@ def reading(path: Path, kind: str = "a file", mend: str = "is it whole, and of t
         yield
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
-    except Exception as error:  # zipfile, zlib, NumPy and HDF5 share no class of errors
-        reason = " ".join(str(error).split()) or type(error).__name__
+    except Exception as error:  # zipfile, zlib, NumPy, HDF5 and decoders of images share no class of errors
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); {mend}") from None
 
 

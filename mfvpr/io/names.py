@@ -41,7 +41,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         free = foreign.keys() - set(matched)
         rows = [row for row, match in enumerate(matched) if match is None]
         if free and rows:
-            _match_ends(path, names, rows, _Ends(free, variants), matched)
+            candidates = _candidates([names[row] for row in rows], free, variants)
+            _match_ends(path, names, dict(zip(rows, candidates, strict=True)), matched)
     return matched
 
 
@@ -85,27 +86,19 @@ def adds_folders(name: str, match: str) -> bool:
     return bool(_prefix(name, match)[0])
 
 
-class _Ends:
-    """Index of foreign names by the whole name and by every end of it."""
-
-    def __init__(self, foreign: Iterable[str], variants: Callable[[str], list[str]]) -> None:
-        self.variants = variants
-        self.by_variant: dict[str, set[str]] = defaultdict(set)
-        self.by_end: dict[str, set[str]] = defaultdict(set)
-        for name in foreign:
-            for variant in variants(printable(name)):
-                self.by_variant[variant].add(name)
-                for end in _ends(variant):
-                    self.by_end[end].add(name)
-
-    def candidates(self, name: str) -> set[str]:
-        """Foreign names that may mean this image."""
-        variant = self.variants(printable(name))[0]
-        shorter = (self.by_variant.get(end, set()) for end in _ends(variant))
-        return set().union(self.by_end.get(variant, set()), *shorter)
+def _candidates(names: Iterable[str], foreign: Iterable[str], variants: Callable[[str], list[str]]) -> list[set[str]]:
+    """For each image, the foreign names that may mean it: one of both paths is the end of the other."""
+    by_variant, by_end = defaultdict(set), defaultdict(set)
+    for name in foreign:
+        for variant in variants(printable(name)):
+            by_variant[variant].add(name)
+            for end in _ends(variant):
+                by_end[end].add(name)
+    images = [variants(printable(name))[0] for name in names]
+    return [by_end[image].union(*(by_variant[end] for end in _ends(image))) for image in images]
 
 
-def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, matched: list[str | None]) -> None:
+def _match_ends(path: Path, names: Sequence[str], candidates: dict[int, set[str]], matched: list[str | None]) -> None:
     """Fill `matched` for pairs of an image and a foreign name that have no other candidates.
 
     Candidates have the prefix of earlier matches, or none: a name at the image's own path contradicts an earlier prefix
@@ -116,10 +109,11 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
         if match is not None:
             examples.setdefault(_prefix(name, match), (name, match))
     prefixes = {*examples, _NO_PREFIX}
-    candidates = {
-        row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in prefixes}
-        for row in rows
-    }
+    if examples:
+        candidates = {
+            row: {match for match in matches if _prefix(names[row], match) in prefixes}
+            for row, matches in candidates.items()
+        }
     num_images = Counter(name for row_candidates in candidates.values() for name in row_candidates)
     for row, row_candidates in candidates.items():
         if not row_candidates:

@@ -1,12 +1,12 @@
 """Read lists of image pairs: hloc's `query database` and kapture's `query, reference, score`."""
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence, Set
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from mfvpr.io.containers import shorten
+from mfvpr.io.containers import reading, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 from mfvpr.utils.numbers import parse_number
@@ -23,18 +23,6 @@ class Pair(NamedTuple):
     score: float | None = None
 
 
-class _Names:
-    """Paths of the query or database images, and the file names and stems that may stand for them."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        self.paths = {printable(name) for name in names}
-        paths = [PurePosixPath(name) for name in self.paths]
-        self.ends = {path.name for path in paths} | {path.stem for path in paths}
-
-    def has_end(self, text: str) -> bool:
-        return PurePosixPath(text).name in self.ends
-
-
 def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> list[Pair]:
     """Read the pairs of a file, in its order.
 
@@ -44,26 +32,31 @@ def read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[
     Raises:
         InputError: a line has no split with known names, or several.
     """
-    try:
+    with reading(path, mend="expected a text file of image pairs"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a text file of image pairs") from None
-    queries, database = _Names(query_names), _Names(database_names)
+    sides = [{printable(name) for name in names} for names in (query_names, database_names)]
+    ends = [{end for name in names for end in _ends(name)} for names in sides]
     pairs = []
     for number, line in enumerate(text.split("\n"), start=1):
         stripped = printable(line.strip())
-        if stripped and (pair := _pair(f"{path}: line {number}", stripped, queries, database)):
+        if stripped and (pair := _pair(f"{path}: line {number}", stripped, sides, ends)):
             pairs.append(pair)
     return pairs
 
 
-def _pair(where: str, line: str, queries: _Names, database: _Names) -> Pair | None:
+def _ends(name: str) -> tuple[str, str]:
+    """File name and stem, which may stand for an image."""
+    return PurePosixPath(name).name, PurePosixPath(name).stem
+
+
+def _pair(where: str, line: str, sides: Sequence[Set[str]], ends: Sequence[Set[str]]) -> Pair | None:
+    """The pair of a line; `sides` are the paths of query and database images, `ends` the ends of these paths."""
     words = line.split()
-    if len(words) == 2 and words[0] in queries.paths and words[1] in database.paths:
+    if len(words) == 2 and words[0] in sides[0] and words[1] in sides[1]:
         return Pair(words[0], words[1])  # nearly every line of hloc
     splits = list(_splits(line))
-    pairs = [pair for pair in splits if pair.query in queries.paths and pair.database in database.paths]
-    pairs = pairs or [pair for pair in splits if queries.has_end(pair.query) and database.has_end(pair.database)]
+    pairs = [pair for pair in splits if pair.query in sides[0] and pair.database in sides[1]]
+    pairs = pairs or [pair for pair in splits if _ends(pair.query)[0] in ends[0] and _ends(pair.database)[0] in ends[1]]
     if len(pairs) == 1:
         return pairs[0]
     if not pairs and line.startswith("#"):

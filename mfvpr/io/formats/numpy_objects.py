@@ -7,7 +7,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mfvpr.io.formats.pickles import DataUnpickler, Name, excerpt, file_size, name_error, natural_number, of_type
+from mfvpr.io.containers import shorten
+from mfvpr.io.formats.pickles import DataUnpickler, Name, file_size, name_error, natural_number, of_type
 from mfvpr.utils.errors import InputError
 
 MAGIC = b"\x93NUMPY"
@@ -124,11 +125,11 @@ def _header_shape(file: BinaryIO, expected: str) -> tuple[int, ...]:
     header = file.read(length)
     fields = _HEADER.fullmatch(header)
     if not fields:
-        got = excerpt(header.decode("latin-1").strip())
+        got = shorten(header.decode("latin-1").strip())
         raise InputError(f"expected {expected}, got an array, {got}; use the official file")
     return (int(fields[2]),) if fields[2] else ()
 
 
 def _type_error(array_type: Type, where: str = "") -> InputError:
-    code = excerpt(array_type.code)
+    code = shorten(array_type.code)
     return InputError(f"expected arrays of integers, float32 or float64, got {code}{where}; use the official file")
