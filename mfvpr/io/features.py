@@ -78,16 +78,12 @@ class ImportedFeatures:
             InputError: an image is missing, or its arrays are damaged or do not fit each other.
         """
         rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else [int(row) for row in rows]
-        images = [self._image(row) for row in rows]
-        arrays = self._container.arrays(images, PARTS)
-        for row, image, parts in zip(rows, images, arrays, strict=True):
-            yield row, self._features(row, f"{self.path}: {shorten(image)}", parts)
-
-    def _image(self, row: int) -> str:
-        image = self._images[row] if 0 <= row < len(self) else None
-        if image is None:
-            raise InputError(f"{self.path}: expected features of image {row}, got none; see counts")
-        return image
+        images = {row: image for row in rows if 0 <= row < len(self) and (image := self._images[row]) is not None}
+        if missing := [row for row in rows if row not in images]:
+            raise InputError(f"{self.path}: expected features of image {missing[0]}, got none; see counts")
+        arrays = self._container.arrays([images[row] for row in rows], PARTS)
+        for row, parts in zip(rows, arrays, strict=True):
+            yield row, self._features(row, f"{self.path}: {shorten(images[row])}", parts)
 
     def _features(self, row: int, where: str, parts: Mapping[str, np.ndarray]) -> Features:
         count, shape = int(self.counts[row]), (int(self.counts[row]), self.dimension)
@@ -135,7 +131,8 @@ def open_features(
     path = Path(path)
     require_word("lengths", lengths, Lengths)
     sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
-    container = open_container(path)
+    readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile}
+    container: Container = NpzFolder(path) if path.is_dir() else choose_reader(path, readers)(path)
     images = match_names(path, names, container.images)
     if not partial or not any(images):
         require_all(path, names, images, "features")
@@ -192,13 +189,6 @@ def write_features(
             if not inside.parts or inside.is_absolute() or ".." in inside.parts:
                 raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
             write_npz(path / f"{name}.npz", arrays.items())
-
-
-def open_container(path: Path) -> Container:
-    """Open a folder, or a file by its suffix."""
-    if path.is_dir():
-        return NpzFolder(path)
-    return choose_reader(path, {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile})(path)
 
 
 def _require_parts(where: str, parts: Collection[str]) -> None:

@@ -84,7 +84,7 @@ class NpzFolder(Container):
 def read_npz(path: Path, parts: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays, or those among `parts`, of an archive; InputError if it is damaged, or holds objects."""
     with _open_archive(path) as archive:
-        members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
         return {part: _array(archive, members[part]) for part in parts or members if part in members}
 
 
