@@ -8,9 +8,8 @@ from typing import Any
 from mfvpr.cli import build, truth
 from mfvpr.cli.console import Progress, tell
 from mfvpr.datasets import Dataset, QuerySequence
-from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.contents import Contents, OwnRows, own_rows
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.sequences import OwnRows, own_rows, without_neighbors
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation import Pipeline, match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
@@ -78,7 +77,7 @@ def _images(settings: dict[str, Any], cache: FeatureCache) -> Images:
         sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
         same_images.append(own_rows(contents, sides["database"]))
         if neighbors is not None:
-            sequence = without_neighbors(sequence, len(dataset.database), same_images[-1], neighbors)
+            sequence = sequence.without_neighbors(len(dataset.database), same_images[-1], neighbors)
         sequences.append(sequence)
     images = Images(replace(dataset, sequences=tuple(sequences)), sides)
     for difference in published_differences(images.dataset):
@@ -172,7 +171,7 @@ def _warn_of_sequence(settings: dict[str, Any], sequence: QuerySequence, same_im
     ground_truth, thresholds = sequence.truth, truth.thresholds(settings, sequence.truth)
     if ground_truth is None:
         return
-    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
+    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).rows.size, thresholds))
     if without == thresholds:
         tell("warning: the ground truth has no correct image for any query; every recall will be 0")
     elif without:

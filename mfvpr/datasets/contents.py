@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import astuple, dataclass
@@ -15,7 +16,7 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
-from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.datasets import ImageFolder, OwnRows
 from mfvpr.datasets.images import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.threads import ordered_map
@@ -102,6 +103,15 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < start - SETTLED}
         _write_records(path, records | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
     return Contents(folder, tuple(files[name] for name in folder.names))
+
+
+def own_rows(queries: Contents, database: Contents) -> OwnRows:
+    """For each query, the database rows of files with the same content."""
+    rows = defaultdict(list)
+    for row, file in enumerate(database.files):
+        if file.sha256:
+            rows[file.sha256].append(row)
+    return tuple(tuple(rows.get(file.sha256, ())) for file in queries.files)
 
 
 def files_of(path: PurePath) -> ImageFolder:

@@ -21,14 +21,11 @@ from mfvpr.utils.numbers import parse_number
 Unit = Literal["frames", "m", "exact"]
 TOLERANCES = (1, 2, 5)  # frames
 RADIUS = 25.0  # meters
-KINDS = {
-    "order": "query i shows database image i",
-    "index": "a file of pairs",
-    "utm": "positions in the names, @easting@northing@...",
-    "label": "two csv files of name,label: images with the same label (floor, room) are correct",
-    "none": "rankings only",
-}
-CHOICES = "; ".join(f"{kind} ({meaning})" for kind, meaning in KINDS.items())
+CHOICES = (
+    "order (query i shows database image i); index (a file of pairs); utm (positions in the names, "
+    "@easting@northing@...); label (two csv files of name,label: images with the same label (floor, room) are "
+    "correct); none (rankings only)"
+)
 _NO_ROWS = np.zeros(0, np.int32)
 FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 

@@ -43,14 +43,12 @@ class ImportedFeatures:
 
     Attributes:
         path: file or folder.
-        paths: files with the images.
         counts: keypoints of each image, -1 = missing image.
         dimension: D; 0 if no image has a keypoint.
         scored: whether the files have scores; if not, all are 1.
     """
 
     path: Path
-    paths: tuple[Path, ...]
     counts: Int32[np.ndarray, " images"]
     dimension: int
     scored: bool
@@ -147,7 +145,6 @@ def open_features(
         raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
     return ImportedFeatures(
         path=path,
-        paths=tuple(dict.fromkeys(container.entry(image).file for image in rows)),
         counts=counts,
         dimension=dimension,
         scored=not without,

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from mfvpr.datasets.streets.camera import NEAR, SPACING, Camera, plan_drives, plan_return, write_ground_truth
-from mfvpr.datasets.streets.cars import traffic
 from mfvpr.datasets.streets.colors import Floats, Image
+from mfvpr.datasets.streets.objects import traffic
 from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
 from mfvpr.datasets.streets.sheets import Panel, Prop
 from mfvpr.datasets.streets.weather import WEATHERS, Weather, expose
