@@ -27,14 +27,9 @@ SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks e
 
 @dataclass(frozen=True)
 class Content:
-    """Hash and header of one file.
+    """Hash and header of one file, see `mfvpr.datasets.images.read_header`."""
 
-    Attributes:
-        sha256: of all bytes; "" = the file cannot be read.
-        orientation, largest: see `mfvpr.datasets.images.read_header`.
-    """
-
-    sha256: str = ""
+    sha256: str = ""  # of all bytes; "" = the file cannot be read
     orientation: int = 1
     largest: int | None = None
 
@@ -72,11 +67,10 @@ class Contents:
 
     def summary(self) -> dict[str, int | bool | None]:
         """Conversions of the images when they are read: numbers of turned and of scaled images, for results."""
-        num_turned = sum(file.orientation != 1 for file in self.files)
         largest = [file.largest for file in self.files if file.largest is not None]
         return {
             "orient": self.folder.orient,
-            "turned": num_turned if self.folder.orient else 0,
+            "turned": sum(file.orientation != 1 for file in self.files) if self.folder.orient else 0,
             "bits": self.folder.bits,
             "scaled_16bit": len(largest) if self.folder.bits is not None else 0,
             "largest_16bit": max(largest, default=None),

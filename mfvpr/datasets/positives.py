@@ -59,7 +59,8 @@ class Positives:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
         offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
-        return cls._from_csr(_csr(flat.astype(np.int32, copy=False), offsets, num_database))
+        content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
+        return cls._from_csr(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -138,7 +139,8 @@ class Positives:
             raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
 
     def _csr(self) -> "scipy.sparse.csr_array":
-        return _csr(self.rows, self.offsets, self.num_database)
+        content = np.ones(len(self.rows), bool), self.rows, self.offsets
+        return scipy.sparse.csr_array(content, shape=(len(self), self.num_database))
 
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
@@ -183,7 +185,3 @@ def radius_positives(
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
     return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
-
-
-def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> "scipy.sparse.csr_array":
-    return scipy.sparse.csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))

@@ -183,6 +183,13 @@ class AllowedTruth(Truth):
         return distance
 
 
+def require_positions(where: str, xy: np.ndarray, count: int) -> None:
+    """Raise an InputError unless there is a position in meters for each of `count` images."""
+    if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
+        got = f"shape {list(xy.shape)}" if xy.shape != (count, 2) else f"{np.abs(xy).max():g} m"
+        raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
+
+
 def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
     """Ground truth where query i shows database image i, in file order."""
     if num_queries != num_database:
@@ -200,15 +207,11 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
 
 def _position(name: str) -> tuple[float, float]:
     """Easting and northing in a file's name; its folders may contain '@' as well."""
-    fields = PurePosixPath(name).name.split("@")
     try:
-        easting, northing = parse_number(fields[1]), parse_number(fields[2])
-    except (IndexError, ValueError):
-        raise InputError(
-            f"{name}: expected a name like @easting@northing@...; or choose another ground truth"
-        ) from None
-    if not (abs(easting) <= FARTHEST and abs(northing) <= FARTHEST):  # NaN neither
-        raise InputError(
-            f"{name}: expected easting and northing of at most {FARTHEST:g} m, got {easting:g} and {northing:g}"
-        )
-    return easting, northing
+        easting, northing = map(parse_number, PurePosixPath(name).name.split("@")[1:3])
+        if abs(easting) <= FARTHEST and abs(northing) <= FARTHEST:  # NaN neither
+            return easting, northing
+    except ValueError:
+        pass
+    expected = f"a name like @easting@northing@..., in meters up to {FARTHEST:g}"
+    raise InputError(f"{name}: expected {expected}; or choose another ground truth")

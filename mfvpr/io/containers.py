@@ -14,29 +14,18 @@ Shapes = Mapping[str, tuple[int, ...]]  # by the name of the array
 
 
 class FileEntry(NamedTuple):
-    """Place of an image's arrays.
-
-    Attributes:
-        file: file with the arrays.
-        name: name of the image in the file; "" = the file holds one image.
-    """
+    """Place of an image's arrays."""
 
     file: Path
-    name: str
+    name: str  # of the image in the file; "" = the file holds one image
 
 
 class Container:
-    """Base class of readers of several images, which read only the requested arrays.
+    """Base class of readers of several images, which read only the requested arrays."""
 
-    Attributes:
-        path: file or folder, for messages.
-        images: names of the images in the file.
-        transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
-    """
-
-    path: Path
-    images: tuple[str, ...]
-    transposed = False
+    path: Path  # file or folder, for messages
+    images: tuple[str, ...]  # their names in the file
+    transposed = False  # whether descriptors are `[D, N]` if their shapes fit both layouts
 
     def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         """For each image, the shapes of its arrays among `parts`, and () for its other arrays; reads no values."""

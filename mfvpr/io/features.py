@@ -4,8 +4,7 @@
     for row, image_features in features.read([3, 14]):
         ...
 
-Formats: hloc's h5; an npz for all images, with arrays named `image/part`; a folder with an npz or a `.d2-net` (of
-D2-Net's code) for each image. Parts of an image:
+Parts of an image in a file:
 
 - `keypoints` `[N, 2]` (x, y), px; up to two more columns (scale, angle) are ignored;
 - `descriptors` `[D, N]` (hloc) or `[N, D]`;
@@ -114,7 +113,8 @@ def open_features(
     """Open the features of the images `names`; reads only the headers of their arrays.
 
     Args:
-        path: `.h5` or `.hdf5` of hloc, `.npz` of all images, or a folder of `.npz` and `.d2-net`.
+        path: `.h5` or `.hdf5` of hloc; `.npz` of all images, with arrays named `image/part`; or a folder with a `.npz`
+            or a `.d2-net` (of D2-Net's code) for each image.
         names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Use hloc's paths if they
             begin at a parent folder (`database/1.jpg`).
         image_size: `[2]` or `[M, 2]` (width, height), px, if the files have no `image_size`.

@@ -4,11 +4,13 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 from mfvpr.io.containers import FileEntry, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 
+Entry = TypeVar("Entry")
 Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders only in the file's names, only in the images' names
 ImageOfEntry = dict[tuple[int, int, str], Path]  # device, inode and name of an entry -> image
 _NO_PREFIX: Prefix = ((), ())
@@ -52,8 +54,8 @@ def require_different(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"{path}: expected different names, got {shorten(twice[0])} twice; rename one of the images")
 
 
-def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], content: str) -> list[str]:
-    """Return the result of `match_names`; raise an InputError if the file lacks the `content` of an image."""
+def require_all(path: Path, names: Sequence[str], matched: Sequence[Entry | None], content: str) -> list[Entry]:
+    """Return what a file has of each image, if that is not None; InputError if it lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
         raise InputError(f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; "

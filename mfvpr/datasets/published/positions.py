@@ -9,7 +9,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.positives import rows_within
 from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images
-from mfvpr.datasets.truth import FARTHEST, RadiusTruth
+from mfvpr.datasets.truth import FARTHEST, RadiusTruth, require_positions
 from mfvpr.io.containers import reading
 from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
@@ -50,8 +50,7 @@ def _dataset_of_structure(root: Path, name: str, path: Path) -> Dataset:
         sides = [_cell_texts(arrays, f"dbStruct.{field}.") for field in ("dbImageFns", "qImageFns")]
         positions = [arrays[f"dbStruct.{field}"].T.astype(np.float64) for field in ("utmDb", "utmQ")]
     for names, xy in zip(sides, positions, strict=True):
-        if xy.shape != (len(names), 2) or not np.isfinite(xy).all():
-            raise InputError(f"{path}: expected a position for each of {len(names)} images, got {list(xy.shape)}")
+        require_positions(str(path), xy, len(names))
     database = listed_images(root, sides[0], path)
     queries = listed_images(root, [f"{QUERIES}/{query}" for query in sides[1]], path)
     truth = RadiusTruth(positions[1], positions[0])
