@@ -21,6 +21,7 @@ pitts30k_{part}_dbImages.npy, _qImages.npy, _gt.npy (_gt_25m.npy)"""
 QUERIES = "queries_real"
 CITIES = ("cph", "sf")
 REACH = 25.0  # meters; images without a database image within it are no queries
+_FLAGS = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
 TABLES = ("raw", "postprocessed", "subtask_index")
 MSLS_LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
 train_val/cph/query, train_val/sf/database, train_val/sf/query  the same; or, as GSV-Cities has them,
@@ -101,7 +102,8 @@ def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]
                          "again")  # fmt: skip
     for key, line in processed.items():
         try:
-            if _flag(raw[key]["pano"]) or not _flag(tasks[key]["all"]):
+            is_panorama, is_of_all = (_FLAGS[text.strip().lower()] for text in (raw[key]["pano"], tasks[key]["all"]))
+            if is_panorama or not is_of_all:
                 continue
             position = parse_number(line["easting"]), parse_number(line["northing"])
             if not all(abs(meters) <= FARTHEST for meters in position):  # NaN neither
@@ -112,11 +114,6 @@ def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]
                 f"{folder}: key {key[:60]!r}: expected pano in raw.csv and all in subtask_index.csv (True or False), "
                 "easting and northing in postprocessed.csv (meters); get them again"
             ) from None
-
-
-def _flag(text: str) -> bool:
-    """Parse a flag as pandas does."""
-    return {"true": True, "1": True, "false": False, "0": False}[text.strip().lower()]
 
 
 def _table(path: Path) -> dict[str, dict[str, str]]:

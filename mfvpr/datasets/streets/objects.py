@@ -44,7 +44,12 @@ def build_car(seed: int, index: int) -> Car:
     right = texture(draw_side(rng, body, color))
     rear = texture(draw_end(body, color, (160, 30, 30), (255, 50, 40)))
     front = texture(draw_end(body, color, (236, 236, 228), (255, 250, 230)))
-    shadow, top, glass = texture(draw_shadow()), texture(draw_top(color)), texture(draw_glass(body, color))
+    shadow, top = Sheet(2.0, 2.0, None), Sheet(1.0, 1.0, tone(color, 1.1))
+    shadow.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
+    top.settle_snow(235)
+    glass = Sheet(body.width, body.roof - body.hood, color)  # rear window or windshield with its frame
+    glass.rect(0.12, 0.08, body.width - 0.24, min(0.8, glass.height - 0.12), (48, 58, 68))
+    covers = [texture(sheet) for sheet in (shadow, top, glass)]
 
     def left(weather: Weather) -> Image:
         return right(weather)[:, ::-1]
@@ -52,6 +57,7 @@ def build_car(seed: int, index: int) -> Car:
     def assemble(near: tuple[float, float], far: tuple[float, float], end: Texture, sides: tuple[Texture, ...]) -> Prop:
         width, length, x = body.width, body.length, -body.width / 2
         roof, across = length - far[1], (width, 0, 0)
+        shadow, top, glass = covers
         panels = (
             Panel(shadow, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
             Panel(top, (x, -body.hood, length), across, (0, 0, -length)),
@@ -106,25 +112,6 @@ def draw_end(body: Body, paint: Color, lights: Color, glow: Color) -> Sheet:
     sheet.rect(body.width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
     for x in (0.08, body.width - 0.4):
         sheet.rect(x, 0.12, 0.32, 0.18, lights, glow)
-    return sheet
-
-
-def draw_top(paint: Color) -> Sheet:
-    sheet = Sheet(1.0, 1.0, tone(paint, 1.1))
-    sheet.settle_snow(235)
-    return sheet
-
-
-def draw_glass(body: Body, paint: Color) -> Sheet:
-    """The rear window or windshield with its frame."""
-    sheet = Sheet(body.width, body.roof - body.hood, paint)
-    sheet.rect(0.12, 0.08, body.width - 0.24, min(0.8, sheet.height - 0.12), (48, 58, 68))
-    return sheet
-
-
-def draw_shadow() -> Sheet:
-    sheet = Sheet(2.0, 2.0, None)
-    sheet.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
     return sheet
 
 
