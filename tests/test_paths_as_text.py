@@ -30,7 +30,7 @@ def public_functions():
 def test_signatures_say_so():
     checked = {function.__name__ for function in public_functions()}
     assert {"open_features", "image_folder", "read_frames", "read_confidences", "truth_from_file"} <= checked
-    internal = {"read_npz", "reading", "replacing", "require_file", "write_text"}
+    internal = {"choose_reader", "read_npz", "reading", "replacing", "require_all", "require_file", "write_text"}
     for function in public_functions():
         if function.__name__ not in internal:
             for parameter in inspect.signature(function).parameters.values():
