@@ -35,10 +35,11 @@ def _arrays(layers: dict[Any, Any], room: int) -> dict[str, np.ndarray]:
             where = f" at {shorten(key)}"
             if not isinstance(array, Array):
                 raise InputError(f"expected arrays by layer, got {type(array).__name__}{where}; {MEND}")
-            room -= array.num_bytes(where) + _ENTRY
+            numbers = array.numbers(where)
+            room -= numbers.nbytes + _ENTRY
             if room < 0:
                 raise InputError(f"expected no more values than the file stores{where}; use the official file")
             if key in arrays:
                 raise ValueError("two arrays of one name")
-            arrays[key] = array.numbers(where)
+            arrays[key] = numbers
     return arrays
