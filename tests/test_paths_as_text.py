@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
-from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, truth_files, videos
+from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, images, truth_files
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
 from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
@@ -21,8 +21,8 @@ from tests.io.other_programs import feature
 
 
 def public_functions():
-    modules = (calibration, datasets, io, truth_files, videos, weight_registry)
-    functions = [value for module in modules for name, value in vars(module).items() if not name.startswith("_")]
+    modules = (calibration, datasets, images, io, truth_files, weight_registry)
+    functions = [getattr(module, name) for module in modules for name in dir(module) if not name.startswith("_")]
     return {function for function in (*functions, draw_streets, published_dataset, streets_folder)
             if inspect.isfunction(function) and function.__module__.startswith("mfvpr.")}  # fmt: skip
 
@@ -30,7 +30,7 @@ def public_functions():
 def test_signatures_say_so():
     checked = {function.__name__ for function in public_functions()}
     assert {"open_features", "image_folder", "read_frames", "read_confidences", "truth_from_file"} <= checked
-    internal = {"require_file", "replacing", "write_text"}
+    internal = {"choose_reader", "read_npz", "reading", "replacing", "require_all", "require_file", "write_text"}
     for function in public_functions():
         if function.__name__ not in internal:
             for parameter in inspect.signature(function).parameters.values():

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.io.formats.pickles import excerpt
+from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 
 
@@ -83,9 +83,9 @@ def convert(
         targets = _targets(key, table)
         target, layout = targets[0] if targets else ("", Layout.COPY)
         if len(targets) > 1:
-            problems["with several rules"].append(excerpt(key))
+            problems["with several rules"].append(shorten(key))
         elif target not in shapes:
-            problems["unknown"].append(excerpt(key))
+            problems["unknown"].append(shorten(key))
         elif target in origin:
             problems["twice"].append(f"{key} and {origin[target]}")
         else:

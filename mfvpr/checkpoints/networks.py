@@ -12,7 +12,7 @@ import numpy as np
 from mfvpr.checkpoints import tables
 from mfvpr.checkpoints.conversion import Rule, Table, convert, known_share
 from mfvpr.checkpoints.registry import REGISTRY, Entry
-from mfvpr.io.formats.pickles import excerpt
+from mfvpr.io.containers import shorten
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -104,7 +104,7 @@ def resemblance(keys: Sequence[str], expected: Network) -> str | None:
     *parts, _ = keys[0].split(".", maxsplit=_MAX_PREFIX)
     for prefix in accumulate(f"{part}." for part in parts):
         if known_share([key.removeprefix(prefix) for key in keys], expected.table) > _LIKELY_SHARE:
-            return f"its keys begin with {excerpt(prefix)}, which the official file's do not"
+            return f"its keys begin with {shorten(prefix)}, which the official file's do not"
     return None
 
 

@@ -4,8 +4,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from mfvpr.io.containers import shorten
 from mfvpr.io.formats.numpy_objects import Array, read_objects
-from mfvpr.io.formats.pickles import MEND, excerpt, file_size, of_type
+from mfvpr.io.formats.pickles import MEND, file_size, of_type
 from mfvpr.utils.errors import InputError
 
 _MAX_NAME = 100  # characters of layer and name
@@ -26,18 +27,19 @@ def _arrays(layers: dict[Any, Any], room: int) -> dict[str, np.ndarray]:
     arrays = {}
     for layer, parts in layers.items():
         if not isinstance(parts, dict):
-            raise InputError(f"expected arrays by layer, got {type(parts).__name__} at {excerpt(str(layer))}; {MEND}")
+            raise InputError(f"expected arrays by layer, got {type(parts).__name__} at {shorten(str(layer))}; {MEND}")
         for name, array in parts.items():
             if len(of_type(str, layer)) + len(of_type(str, name)) > _MAX_NAME:
                 raise ValueError("a name of too many characters")
             key = f"{layer}.{name}"
-            where = f" at {excerpt(key)}"
+            where = f" at {shorten(key)}"
             if not isinstance(array, Array):
                 raise InputError(f"expected arrays by layer, got {type(array).__name__}{where}; {MEND}")
-            room -= array.num_bytes(where) + _ENTRY
+            numbers = array.numbers(where)
+            room -= numbers.nbytes + _ENTRY
             if room < 0:
                 raise InputError(f"expected no more values than the file stores{where}; use the official file")
             if key in arrays:
                 raise ValueError("two arrays of one name")
-            arrays[key] = array.numbers(where)
+            arrays[key] = numbers
     return arrays

@@ -14,7 +14,8 @@ from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
-from mfvpr.io.formats.pickles import MEND, DataUnpickler, Name, excerpt, file_size, name_error, natural_number, of_type
+from mfvpr.io.containers import shorten
+from mfvpr.io.formats.pickles import MEND, DataUnpickler, Name, file_size, name_error, natural_number, of_type
 from mfvpr.utils.errors import InputError
 
 Order = Literal["little", "big"]
@@ -106,7 +107,7 @@ def read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
         if packed or len(set(names)) < len(names) or sum(entry.file_size for entry in entries) > file_size(file):
             raise InputError("expected each entry of the zip file once and uncompressed; use the official file")
         if broken := archive.testzip():
-            raise InputError(f"this checkpoint is damaged, by the checksum of {excerpt(broken)}; download it again")
+            raise InputError(f"this checkpoint is damaged, by the checksum of {shorten(broken)}; download it again")
         (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
         folder = pickle.removesuffix("data.pkl")
         order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
@@ -151,9 +152,9 @@ def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes])
     arrays = {}
     for key, tensor in content.items():
         if not isinstance(key, str):
-            number = excerpt(str(key))
+            number = shorten(str(key))
             raise InputError(f"expected tensors by name, got one by the number {number}; use the official file")
-        where = f" at {excerpt(key)}"
+        where = f" at {shorten(key)}"
         if not isinstance(tensor, Tensor):
             raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
         dtype = _dtype(tensor.storage, where).newbyteorder(order)
@@ -171,6 +172,6 @@ def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes])
 def _dtype(storage: Storage, where: str = "") -> np.dtype:
     """Type of a storage's values; `where` ends the message of an error."""
     if storage.kind not in _DTYPES:
-        kind = excerpt(storage.kind.removesuffix("Storage"))
+        kind = shorten(storage.kind.removesuffix("Storage"))
         raise InputError(f"expected tensors of float32 or float64, got {kind}{where}; use the official file")
     return _DTYPES[storage.kind]

@@ -7,10 +7,9 @@ from typing import Any
 from mfvpr import datasets
 from mfvpr.cli import console
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles
-from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
-from mfvpr.datasets.streets import seasons_folder, streets_folder
-from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
+from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
+from mfvpr.datasets.truth import CHOICES
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Cluster, Runtime
@@ -18,15 +17,14 @@ from mfvpr.utils.files import expand_user
 
 
 def dataset(settings: Mapping[str, Any], progress: Callable[[int, int], None]) -> Dataset:
-    """The data set; `streets` is drawn first if the cache does not have it."""
-    if settings["name"] == "streets_seasons":
-        root = seasons_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
-        queries, truth = [root / name for name in CONDITIONS], IndexFile(TRUTH, is_widened=True)
-        return datasets.folder(root / "database", queries, ground_truth=truth, name="streets_seasons")
+    """The data set; the synthetic street is drawn first if the cache does not have it."""
     if "cache" in settings:
-        root = streets_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
-        truth = IndexFile(root / "ground_truth.csv", is_widened=True)
-        return datasets.folder(root / "database", root / "queries", ground_truth=truth, name="streets")
+        seasons = settings["name"] == "streets_seasons"
+        root = expand_user(settings["cache"])
+        root = streets_folder(root, seasons=seasons, seed=settings["seed"], progress=progress)
+        queries = [root / name for name in CONDITIONS] if seasons else root / "queries"
+        truth = IndexFile(TRUTH if seasons else root / TRUTH, is_widened=True)
+        return datasets.folder(root / "database", queries, ground_truth=truth, name=settings["name"])
     if "ground_truth" not in settings:
         return published_dataset(
             settings["name"],

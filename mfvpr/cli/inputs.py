@@ -7,8 +7,7 @@ from typing import Any
 from mfvpr.cli import build, notes, truth
 from mfvpr.cli.console import Progress
 from mfvpr.datasets import Dataset
-from mfvpr.datasets.contents import Contents
-from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import Pipeline, match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matching import MatchSet, Scales
@@ -87,7 +86,7 @@ def _data(settings: Mapping[str, Any], cache: FeatureCache) -> tuple[Dataset, di
         sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
         if neighbors is not None:
             same_images = own_rows(contents, sides["database"])
-            sequence = without_neighbors(sequence, len(dataset.database), same_images, neighbors)
+            sequence = sequence.without_neighbors(len(dataset.database), same_images, neighbors)
         sequences.append(sequence)
     return replace(dataset, sequences=tuple(sequences)), sides
 

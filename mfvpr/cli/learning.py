@@ -9,7 +9,7 @@ from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.datasets.sequences import OwnRows, own_rows
+from mfvpr.datasets.contents import OwnRows, own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer

@@ -6,9 +6,8 @@ from typing import Any
 
 from mfvpr.cli.console import tell
 from mfvpr.datasets import Dataset, QuerySequence
-from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.contents import Contents, OwnRows, own_rows
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.sequences import OwnRows, own_rows
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.scoring.weight_registry import provenance
@@ -47,7 +46,7 @@ def _warn_of_sequence(sequence: QuerySequence, same_images: OwnRows, thresholds:
         tell(f"note: {queries - same} of {queries} queries are no database images; nothing is left out for them")
     if (ground_truth := sequence.truth) is None:
         return
-    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
+    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).rows.size, thresholds))
     if without == thresholds:
         tell("warning: the ground truth has no correct image for any query; every recall will be 0")
     elif without:

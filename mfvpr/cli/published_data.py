@@ -10,9 +10,8 @@ from mfvpr.cli.inputs import dataset_of
 from mfvpr.cli.launch import refuse
 from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.datasets.published import PUBLISHED, published_differences
-from mfvpr.datasets.sequences import own_rows
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.report import Table
 from mfvpr.report.figures import contact_sheet

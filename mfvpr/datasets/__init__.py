@@ -1,8 +1,7 @@
 """Data sets: images, sequences of queries, and the ground truth.
 
-Read first: datasets (folders of images), ground_truth and positives (what is correct), images (decoding and
-resizing), contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic
-street).
+Read first: datasets (folders of images), truth and positives (what is correct), images (decoding and resizing),
+contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic street).
 
 Imports io, utils.
 """

@@ -19,7 +19,6 @@ __all__ = [
 ]
 
 from .datasets import Dataset, ImageFolder, IndexFile, LabelFiles, QuerySequence, folder, image_folder
-from .ground_truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth
 from .images import read_image, resize
 from .positives import Positives, frame_positives, radius_positives
-from .truth import Truth
+from .truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth, Truth

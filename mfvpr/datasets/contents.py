@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import astuple, dataclass
@@ -15,7 +16,7 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
-from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.datasets import ImageFolder, OwnRows
 from mfvpr.datasets.images import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.threads import ordered_map
@@ -26,14 +27,9 @@ SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks e
 
 @dataclass(frozen=True)
 class Content:
-    """Hash and header of one file.
+    """Hash and header of one file, see `mfvpr.datasets.images.read_header`."""
 
-    Attributes:
-        sha256: of all bytes; "" = the file cannot be read.
-        orientation, largest: see `mfvpr.datasets.images.read_header`.
-    """
-
-    sha256: str = ""
+    sha256: str = ""  # of all bytes; "" = the file cannot be read
     orientation: int = 1
     largest: int | None = None
 
@@ -71,11 +67,10 @@ class Contents:
 
     def summary(self) -> dict[str, int | bool | None]:
         """Conversions of the images when they are read: numbers of turned and of scaled images, for results."""
-        num_turned = sum(file.orientation != 1 for file in self.files)
         largest = [file.largest for file in self.files if file.largest is not None]
         return {
             "orient": self.folder.orient,
-            "turned": num_turned if self.folder.orient else 0,
+            "turned": sum(file.orientation != 1 for file in self.files) if self.folder.orient else 0,
             "bits": self.folder.bits,
             "scaled_16bit": len(largest) if self.folder.bits is not None else 0,
             "largest_16bit": max(largest, default=None),
@@ -102,6 +97,15 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < start - SETTLED}
         _write_records(path, records | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
     return Contents(folder, tuple(files[name] for name in folder.names))
+
+
+def own_rows(queries: Contents, database: Contents) -> OwnRows:
+    """For each query, the database rows of files with the same content."""
+    rows = defaultdict(list)
+    for row, file in enumerate(database.files):
+        if file.sha256:
+            rows[file.sha256].append(row)
+    return tuple(tuple(rows.get(file.sha256, ())) for file in queries.files)
 
 
 def files_of(path: PurePath) -> ImageFolder:

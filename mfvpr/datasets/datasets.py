@@ -3,21 +3,21 @@
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.ground_truth import CHOICES, truth_by_order, truth_from_names
 from mfvpr.datasets.images import read_image
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Truth
+from mfvpr.datasets.truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_by_order, truth_from_names
 from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
+OwnRows = tuple[tuple[int, ...], ...]  # database rows of files with the content of each query
 MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
@@ -93,6 +93,24 @@ class QuerySequence:
     def __repr__(self) -> str:
         truth = type(self.truth).__name__ if self.truth else "no ground truth"
         return f"QuerySequence({self.name}: {len(self.images)} queries, {truth})"
+
+    def without_neighbors(self, num_database: int, query_rows: OwnRows, neighbors: int) -> "QuerySequence":
+        """Exclude each query and its neighbors within `neighbors` frames from its candidates; 0 = the query alone.
+
+        Excluded images are not correct either: a query without other correct images counts as a failure. `query_rows`
+        are the rows of each query in the database, which is a sequence of `num_database` images.
+
+        Raises:
+            InputError: no query is among the database images, so that their frame numbers are unknown.
+        """
+        if not any(query_rows):
+            raise InputError(
+                f"exclude_neighbors={neighbors}: expected queries that are among the database images, got none in "
+                f"{self.images.root}; leave it out for two different sequences"
+            )
+        excluded = FrameTruth(query_rows, num_database).positives(neighbors)
+        truth = None if self.truth is None else AllowedTruth(self.truth, excluded)
+        return replace(self, truth=truth, excluded=excluded)
 
 
 @dataclass(frozen=True, repr=False)

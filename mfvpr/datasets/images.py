@@ -1,10 +1,11 @@
-"""Read and resize images: files -> RGB arrays `[H, W, 3]`.
+"""Read and resize images: files, also frames of videos -> RGB arrays `[H, W, 3]`.
 
 Decoding and the default resampling are Pillow's, as in the published networks' code. In addition, images are turned by
 their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
 import warnings
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -14,10 +15,12 @@ import numpy as np
 from jaxtyping import Num, UInt8
 from PIL import Image, ImageFile
 
+from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
 MAX_PIXELS = 64_000_000
+VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 Interpolation = Literal[
     "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
@@ -56,16 +59,16 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             or of 32 bits a channel, whose range is unknown (unless `bits` is None).
     """
     path = Path(path)
-    try:
-        require_file(path, "an image file")
+    with reading(path, "an image file", "replace or remove it"):
         if path.stat().st_size == 0:
-            raise InputError(f"{path}: expected an image file, got 0 bytes; replace or remove it")
+            raise InputError("expected an image file, got 0 bytes; replace or remove it")
         with Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise InputError(_too_large(path, f"{image.width} x {image.height} px"))
+                size = f"{image.width} x {image.height} px"
+                raise InputError(f"expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image")
             used = _bits_in_use(image, bits)
             if used is None and bits is not None and image.mode in ("I", "F"):
-                raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
+                raise InputError("expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
             orientation = _orientation(image)
             rgb = _as_rgb(image, path, used)
             if image.format == "TIFF":  # already turned by Pillow
@@ -73,13 +76,6 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             elif not orient:
                 orientation = 1
             return np.asarray(rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb)
-    except InputError:
-        raise
-    except Image.DecompressionBombError:
-        raise InputError(_too_large(path, "several times as many")) from None
-    except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more on broken files
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from None
 
 
 def read_header(content: bytes) -> tuple[int, int | None]:
@@ -129,6 +125,28 @@ def resize(
     return np.asarray(cv2.resize(image, size, interpolation=_CV2[interpolation]))
 
 
+def read_frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+    """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame.
+
+    Raises:
+        InputError: no video, or a video without readable frames.
+    """
+    path = Path(path)
+    require_file(path, "a video file")
+    video, number = cv2.VideoCapture(str(path)), 0
+    try:
+        while video.grab():
+            if number % every == 0:
+                is_valid, image = video.retrieve()
+                if is_valid:
+                    yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            number += 1
+    finally:
+        video.release()
+    if not number:
+        raise InputError(f"{path}: expected a video, got a file without frames that can be read; convert it")
+
+
 def _orientation(image: Image.Image) -> int:
     try:
         value = image.getexif().get(_ORIENTATION, 1)
@@ -176,7 +194,3 @@ def _color_values(content: np.ndarray) -> np.ndarray:
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise ValueError("its 16 bits of color cannot be decoded")
     return image[..., 2::-1]
-
-
-def _too_large(path: Path, size: str) -> str:
-    return f"{path}: expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image"

@@ -58,8 +58,9 @@ class Positives:
         if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
                              f"{flat.max()}; check the ground truth")  # fmt: skip
-        flat, offsets = flat.astype(np.int32, copy=False), _offsets(list(map(len, per_query)))
-        return cls._from_csr(_csr(flat, offsets, num_database))
+        offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
+        content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
+        return cls._from_csr(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -83,31 +84,14 @@ class Positives:
         """Number of rows of each query."""
         return np.diff(self.offsets)
 
-    def any(self) -> bool:
-        """Whether at least one query has rows."""
-        return len(self.rows) > 0
-
     def of(self, query: int) -> Int[np.ndarray, " _"]:
         """Rows of one query, ascending."""
         query = range(len(self))[query]
         return self.rows[self.offsets[query] : self.offsets[query + 1]]
 
-    def union(self) -> Bool[np.ndarray, " database"]:
-        """Mask of the rows of all queries."""
-        union = np.zeros(self.num_database, bool)
-        union[self.rows] = True
-        return union
-
     def take(self, queries: Any) -> "Positives":
         """Select queries by numbers `[q]` in any order, a mask `[Q]`, or a slice."""
         return self._from_csr(self._csr()[np.arange(len(self))[queries]])
-
-    def among(self, allowed: np.ndarray) -> "Positives":
-        """Select the rows that a mask `[N]` of the database allows."""
-        if np.shape(allowed) != (self.num_database,):
-            raise InputError(f"allowed: expected shape ({self.num_database},), got {np.shape(allowed)}")
-        is_allowed = np.asarray(allowed, bool)[self.rows]
-        return Positives(self.rows[is_allowed], _offsets(is_allowed)[self.offsets], self.num_database)
 
     def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
         """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
@@ -155,7 +139,8 @@ class Positives:
             raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
 
     def _csr(self) -> "scipy.sparse.csr_array":
-        return _csr(self.rows, self.offsets, self.num_database)
+        content = np.ones(len(self.rows), bool), self.rows, self.offsets
+        return scipy.sparse.csr_array(content, shape=(len(self), self.num_database))
 
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
@@ -171,9 +156,6 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
     """Database rows int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
-    if not len(database_xy):
-        yield from (np.zeros(0, np.int32) for _ in query_xy)
-        return
     tree = scipy.spatial.KDTree(database_xy)
     for first in range(0, len(query_xy), _QUERIES_AT_A_TIME):
         block = query_xy[first : first + _QUERIES_AT_A_TIME]
@@ -203,12 +185,3 @@ def radius_positives(
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
     return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
-
-
-def _csr(rows: np.ndarray, offsets: np.ndarray, num_database: int) -> "scipy.sparse.csr_array":
-    return scipy.sparse.csr_array((np.ones(len(rows), bool), rows, offsets), shape=(len(offsets) - 1, num_database))
-
-
-def _offsets(counts: Any) -> np.ndarray:
-    """Start of each of n runs of `counts` `[n]` entries, and the end, `[n + 1]` int64."""
-    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

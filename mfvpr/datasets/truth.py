@@ -1,17 +1,33 @@
-"""The interface of ground truth: positives at a threshold."""
+"""Ground truth: positives at a threshold, by file order or UTM coordinates (`truth_files` reads it from files).
+
+There are three units. Frames of the database sequence and meters have a threshold up to which database images count as
+correct. Exact ground truth has none.
+"""
 
 from abc import ABC, abstractmethod
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from typing import Literal
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Num
 
-from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.positives import Positives, rows_within
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numbers import parse_number
 
 Unit = Literal["frames", "m", "exact"]
 TOLERANCES = (1, 2, 5)  # frames
 RADIUS = 25.0  # meters
+CHOICES = (
+    "order (query i shows database image i); index (a file of pairs); utm (positions in the names, "
+    "@easting@northing@...); label (two csv files of name,label: images with the same label (floor, room) are "
+    "correct); none (rankings only)"
+)
+_NO_ROWS = np.zeros(0, np.int32)
+FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 
 
 class Truth(ABC):
@@ -53,3 +69,149 @@ def middle(thresholds: Sequence[float]) -> float:
 def threshold_words(unit: Unit, threshold: float) -> str:
     """Text of a threshold behind R@K in tables, for example " ±2"."""
     return {"frames": f" ±{threshold:g}", "m": f" {threshold:g} m", "exact": ""}[unit]
+
+
+@dataclass(frozen=True)
+class FrameTruth(Truth):
+    """The database rows that show each query's place; neighbors within a tolerance in frames count as well.
+
+    Attributes:
+        rows: per query; empty = unknown place, which counts as a failure.
+        num_database: N.
+        widened: False = neighbors do not count, at any tolerance.
+        starts: database rows at which a new drive begins, ascending; neighbors are of the same drive.
+    """
+
+    rows: tuple[tuple[int, ...], ...]
+    num_database: int
+    widened: bool = True
+    starts: tuple[int, ...] = ()
+
+    @property
+    def unit(self) -> Unit:
+        """Frames if neighbors count, otherwise exact."""
+        return "frames" if self.widened else "exact"
+
+    def positives(self, threshold: float) -> Positives:
+        """Correct database images at a tolerance in frames, inclusive."""
+        tolerance = int(min(threshold, self.num_database)) if self.widened else 0
+
+        def around(row: int) -> np.ndarray:
+            first, last = self._drive(row)
+            return np.arange(max(row - tolerance, first), min(row + tolerance + 1, last), dtype=np.int32)
+
+        rows = (np.concatenate([_NO_ROWS, *map(around, rows)]) for rows in self.rows)
+        return Positives.from_rows(rows, self.num_database)
+
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Frames to the nearest of the query's rows."""
+        distance = np.full(self.num_database, np.inf)
+        for row in self.rows[query]:
+            drive = slice(*self._drive(row))
+            distance[drive] = np.minimum(distance[drive], np.abs(np.arange(self.num_database) - row)[drive])
+        return distance if self.widened else np.where(distance > 0, np.inf, 0.0)
+
+    def _drive(self, row: int) -> tuple[int, int]:
+        """First and last + 1 database row of a row's drive."""
+        bounds = (0, *self.starts, self.num_database)
+        number = bisect_right(bounds, row)
+        return bounds[number - 1], bounds[number]
+
+
+@dataclass(frozen=True)
+class RadiusTruth(Truth):
+    """Positions in meters; database images within a radius of the query are correct."""
+
+    unit: ClassVar[Unit] = "m"
+    query_xy: Num[np.ndarray, "queries 2"]
+    database_xy: Num[np.ndarray, "database 2"]
+
+    def positives(self, threshold: float) -> Positives:
+        """Correct database images at a radius in meters, inclusive."""
+        return Positives.from_rows(rows_within(self.query_xy, self.database_xy, threshold), len(self.database_xy))
+
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Meters to the query."""
+        return np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)
+
+
+@dataclass(frozen=True)
+class LabelTruth(Truth):
+    """Labels of floors or rooms as numbers; database images with the query's label are correct. -1 = no label."""
+
+    unit: ClassVar[Unit] = "exact"
+    query_labels: Int[np.ndarray, " queries"]
+    database_labels: Int[np.ndarray, " database"]
+
+    def positives(self, threshold: float = 0) -> Positives:
+        """Database images with the query's label, at any threshold."""
+        labels, order = self.database_labels, np.argsort(self.database_labels, kind="stable").astype(np.int32)
+        first = np.searchsorted(labels, self.query_labels, "left", sorter=order)
+        last = np.where(self.query_labels < 0, first, np.searchsorted(labels, self.query_labels, "right", sorter=order))
+        return Positives.from_rows((order[run] for run in map(slice, first, last)), len(order))
+
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """0 if correct, else infinite."""
+        label = self.query_labels[query]
+        return np.where((self.database_labels == label) & (label >= 0), 0.0, np.inf)
+
+
+@dataclass(frozen=True)
+class AllowedTruth(Truth):
+    """Ground truth without the database images that are `excluded` from the candidates of each query."""
+
+    truth: Truth
+    excluded: Positives
+
+    @property
+    def unit(self) -> Unit:
+        """Unit of the ground truth of all images."""
+        return self.truth.unit
+
+    def positives(self, threshold: float) -> Positives:
+        """Correct images that are not excluded."""
+        return self.truth.positives(threshold) - self.excluded
+
+    def shows_place(self, threshold: float) -> Positives:
+        """Images of the query's place: correct images and excluded ones (the query itself and its neighbors)."""
+        return self.truth.shows_place(threshold) | self.excluded
+
+    def distance(self, query: int) -> Float[np.ndarray, " database"]:
+        """Distance, infinite for excluded images."""
+        distance = np.array(self.truth.distance(query), np.float64)
+        distance[self.excluded.of(query)] = np.inf
+        return distance
+
+
+def require_positions(where: str, xy: np.ndarray, count: int) -> None:
+    """Raise an InputError unless there is a position in meters for each of `count` images."""
+    if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
+        got = f"shape {list(xy.shape)}" if xy.shape != (count, 2) else f"{np.abs(xy).max():g} m"
+        raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
+
+
+def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
+    """Ground truth where query i shows database image i, in file order."""
+    if num_queries != num_database:
+        raise InputError(
+            f"ground_truth=order: expected as many queries as database images, got {num_queries} and {num_database}; "
+            "name the pairs in an index file, or use another ground truth"
+        )
+    return FrameTruth(tuple((row,) for row in range(num_queries)), num_database)
+
+
+def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
+    """UTM easting and northing from names `@easting@northing@...` (the convention of VPR-datasets-downloader)."""
+    return RadiusTruth(*(np.array([_position(name) for name in names]) for names in (query_names, database_names)))
+
+
+def _position(name: str) -> tuple[float, float]:
+    """Easting and northing in a file's name; its folders may contain '@' as well."""
+    try:
+        easting, northing = map(parse_number, PurePosixPath(name).name.split("@")[1:3])
+        if abs(easting) <= FARTHEST and abs(northing) <= FARTHEST:  # NaN neither
+            return easting, northing
+    except ValueError:
+        pass
+    expected = f"a name like @easting@northing@..., in meters up to {FARTHEST:g}"
+    raise InputError(f"{name}: expected {expected}; or choose another ground truth")

@@ -3,20 +3,22 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, LabelTruth, RadiusTruth
-from mfvpr.datasets.truth import Truth
-from mfvpr.io.containers import shorten
+from mfvpr.datasets.truth import FrameTruth, LabelTruth, RadiusTruth, Truth, require_positions
+from mfvpr.io.containers import choose_reader, reading, shorten
+from mfvpr.io.names import require_all
+from mfvpr.io.npz import read_npz
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file
 
 MAX_DIGITS = 20  # of a row number
+_LINES = "lines (with an empty cell if it has no place or label)"
+_reading = partial(reading, kind="a ground truth file", mend="see README, Your own images")
 
 
 def truth_from_labels(
@@ -48,31 +50,13 @@ def truth_from_file(
     path = Path(path)
     csv_pairs = partial(_csv_columns, choices=(("query", "database"), ("live", "reference")))
     readers: dict[str, Callable[[Path], Any]] = {".csv": csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
-    if path.suffix.lower() not in readers:
-        raise InputError(f"{path}: expected an index file named .csv, .npz or .json, got {path.suffix or 'no suffix'}")
-    content = _parse(path, readers[path.suffix.lower()])
-    if not isinstance(content, RadiusTruth):
+    with _reading(path):
+        content = choose_reader(path, readers)(path)
+    if not isinstance(content, dict):
         return _frame_truth(path, content, query_names, database_names, widened)
-    got, expected = (len(content.query_xy), len(content.database_xy)), (len(query_names), len(database_names))
-    if got != expected:
-        raise InputError(f"{path}: expected {expected[0]} query positions (utmQ) and {expected[1]} database positions "
-                         f"(utmDb), one per image, got {got[0]} and {got[1]}")  # fmt: skip
-    return content
-
-
-def _parse(path: Path, reader: Callable[[Path], Any]) -> Any:
-    """Content of a file that `reader` reads; all errors become InputErrors."""
-    require_file(path, "a ground truth file")
-    try:
-        return reader(path)
-    except InputError:
-        raise
-    except Exception as error:
-        reason = "it holds Python objects, which are never loaded" if "allow_pickle" in str(error) else str(error)
-        reason = " ".join(reason.split())
-        raise InputError(
-            f"{path}: cannot be read as {path.suffix or 'csv'} ({reason}); see README, Your own images"
-        ) from None
+    for (name, xy), images in zip(content.items(), (query_names, database_names), strict=True):
+        require_positions(f"{path}: {name}", xy, len(images))
+    return RadiusTruth(*content.values())
 
 
 def _frame_truth(
@@ -85,24 +69,16 @@ def _frame_truth(
         places = rows.setdefault(row, [])
         if str(place).strip():
             places.append(_row(path, line, "database", place, database_rows, len(database)))
-    _require_all(path, "queries", queries, rows)
-    return FrameTruth(tuple(tuple(rows[row]) for row in range(len(queries))), len(database), widened)
-
-
-def _require_all(path: Path, kind: str, names: Sequence[str], rows: Container[int]) -> None:
-    missing = [name for row, name in enumerate(names) if row not in rows]
-    if missing:
-        raise InputError(
-            f"{path}: expected lines for all {len(names)} {kind}, got them for {len(names) - len(missing)}; the first "
-            f"without is {missing[0]} (a line with an empty cell says that it has no place or label)"
-        )
+    places_by_query = require_all(path, queries, [rows.get(row) for row in range(len(queries))], _LINES)
+    return FrameTruth(tuple(map(tuple, places_by_query)), len(database), widened)
 
 
 def _labels(path: Path, names: Sequence[str]) -> list[str]:
     table = _row_table(names)
     labels: dict[int, str] = {}
-    read_labels = partial(_csv_columns, choices=(("name", "label"),))
-    for number, (name, label) in enumerate(_parse(path, read_labels), start=1):
+    with _reading(path):
+        lines = _csv_columns(path, choices=(("name", "label"),))
+    for number, (name, label) in enumerate(lines, start=1):
         row = table.get(name.strip())
         if row is None:
             several = any(PurePosixPath(image).name == name.strip() for image in names)
@@ -111,8 +87,7 @@ def _labels(path: Path, names: Sequence[str]) -> list[str]:
         if row in labels:
             raise InputError(f"{path}: entry {number}: {shorten(name)!r} has a label already; keep one of them")
         labels[row] = label.strip()
-    _require_all(path, "images", names, labels)
-    return [labels[row] for row in range(len(names))]
+    return require_all(path, names, [labels.get(row) for row in range(len(names))], _LINES)
 
 
 def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -129,25 +104,17 @@ def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[s
     raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
 
 
-def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
-    with np.load(path, allow_pickle=False) as arrays:
-        if len({*arrays.files}) < len(arrays.files):
-            raise InputError(f"{path}: expected every array once, got {', '.join(arrays.files)}; write the file anew")
-        if {"utmQ", "utmDb"} <= set(arrays):
-            positions = {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
-            for name, xy in positions.items():
-                if xy.ndim != 2 or xy.shape[1] != 2:
-                    raise InputError(f"{path}: {name}: expected positions [n, 2] in meters, got shape {xy.shape}")
-                if not (np.abs(xy) <= FARTHEST).all():  # NaN neither
-                    raise InputError(f"{path}: {name}: expected positions of at most {FARTHEST:g} m, got others")
-            return RadiusTruth(*positions.values())
-        if {"query", "database"} <= set(arrays):
-            query, database = arrays["query"], arrays["database"]
-            if query.shape != database.shape or query.ndim != 1:
-                shapes = f"{query.shape} and {database.shape}"
-                raise InputError(f"{path}: expected query and database of one length, got {shapes}")
-            return list(zip(query.tolist(), database.tolist(), strict=True))
-        raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {', '.join(arrays)}")
+def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | dict[str, np.ndarray]:
+    arrays = read_npz(path)
+    if {"utmQ", "utmDb"} <= arrays.keys():
+        return {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
+    if {"query", "database"} <= arrays.keys():
+        query, database = arrays["query"], arrays["database"]
+        if query.shape != database.shape or query.ndim != 1:
+            shapes = f"{query.shape} and {database.shape}"
+            raise InputError(f"{path}: expected query and database of one length, got {shapes}")
+        return list(zip(query.tolist(), database.tolist(), strict=True))
+    raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {shorten(', '.join(arrays))}")
 
 
 def _json_pairs(path: Path) -> list[tuple[Any, Any]]:

@@ -63,8 +63,10 @@ def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
 
 def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[np.ndarray, " report"]) -> Half:
     """Leave out query rows to choose on that share a place with a row to report on; see `halves`."""
-    reported = positives.take(report).union()
-    return Half(tune[positives.take(tune).among(reported).counts == 0], report, ~reported)
+    is_free = np.ones(positives.num_database, bool)
+    is_free[positives.take(report).rows] = False
+    is_apart = np.array([is_free[positives.of(query)].all() for query in tune], bool)
+    return Half(tune[is_apart], report, is_free)
 
 
 def neighboring_settings(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:

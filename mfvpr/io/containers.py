@@ -1,6 +1,6 @@
 """Common interface of files with arrays by image: hloc's h5, npz, folders of npz."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -10,41 +10,25 @@ import numpy as np
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
-
-class Contents(NamedTuple):
-    """Names of an image's arrays, and shapes of the requested ones."""
-
-    names: Set[str]
-    shapes: Mapping[str, tuple[int, ...]]
+Shapes = Mapping[str, tuple[int, ...]]  # by the name of the array
 
 
 class FileEntry(NamedTuple):
-    """Place of an image's arrays.
-
-    Attributes:
-        file: file with the arrays.
-        name: name of the image in the file; "" = the file holds one image.
-    """
+    """Place of an image's arrays."""
 
     file: Path
-    name: str
+    name: str  # of the image in the file; "" = the file holds one image
 
 
 class Container:
-    """Base class of readers of several images, which read only the requested arrays.
+    """Base class of readers of several images, which read only the requested arrays."""
 
-    Attributes:
-        path: file or folder, for messages.
-        images: names of the images in the file.
-        transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
-    """
+    path: Path  # file or folder, for messages
+    images: tuple[str, ...]  # their names in the file
+    transposed = False  # whether descriptors are `[D, N]` if their shapes fit both layouts
 
-    path: Path
-    images: tuple[str, ...]
-    transposed = False
-
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
-        """For each image, the names of all arrays and the shapes of those in `parts`; reads no values."""
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
+        """For each image, the shapes of its arrays among `parts`, and () for its other arrays; reads no values."""
         raise NotImplementedError
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
@@ -65,15 +49,16 @@ def choose_reader(path: Path, readers: Mapping[str, Callable]) -> Callable:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn any error of a reader into an InputError of one line."""
+def reading(path: Path, kind: str = "a file", mend: str = "is it whole, and of this kind?") -> Iterator[None]:
+    """Require a regular file, and turn any error of its reader into an InputError of one line with the path."""
+    require_file(path, kind)
     try:
         yield
-    except InputError:
-        raise
-    except Exception as error:  # zipfile, zlib, NumPy and HDF5 share no class of errors
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); is it whole, and of this kind?") from None
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+    except Exception as error:  # zipfile, zlib, NumPy, HDF5 and decoders of images share no class of errors
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read ({shorten(reason, 160)}); {mend}") from None
 
 
 def shorten(text: str, limit: int = 60) -> str:

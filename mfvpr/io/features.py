@@ -4,8 +4,7 @@
     for row, image_features in features.read([3, 14]):
         ...
 
-Formats: hloc's h5; an npz for all images, with arrays named `image/part`; a folder with an npz or a `.d2-net` (of
-D2-Net's code) for each image. Parts of an image:
+Parts of an image in a file:
 
 - `keypoints` `[N, 2]` (x, y), px; up to two more columns (scale, angle) are ignored;
 - `descriptors` `[D, N]` (hloc) or `[N, D]`;
@@ -26,7 +25,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
-from mfvpr.io.containers import Container, Contents, FileEntry, choose_reader, shorten
+from mfvpr.io.containers import Container, FileEntry, Shapes, choose_reader, shorten
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
@@ -43,14 +42,12 @@ class ImportedFeatures:
 
     Attributes:
         path: file or folder.
-        paths: files with the images.
         counts: keypoints of each image, -1 = missing image.
         dimension: D; 0 if no image has a keypoint.
         scored: whether the files have scores; if not, all are 1.
     """
 
     path: Path
-    paths: tuple[Path, ...]
     counts: Int32[np.ndarray, " images"]
     dimension: int
     scored: bool
@@ -78,16 +75,12 @@ class ImportedFeatures:
             InputError: an image is missing, or its arrays are damaged or do not fit each other.
         """
         rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else [int(row) for row in rows]
-        images = [self._image(row) for row in rows]
-        arrays = self._container.arrays(images, PARTS)
-        for row, image, parts in zip(rows, images, arrays, strict=True):
-            yield row, self._features(row, f"{self.path}: {shorten(image)}", parts)
-
-    def _image(self, row: int) -> str:
-        image = self._images[row] if 0 <= row < len(self) else None
-        if image is None:
-            raise InputError(f"{self.path}: expected features of image {row}, got none; see counts")
-        return image
+        images = {row: image for row in rows if 0 <= row < len(self) and (image := self._images[row]) is not None}
+        if missing := [row for row in rows if row not in images]:
+            raise InputError(f"{self.path}: expected features of image {missing[0]}, got none; see counts")
+        arrays = self._container.arrays([images[row] for row in rows], PARTS)
+        for row, parts in zip(rows, arrays, strict=True):
+            yield row, self._features(row, f"{self.path}: {shorten(images[row])}", parts)
 
     def _features(self, row: int, where: str, parts: Mapping[str, np.ndarray]) -> Features:
         count, shape = int(self.counts[row]), (int(self.counts[row]), self.dimension)
@@ -120,7 +113,8 @@ def open_features(
     """Open the features of the images `names`; reads only the headers of their arrays.
 
     Args:
-        path: `.h5` or `.hdf5` of hloc, `.npz` of all images, or a folder of `.npz` and `.d2-net`.
+        path: `.h5` or `.hdf5` of hloc; `.npz` of all images, with arrays named `image/part`; or a folder with a `.npz`
+            or a `.d2-net` (of D2-Net's code) for each image.
         names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Use hloc's paths if they
             begin at a parent folder (`database/1.jpg`).
         image_size: `[2]` or `[M, 2]` (width, height), px, if the files have no `image_size`.
@@ -135,22 +129,22 @@ def open_features(
     path = Path(path)
     require_word("lengths", lengths, Lengths)
     sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
-    container = open_container(path)
+    readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile}
+    container: Container = NpzFolder(path) if path.is_dir() else choose_reader(path, readers)(path)
     images = match_names(path, names, container.images)
     if not partial or not any(images):
         require_all(path, names, images, "features")
     rows = {image: row for row, image in enumerate(images) if image is not None}
-    contents = dict(zip(rows, container.contents(rows, ("keypoints", "descriptors")), strict=True))
+    shapes = dict(zip(rows, container.shapes(rows, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
     for image, row in rows.items():
-        counts[row] = _count(f"{path}: {shorten(image)}", contents[image], needs_size=sizes is None)
-    transposed, dimension = _layout(path, contents, container.transposed)
-    without = [image for image, parts in contents.items() if _score_part(parts.names) is None]
-    if without and len(without) < len(contents):  # a missing score would become 1
+        counts[row] = _count(f"{path}: {shorten(image)}", shapes[image], needs_size=sizes is None)
+    transposed, dimension = _layout(path, shapes, container.transposed)
+    without = [image for image, parts in shapes.items() if _score_part(parts) is None]
+    if without and len(without) < len(shapes):  # a missing score would become 1
         raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
     return ImportedFeatures(
         path=path,
-        paths=tuple(dict.fromkeys(container.entry(image).file for image in rows)),
         counts=counts,
         dimension=dimension,
         scored=not without,
@@ -194,41 +188,31 @@ def write_features(
             write_npz(path / f"{name}.npz", arrays.items())
 
 
-def open_container(path: Path) -> Container:
-    """Open a folder, or a file by its suffix."""
-    if path.is_dir():
-        return NpzFolder(path)
-    return choose_reader(path, {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile})(path)
-
-
 def _require_parts(where: str, parts: Collection[str]) -> None:
     if missing := [part for part in ("keypoints", "descriptors") if part not in parts]:
         raise InputError(f"{where}: expected keypoints and descriptors, got no {' and no '.join(missing)}")
 
 
-def _count(where: str, contents: Contents, *, needs_size: bool) -> int:
+def _count(where: str, shapes: Shapes, *, needs_size: bool) -> int:
     """Number of an image's keypoints."""
-    _require_parts(where, contents.names)
-    shape = contents.shapes["keypoints"]
+    _require_parts(where, shapes)
+    shape = shapes["keypoints"]
     if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
         raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
-    if needs_size and "image_size" not in contents.names:
+    if needs_size and "image_size" not in shapes:
         raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
     return shape[0]
 
 
-def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tuple[bool, int]:
+def _layout(path: Path, shapes: Mapping[str, Shapes], default: bool) -> tuple[bool, int]:
     """Whether descriptors are `[D, N]`, and D, both the same for all images.
 
     An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
     """
     votes: dict[bool, str] = {}
-    shapes = {
-        image: (parts.shapes["keypoints"][0], parts.shapes["descriptors"])
-        for image, parts in contents.items()
-        if parts.shapes["keypoints"][0]
-    }
-    for image, (count, shape) in shapes.items():
+    descriptors = {image: parts["descriptors"] for image, parts in shapes.items() if parts["keypoints"][0]}
+    for image, shape in descriptors.items():
+        count = shapes[image]["keypoints"][0]
         if len(shape) != 2 or count not in shape:
             expected = f"[{count}, D] or [D, {count}] like the keypoints"
             raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
@@ -238,7 +222,7 @@ def _layout(path: Path, contents: Mapping[str, Contents], default: bool) -> tupl
         got = f"[D, N] for {shorten(votes[True])} and [N, D] for {shorten(votes[False])}"
         raise InputError(f"{path}: expected descriptors of one layout, got {got}")
     transposed = next(iter(votes), default)
-    dimensions = {image: shape[0 if transposed else 1] for image, (_, shape) in shapes.items()}
+    dimensions = {image: shape[0 if transposed else 1] for image, shape in descriptors.items()}
     dimension = next(iter(dimensions.values()), 0)
     for image, numbers in dimensions.items():
         if numbers != dimension:

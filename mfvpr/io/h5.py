@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.io.containers import Container, Contents, reading, require_plain, shorten
+from mfvpr.io.containers import Container, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing
 
@@ -28,14 +28,15 @@ class H5File(Container):
         if not self.images:
             raise InputError(f"{path}: expected a group for every image, as hloc writes them, got no datasets")
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         h5py = _h5py(self.path)
         with reading(self.path), h5py.File(self.path, "r") as file:
             for image in images:  # with the low-level interface, which is five times faster
                 group = h5py.h5g.open(file.id, _encode(image))
                 names = {name.decode("utf-8", "surrogateescape") for name in group}
-                datasets = ((part, _open_dataset(self.path, image, group, part)) for part in parts if part in names)
-                yield Contents(names, {part: dataset.shape for part, dataset in datasets})
+                yield {
+                    name: _open_dataset(self.path, image, group, name).shape if name in parts else () for name in names
+                }
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         h5py = _h5py(self.path)

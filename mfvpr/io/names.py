@@ -4,11 +4,13 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 from mfvpr.io.containers import FileEntry, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 
+Entry = TypeVar("Entry")
 Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders only in the file's names, only in the images' names
 ImageOfEntry = dict[tuple[int, int, str], Path]  # device, inode and name of an entry -> image
 _NO_PREFIX: Prefix = ((), ())
@@ -41,7 +43,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         free = foreign.keys() - set(matched)
         rows = [row for row, match in enumerate(matched) if match is None]
         if free and rows:
-            _match_ends(path, names, rows, _Ends(free, variants), matched)
+            candidates = _candidates([names[row] for row in rows], free, variants)
+            _match_ends(path, names, dict(zip(rows, candidates, strict=True)), matched)
     return matched
 
 
@@ -51,8 +54,8 @@ def require_different(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"{path}: expected different names, got {shorten(twice[0])} twice; rename one of the images")
 
 
-def require_all(path: Path, names: Sequence[str], matched: Sequence[str | None], content: str) -> list[str]:
-    """Return the result of `match_names`; raise an InputError if the file lacks the `content` of an image."""
+def require_all(path: Path, names: Sequence[str], matched: Sequence[Entry | None], content: str) -> list[Entry]:
+    """Return what a file has of each image, if that is not None; InputError if it lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
         raise InputError(f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; "
@@ -85,27 +88,19 @@ def adds_folders(name: str, match: str) -> bool:
     return bool(_prefix(name, match)[0])
 
 
-class _Ends:
-    """Index of foreign names by the whole name and by every end of it."""
-
-    def __init__(self, foreign: Iterable[str], variants: Callable[[str], list[str]]) -> None:
-        self.variants = variants
-        self.by_variant: dict[str, set[str]] = defaultdict(set)
-        self.by_end: dict[str, set[str]] = defaultdict(set)
-        for name in foreign:
-            for variant in variants(printable(name)):
-                self.by_variant[variant].add(name)
-                for end in _ends(variant):
-                    self.by_end[end].add(name)
-
-    def candidates(self, name: str) -> set[str]:
-        """Foreign names that may mean this image."""
-        variant = self.variants(printable(name))[0]
-        shorter = (self.by_variant.get(end, set()) for end in _ends(variant))
-        return set().union(self.by_end.get(variant, set()), *shorter)
+def _candidates(names: Iterable[str], foreign: Iterable[str], variants: Callable[[str], list[str]]) -> list[set[str]]:
+    """For each image, the foreign names that may mean it: one of both paths is the end of the other."""
+    by_variant, by_end = defaultdict(set), defaultdict(set)
+    for name in foreign:
+        for variant in variants(printable(name)):
+            by_variant[variant].add(name)
+            for end in _ends(variant):
+                by_end[end].add(name)
+    images = [variants(printable(name))[0] for name in names]
+    return [by_end[image].union(*(by_variant[end] for end in _ends(image))) for image in images]
 
 
-def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, matched: list[str | None]) -> None:
+def _match_ends(path: Path, names: Sequence[str], candidates: dict[int, set[str]], matched: list[str | None]) -> None:
     """Fill `matched` for pairs of an image and a foreign name that have no other candidates.
 
     Candidates have the prefix of earlier matches, or none: a name at the image's own path contradicts an earlier prefix
@@ -116,10 +111,11 @@ def _match_ends(path: Path, names: Sequence[str], rows: list[int], ends: _Ends, 
         if match is not None:
             examples.setdefault(_prefix(name, match), (name, match))
     prefixes = {*examples, _NO_PREFIX}
-    candidates = {
-        row: {match for match in ends.candidates(names[row]) if not examples or _prefix(names[row], match) in prefixes}
-        for row in rows
-    }
+    if examples:
+        candidates = {
+            row: {match for match in matches if _prefix(names[row], match) in prefixes}
+            for row, matches in candidates.items()
+        }
     num_images = Counter(name for row_candidates in candidates.values() for name in row_candidates)
     for row, row_candidates in candidates.items():
         if not row_candidates:

@@ -13,9 +13,9 @@ from typing import IO
 import numpy as np
 from jaxtyping import Shaped
 
-from mfvpr.io.containers import Container, Contents, FileEntry, reading, require_plain, shorten
+from mfvpr.io.containers import Container, FileEntry, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing, require_file
+from mfvpr.utils.files import printable, replacing
 
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
@@ -36,20 +36,21 @@ class NpzFile(Container):
             raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; "
                              "if every image has its own file, give their folder")  # fmt: skip
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         with _open_archive(self.path) as archive:
             members: dict[str, set[str]] = defaultdict(set)
             for name in archive.namelist():
                 image, _, part = name.rpartition("/")
                 members[image].add(part)
             for image in images:
-                yield _contents(archive, members[image], f"{image}/", parts)
+                yield _shapes(archive, members[image], f"{image}/", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         with _open_archive(self.path) as archive:
             members = set(archive.namelist())
             for image in images:
-                yield {part: _array(archive, name) for part, name in _members(members, f"{image}/", parts)}
+                names = {part: f"{image}/{part}.npy" for part in parts}
+                yield {part: _array(archive, name) for part, name in names.items() if name in members}
 
 
 class NpzFolder(Container):
@@ -67,10 +68,10 @@ class NpzFolder(Container):
         if not self.images:
             raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
 
-    def contents(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Contents]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         for image in images:
             with _open_archive(self._paths[image]) as archive:
-                yield _contents(archive, set(archive.namelist()), "", parts)
+                yield _shapes(archive, archive.namelist(), "", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         for image in images:
@@ -80,10 +81,11 @@ class NpzFolder(Container):
         return FileEntry(self._paths[image], "")
 
 
-def read_npz(path: Path, parts: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read the arrays among `parts` that the archive has; InputError if it is damaged, or holds objects."""
+def read_npz(path: Path, parts: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays, or those among `parts`, of an archive; InputError if it is damaged, or holds objects."""
     with _open_archive(path) as archive:
-        return {part: _array(archive, name) for part, name in _members(set(archive.namelist()), "", parts)}
+        members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        return {part: _array(archive, members[part]) for part in parts or members if part in members}
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
@@ -97,25 +99,19 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
 @contextmanager
 def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive; raise an InputError if two members share a name, since readers choose either."""
-    require_file(path)
     with reading(path), zipfile.ZipFile(path) as archive:
         if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
             raise InputError(f"{path}: expected every array once, got {shorten(twice[0])} again; write the file anew")
         yield archive
 
 
-def _members(members: set[str], prefix: str, parts: Sequence[str]) -> Iterator[tuple[str, str]]:
-    return ((part, name) for part in parts if (name := f"{prefix}{part}.npy") in members)
-
-
-def _contents(archive: zipfile.ZipFile, members: set[str], prefix: str, parts: Sequence[str]) -> Contents:
-    names = {name.removesuffix(".npy") for name in members}
-    return Contents(names, {part: _shape(archive, f"{prefix}{part}.npy") for part in parts if part in names})
-
-
-def _shape(archive: zipfile.ZipFile, member: str) -> tuple[int, ...]:
-    with archive.open(member) as file:
-        return _read_header(f"{archive.filename}: {shorten(member)}", file)[0]
+def _shapes(archive: zipfile.ZipFile, members: Iterable[str], prefix: str, parts: Sequence[str]) -> Shapes:
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys((name.removesuffix(".npy") for name in members), ())
+    for part in parts:
+        if part in shapes:
+            with archive.open(f"{prefix}{part}.npy") as file:
+                shapes[part] = _read_header(f"{archive.filename}: {shorten(prefix + part)}.npy", file)[0]
+    return shapes
 
 
 def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:

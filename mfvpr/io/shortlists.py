@@ -1,22 +1,37 @@
-"""Read and write shortlists and rankings of other programs."""
+"""Read and write shortlists and rankings of other programs.
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, Literal
+Lists of image pairs are hloc's `query database` and kapture's `query, reference, score`.
+"""
+
+import re
+from collections.abc import Iterator, Sequence, Set
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mfvpr.io.containers import FileEntry, shorten
+from mfvpr.io.containers import FileEntry, reading, shorten
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
-from mfvpr.io.pairs import read_pairs, require_lines
 from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import require_file, write_text
+from mfvpr.utils.files import printable, require_file, write_text
+from mfvpr.utils.numbers import parse_number
 
 PairLayout = Literal["hloc", "kapture"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
+_SEPARATOR = re.compile(r"\s*,\s*|\s+")
+_SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
+
+
+class Pair(NamedTuple):
+    """Names of an image pair, and its score if the line has one."""
+
+    query: str
+    database: str
+    score: float | None = None
 
 
 def read_shortlist(
@@ -59,7 +74,7 @@ def read_with_entries(
     if path.suffix.lower() == ".npz":
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
-        names = read_pairs(path, query_names, database_names)
+        names = _read_pairs(path, query_names, database_names)
         queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
         database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
@@ -108,7 +123,9 @@ def write_shortlist(
         return
     for names in (query_names, database_names):
         require_different(path, names)
-        require_lines(path, names)
+        for name in names:
+            if name != name.strip() or "\n" in name or "\r" in name:
+                raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
         names = (query_names[query], database_names[int(indices[query, position])])
@@ -146,6 +163,58 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Score
         yield from ((query, row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0)
 
 
+def _read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> list[Pair]:
+    """Read the pairs of a file, in its order.
+
+    Names may contain spaces or commas: of all splits of a line, the one with known names counts. (hloc splits at every
+    space.) Lines that begin with # and hold no known pair are comments.
+
+    Raises:
+        InputError: a line has no split with known names, or several.
+    """
+    with reading(path, mend="expected a text file of image pairs"):
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+    sides = [{printable(name) for name in names} for names in (query_names, database_names)]
+    ends = [{end for name in names for end in _ends(name)} for names in sides]
+    pairs = []
+    for number, line in enumerate(text.split("\n"), start=1):
+        stripped = printable(line.strip())
+        if stripped and (pair := _pair(f"{path}: line {number}", stripped, sides, ends)):
+            pairs.append(pair)
+    return pairs
+
+
+def _ends(name: str) -> tuple[str, str]:
+    """File name and stem, which may stand for an image."""
+    return PurePosixPath(name).name, PurePosixPath(name).stem
+
+
+def _pair(where: str, line: str, sides: Sequence[Set[str]], ends: Sequence[Set[str]]) -> Pair | None:
+    """The pair of a line; `sides` are the paths of query and database images, `ends` the ends of these paths."""
+    words = line.split()
+    if len(words) == 2 and words[0] in sides[0] and words[1] in sides[1]:
+        return Pair(words[0], words[1])  # nearly every line of hloc
+    splits = list(_splits(line))
+    pairs = [pair for pair in splits if pair.query in sides[0] and pair.database in sides[1]]
+    pairs = pairs or [pair for pair in splits if _ends(pair.query)[0] in ends[0] and _ends(pair.database)[0] in ends[1]]
+    if len(pairs) == 1:
+        return pairs[0]
+    if not pairs and line.startswith("#"):
+        return None
+    got = "several ways to read" if pairs else "names of none in"
+    raise InputError(f"{where}: expected the names of a query and a database image, got {got} {shorten(line)!r}")
+
+
+def _splits(line: str) -> Iterator[Pair]:
+    """All pairs that a line may mean."""
+    for separator in _SEPARATOR.finditer(line):
+        query, database = line[: separator.start()], line[separator.end() :]
+        yield Pair(query, database)
+        if scored := _SCORED.fullmatch(database):
+            with suppress(ValueError):  # the last word is no number
+                yield Pair(query, scored[1], parse_number(scored[2]))
+
+
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
     """Row of each foreign name; raises an InputError for unknown names."""
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
@@ -158,11 +227,8 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
 
 
 def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[FileEntry | None]:
-    entries: list[FileEntry | None] = [None] * len(names)
-    for match, row in rows.items():
-        if adds_folders(names[row], match):
-            entries[row] = FileEntry(path, match)
-    return entries
+    entries = {row: FileEntry(path, match) for match, row in rows.items() if adds_folders(names[row], match)}
+    return [entries.get(row) for row in range(len(names))]
 
 
 def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], num_candidates: int | None) -> Shortlist:

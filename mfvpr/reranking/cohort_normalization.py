@@ -14,9 +14,8 @@ places: if the drive passes a place twice, its images score high with each other
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.datasets.datasets import QuerySequence
-from mfvpr.datasets.sequences import own_rows, without_neighbors
 from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
@@ -37,7 +36,7 @@ def cohort_sequence(database: Contents, neighbors: int) -> QuerySequence:
         raise InputError(f"cohort={neighbors}: expected less than half of {number} database images, as an image is "
                          "scored with those that are farther away; leave fewer out")  # fmt: skip
     equal_rows = tuple(tuple({row, *same}) for row, same in enumerate(own_rows(database, database)))
-    return without_neighbors(QuerySequence("cohort", database.folder, None), number, equal_rows, int(neighbors))
+    return QuerySequence("cohort", database.folder, None).without_neighbors(number, equal_rows, int(neighbors))
 
 
 def hubness(

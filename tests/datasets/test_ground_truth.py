@@ -110,7 +110,7 @@ def test_labels(folders, tmp_path):
 
 
 @pytest.mark.parametrize(("database", "words"), [
-    ("0.png,x\n1.png,x\n", "all 3 images, got them for 2; "),
+    ("0.png,x\n1.png,x\n", "of all 3 images, got 2; the first without is 2.png"),
     ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: '0.png' has a label already"),
     ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: got '9.png'"),
     ("0.png,x\n" + 5000 * "9" + ",x\n", "(5000 characters)'"),
@@ -161,7 +161,7 @@ def test_nordland_takes_a_few_megabytes():
     np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
     assert [len(half.tune) for half in protocol.halves] == [number // 2 - 2 * tolerance] * 2
     np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
-    assert not difference.any()
+    assert not difference.rows.size
 
 
 def test_a_radius_takes_no_more_than_its_neighbors():
@@ -203,7 +203,7 @@ def test_excluded_images_are_not_correct():
     truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
     np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
-    assert not truth.positives(0).any()
+    assert not truth.positives(0).rows.size
     np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
     assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
@@ -220,30 +220,38 @@ def twice(path):
     [
         ("missing.csv", None, "got nothing"),
         ("gt.csv", f"query,database\n0,0\n1,{5000 * '1'}\n", "(5000 characters)'"),
-        ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read as .json"),
+        ("gt.json", f"[[0, [{5000 * '1'}]], [1, []]]", "cannot be read"),
         ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
-        ("gt.json", 100_000 * "[", "cannot be read as .json"),
+        ("gt.json", 100_000 * "[", "cannot be read"),
         ("gt.npz", {"utmQ": np.full((2, 2), 1e308), "utmDb": np.zeros((3, 2))}, "1e+09 m"),
-        ("gt.txt", "x", "named .csv, .npz or .json"),
+        ("gt.txt", "x", "named .csv, .npz, .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "a,b\n0,0\n", "got a,b"),
-        ("gt.csv", "query,database\n0,0\n", "all 2 queries, got them for 1; "),
+        ("gt.csv", "query,database\n0,0\n", "of all 2 images, got 1; the first without is b.png"),
         ("gt.csv", "query,database\n0,0\n1,3\n", "a number from 0 to 2, got '3'"),
         ("gt.csv", "query,database\n0,0\n1,-1\n", "got '-1'"),
         ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
-        ("gt.json", "[[0", "cannot be read as .json"),
-        ("gt.npz", "no archive", "cannot be read as .npz"),
-        ("gt.npz", {"query": np.array([{"a": 1}], object), "database": np.array([0])}, "Python objects"),
+        ("gt.json", "[[0", "cannot be read"),
+        ("gt.npz", "no archive", "cannot be read"),
+        ("gt.npz", {"query": np.array([{"a": 1}], object), "database": np.array([0])}, "got objects or records"),
         ("gt.json", '{"00": 1, "11": 1}', "expected [[query, [database, ...]], ...]"),
         ("gt.json", '[[0, "12"], [1, "0"]]', "expected [[query, [database, ...]], ...]"),
-        ("gt.npz", {"utmQ": np.full((2, 2), np.nan), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions of at most"),
-        ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [n, 2]"),
+        (
+            "gt.npz",
+            {"utmQ": np.full((2, 2), np.nan), "utmDb": np.zeros((3, 2))},
+            "at most 1e+09 m, got nan",
+        ),
+        ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [2, 2]"),
         ("gt.npz", {"query": np.arange(2), "database": np.arange(3)}, "of one length"),
         ("gt.npz", {"other": np.zeros(2)}, "got other"),
-        ("gt.npz", twice, "got query, database, query"),
+        ("gt.npz", twice, "got query.npy again"),
         ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
         ("gt.csv", os.mkfifo, "got a pipe"),
-        ("gt.npz", {"utmQ": np.zeros((5, 2)), "utmDb": np.zeros((3, 2))}, "expected 2 query positions"),
+        (
+            "gt.npz",
+            {"utmQ": np.zeros((5, 2)), "utmDb": np.zeros((3, 2))},
+            "utmQ: expected positions [2, 2]",
+        ),
     ],
 )
 def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, content, words):

@@ -29,8 +29,6 @@ def test_they_are_the_matrix(matrix):
     check_same(got, matrix)
     np.testing.assert_array_equal(got.dense(), matrix)
     np.testing.assert_array_equal(got.counts, matrix.sum(axis=1))
-    np.testing.assert_array_equal(got.union(), matrix.any(axis=0))
-    assert got.any() is bool(matrix.any())
     for query in range(-len(matrix), len(matrix)):
         np.testing.assert_array_equal(got.of(query), np.flatnonzero(matrix[query]))
     for beyond in (len(matrix), -len(matrix) - 1):
@@ -56,8 +54,6 @@ def test_of_some_queries(matrix, seed):
         chosen = matrix[queries] if len(np.shape(queries)) == 0 or len(queries) else matrix[:0]
         check_same(got.take(queries), chosen)
         np.testing.assert_array_equal(got.dense(queries), chosen)
-    allowed = rng.random(matrix.shape[1]) < 0.5
-    check_same(got.among(allowed), matrix & allowed)
 
 
 @given(pairs)
@@ -115,7 +111,5 @@ def test_values_that_do_not_fit_are_errors():
             Positives.from_rows(rows, 4)
     with pytest.raises(InputError, match=r"size.* got \(2, 4\) and \(2, 5\)"):
         got | Positives.from_rows([[0], [0]], 5)
-    with pytest.raises(InputError, match="allowed: expected shape"):
-        got.among(np.ones(5, bool))
     with pytest.raises(InputError, match="expected a matrix"):
         Positives.from_matrix(np.ones(3, bool))

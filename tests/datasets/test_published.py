@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.published import published_dataset, published_differences
+from mfvpr.datasets.published.frames import CONDITIONS, REFERENCE
 from mfvpr.datasets.published.lists import read_lines, read_names, read_rows
-from mfvpr.datasets.published.robotcar import CONDITIONS, REFERENCE
 from mfvpr.utils import InputError
 from tests.builders import fill
 from tests.io.checks import one_line_error
@@ -294,8 +294,8 @@ def test_damaged_lists(pittsburgh):
 def test_structures_that_are_not_pittsburghs(pittsburgh):
     path = pittsburgh / "datasets/pitts30k_val.mat"
     for changes, words in (
-        ({"places": PLACES[:2]}, "3 images, got [2, 2]"),
-        ({"places": np.full((3, 2), np.nan)}, "expected a position for each"),
+        ({"places": PLACES[:2]}, "[3, 2] of all images, at most 1e+09 m, got shape [2, 2]"),
+        ({"places": np.full((3, 2), np.nan)}, "got nan m"),
         ({"qImageFns": cells(["../x.jpg", "y.jpg"])}, "expected names below"),
     ):
         write_structure(path, **changes)

@@ -8,8 +8,7 @@ from PIL import Image
 
 from mfvpr import InputError, datasets
 from mfvpr.datasets import Positives
-from mfvpr.datasets.contents import contents
-from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.datasets.contents import contents, own_rows
 from mfvpr.retrieval import ExactSearch
 from mfvpr.retrieval import search as retrieval
 from tests.builders import unit
@@ -46,12 +45,12 @@ def test_neighbors_are_neither_candidates_nor_correct(sequence):
     dataset, rows = dataset_and_own_rows(sequence, sequence, "order")
     for neighbors in (0, 1):
         allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
-        reduced = without_neighbors(dataset.only, 6, rows, neighbors)
+        reduced = dataset.only.without_neighbors(6, rows, neighbors)
         np.testing.assert_array_equal(reduced.excluded.dense(), ~allowed)
         expected = dataset.truth.positives(2).dense() & allowed
         np.testing.assert_array_equal(reduced.truth.positives(2).dense(), expected)
-    assert not reduced.truth.positives(1).any()  # all correct images are excluded
-    assert without_neighbors(dataset_and_own_rows(sequence, sequence)[0].only, 6, rows, 0).truth is None
+    assert not reduced.truth.positives(1).rows.size  # all correct images are excluded
+    assert dataset_and_own_rows(sequence, sequence)[0].only.without_neighbors(6, rows, 0).truth is None
 
 
 def test_two_sequences_have_no_neighbors(sequence, tmp_path):
@@ -59,7 +58,7 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
     dataset, rows = dataset_and_own_rows(sequence, tmp_path / "other")
     with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
-        without_neighbors(dataset.only, 6, rows, 2)
+        dataset.only.without_neighbors(6, rows, 2)
 
 
 @pytest.mark.parametrize("memory, rows", [(None, 6), (1e-9, 6), (1e-9, 4), (None, 1)])

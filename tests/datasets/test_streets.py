@@ -2,18 +2,25 @@
 
 import csv
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 
-from mfvpr.datasets.streets import draw_seasons, draw_streets, seasons_folder, streets_folder
-from mfvpr.datasets.streets.camera import LANE, SPACING, Camera, plan_drives, plan_return
-from mfvpr.datasets.streets.exposure import expose, fall_rain
-from mfvpr.datasets.streets.ground_truth import Facade, image_shift, visible_points
-from mfvpr.datasets.streets.seasons import CONDITIONS, TRUTH
+from mfvpr.datasets.streets import CONDITIONS, TRUTH, draw_streets, streets_folder
+from mfvpr.datasets.streets.camera import (
+    LANE,
+    SPACING,
+    Camera,
+    Facade,
+    image_shift,
+    plan_drives,
+    plan_return,
+    visible_points,
+)
 from mfvpr.datasets.streets.sheets import Sheet, texture
-from mfvpr.datasets.streets.weather import WEATHERS, Exposure
+from mfvpr.datasets.streets.weather import WEATHERS, expose, fall_rain
 
 pytestmark = pytest.mark.thorough
 
@@ -37,7 +44,7 @@ def streets(tmp_path_factory):
 @pytest.fixture(scope="module")
 def seasons(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seasons") / "drawn"
-    draw_seasons(folder, num_frames=SEASONS_FRAMES, image_size=SIZE)
+    draw_streets(folder, seasons=True, num_frames=SEASONS_FRAMES, image_size=SIZE)
     return folder
 
 
@@ -57,7 +64,7 @@ def test_a_seed_decides_all_bytes_of_the_street(streets, tmp_path):
 
 @pytest.mark.slow
 def test_a_seed_decides_all_bytes_of_the_seasons(seasons, tmp_path):
-    check_other_drawings(draw_seasons, seasons, SEASONS_FRAMES, tmp_path)
+    check_other_drawings(partial(draw_streets, seasons=True), seasons, SEASONS_FRAMES, tmp_path)
 
 
 def check_ground_truth(path, num_frames):
@@ -96,10 +103,10 @@ def test_queries_show_something_dark_at_night_and_bright_in_snow(streets):
 def test_without_effects_the_image_stays_and_each_effect_changes_it(effect, size):
     image = np.zeros((72, 96, 3), np.uint8)
     image[20:50, 30:60] = 240
-    quiet = Exposure(noise=0.0)
+    quiet = replace(WEATHERS["day"], noise=0.0)
 
-    def exposed(exposure):
-        return expose(image, replace(WEATHERS["day"], exposure=exposure), np.random.default_rng(0))
+    def exposed(weather):
+        return expose(image, weather, np.random.default_rng(0))
 
     np.testing.assert_array_equal(exposed(quiet), image)
     assert (exposed(replace(quiet, **{effect: size})) != image).any()
@@ -123,23 +130,23 @@ def test_existing_folder_is_an_error(tmp_path):
         draw_streets(tmp_path, num_frames=1, image_size=SIZE)
 
 
-@pytest.mark.parametrize("folder_of, folders", [(streets_folder, 2), (seasons_folder, 8)])
-def test_interrupted_drawing_leaves_nothing_and_the_cache_is_used_afterwards(folder_of, folders, tmp_path):
+@pytest.mark.parametrize("seasons, folders", [(False, 2), (True, 8)])
+def test_interrupted_drawing_leaves_nothing_and_the_cache_is_used_afterwards(seasons, folders, tmp_path):
     def interrupt(done, total):
         raise KeyboardInterrupt
 
-    options = {"num_frames": 2, "image_size": (32, 24)}
+    options = {"seasons": seasons, "num_frames": 2, "image_size": (32, 24)}
     with pytest.raises(KeyboardInterrupt):
-        folder_of(tmp_path, **options, progress=interrupt)
+        streets_folder(tmp_path, **options, progress=interrupt)
     assert list(tmp_path.iterdir()) == []
 
     calls = []
-    folder = folder_of(tmp_path, **options, progress=lambda *done_total: calls.append(done_total))
+    folder = streets_folder(tmp_path, **options, progress=lambda *done_total: calls.append(done_total))
     assert calls == [(done, 2 * folders) for done in range(1, 2 * folders + 1)]
     assert list(tmp_path.iterdir()) == [folder]
 
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    assert folder_of(tmp_path, **options) == folder
+    assert streets_folder(tmp_path, **options) == folder
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == times
 
 

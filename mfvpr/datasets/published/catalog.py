@@ -5,54 +5,40 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mfvpr.datasets.datasets import Dataset
-from mfvpr.datasets.published import msls, nordland, pittsburgh, robotcar, ssm_vpr
+from mfvpr.datasets.published import frames, positions
 from mfvpr.utils.errors import InputError
 
 
 @dataclass(frozen=True)
 class Published:
-    """A published data set.
+    """A published data set."""
 
-    Attributes:
-        name: of the choice `dataset=`, and of its folder below a folder of data sets.
-        layout: contents of its folder, in lines.
-        database: published number of database images.
-        queries: published numbers of queries, by sequence.
-        read: `read(folder, name)`, with the keyword `seasons` if it has seasons.
-        archive: name under which it is distributed, another possible name of its folder.
-        seasons: default (database, queries) if seasons can be chosen.
-    """
-
-    name: str
+    name: str  # of the choice `dataset=`
     title: str
-    layout: str
-    database: int
-    queries: Mapping[str, int]
-    read: Callable[..., Dataset]
+    layout: str  # contents of its folder, in lines
+    database: int  # published number of database images
+    queries: Mapping[str, int]  # published numbers of queries, by sequence
+    read: Callable[..., Dataset]  # `read(folder, name)`, with the keyword `seasons` if it has seasons
     source: str
-    archive: str | None = None
-    seasons: tuple[str, str] | None = None
-
-    @property
-    def folders(self) -> tuple[str, ...]:
-        """Possible names of its folder."""
-        return (self.name,) if self.archive is None else (self.name, self.archive)
+    folders: tuple[str, ...]  # possible names of its folder below a folder of data sets: its own, its archive's
+    seasons: tuple[str, str] | None = None  # default (database, queries) if seasons can be chosen
 
 
 def _ssm(name: str, title: str, database: int, queries: int, archive: str) -> Published:
     title, source = f"{title}, as SSM-VPR has it", "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr"
-    return Published(name, title, ssm_vpr.LAYOUT, database, {name: queries}, ssm_vpr.ssm_vpr, source, archive)
+    folders = name, archive
+    return Published(name, title, frames.SSM_LAYOUT, database, {name: queries}, frames.ssm_vpr, source, folders)
 
 
 def _pittsburgh(part: str, queries: int) -> Published:
     name = f"pitts30k_{part}"
     return Published(
-        name, f"Pittsburgh30k, {part} part", pittsburgh.LAYOUT.format(part=part), 10_000, {name: queries},
-        pittsburgh.pitts30k, "on request from its authors: https://github.com/Relja/netvlad", "pitts30k",
+        name, f"Pittsburgh30k, {part} part", positions.PITTSBURGH_LAYOUT.format(part=part), 10_000, {name: queries},
+        positions.pitts30k, "on request from its authors: https://github.com/Relja/netvlad", (name, "pitts30k"),
     )  # fmt: skip
 
 
-_ROBOTCAR: Mapping[str, int] = dict(zip(robotcar.CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True))
+_ROBOTCAR: Mapping[str, int] = dict(zip(frames.CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True))
 
 PUBLISHED = {
     entry.name: entry
@@ -64,29 +50,29 @@ PUBLISHED = {
         _ssm("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
         Published(
             "nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)",
-            nordland.LAYOUT_27592, 27_592, {"nordland_27592": 27_592}, nordland.nordland_27592,
-            "https://github.com/QVPR/Patch-NetVLAD", "nordland", ("summer", "winter"),
+            frames.LAYOUT_27592, 27_592, {"nordland_27592": 27_592}, frames.nordland_27592,
+            "https://github.com/QVPR/Patch-NetVLAD", ("nordland_27592", "nordland"), ("summer", "winter"),
         ),
         Published(
-            "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", nordland.LAYOUT_3450, 3450,
-            {"nordland_3450": 3450}, nordland.nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/", None,
-            ("summer", "winter"),
+            "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", frames.LAYOUT_3450, 3450,
+            {"nordland_3450": 3450}, frames.nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
+            ("nordland_3450",), ("summer", "winter"),
         ),
         Published(
-            "nordland_vprbench", "Nordland, VPR-Bench's: winter, every tenth frame of summer", nordland.LAYOUT_VPRBENCH,
-            27_592, {"nordland_vprbench": 2760}, nordland.nordland_vprbench,
-            "https://github.com/MubarizZaffar/VPR-Bench",
+            "nordland_vprbench", "Nordland, VPR-Bench's: winter, every tenth frame of summer", frames.LAYOUT_VPRBENCH,
+            27_592, {"nordland_vprbench": 2760}, frames.nordland_vprbench,
+            "https://github.com/MubarizZaffar/VPR-Bench", ("nordland_vprbench",),
         ),
         Published(
             "robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
-            robotcar.LAYOUT, 220, _ROBOTCAR, robotcar.robotcar_seasons, "https://www.visuallocalization.net/datasets/",
-            "RobotCar-Seasons",
+            frames.ROBOTCAR_LAYOUT, 220, _ROBOTCAR, frames.robotcar_seasons,
+            "https://www.visuallocalization.net/datasets/", ("robotcar_seasons", "RobotCar-Seasons"),
         ),
         _pittsburgh("val", 7608),
         _pittsburgh("test", 6816),
         Published(
-            "msls_val", "Mapillary Street-Level Sequences, validation part", msls.LAYOUT, 18_871,
-            {"msls_val": 740}, msls.msls_val, "https://www.mapillary.com/dataset/places", "msls",
+            "msls_val", "Mapillary Street-Level Sequences, validation part", positions.MSLS_LAYOUT, 18_871,
+            {"msls_val": 740}, positions.msls_val, "https://www.mapillary.com/dataset/places", ("msls_val", "msls"),
         ),
     )
 }  # fmt: skip
@@ -102,8 +88,8 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
     if not root.is_dir():
         got = "a file" if root.exists() else "nothing"
         raise InputError(f"{root}: expected the folder of {name}, got {got}; it is to be had at {entry.source}")
-    if seasons is not None and not (entry.seasons and len({*seasons}) == 2 and {*seasons} <= {*nordland.SEASONS}):
-        raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(nordland.SEASONS)}")
+    if seasons is not None and not (entry.seasons and len({*seasons}) == 2 and {*seasons} <= {*frames.SEASONS}):
+        raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(frames.SEASONS)}")
     options = {} if entry.seasons is None else {"seasons": seasons or entry.seasons}
     try:
         return entry.read(root, name, **options)

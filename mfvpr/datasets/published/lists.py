@@ -1,19 +1,16 @@
 """Images from lists of names, and NumPy's files of lists, whose code is never executed."""
 
-import csv
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.ground_truth import FrameTruth
+from mfvpr.datasets.truth import FrameTruth
+from mfvpr.io.containers import reading
 from mfvpr.io.formats.numpy_objects import Array, read_objects
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file
 
-_DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, StopIteration, csv.Error)
 _OBJECTS = b"'|O'"
 
 
@@ -54,20 +51,6 @@ def dataset_of_lists(
     return Dataset(name, database, (QuerySequence(name, listed_images(root, names, query_list), truth),))
 
 
-@contextmanager
-def reading_list(path: Path, damage: str, kind: str = "a list") -> Iterator[None]:
-    """Require a regular file, and raise all errors of reading it as InputErrors; `damage` describes another content."""
-    require_file(path, kind)
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
-    except _DAMAGE:
-        raise InputError(f"{path}: {damage}") from None
-
-
 def expected_file(root: Path, *names: str) -> Path | None:
     """The first of several files that exists."""
     return next((root / name for name in names if (root / name).is_file()), None)
@@ -75,7 +58,7 @@ def expected_file(root: Path, *names: str) -> Path | None:
 
 def read_lines(path: Path) -> list[str]:
     """Read lines that are not empty, without the spaces around them."""
-    with reading_list(path, "expected lines of text; get it again"):
+    with reading(path, "a list", "get it again"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
 
@@ -90,7 +73,7 @@ def read_names(path: Path) -> list[str]:
 
 def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
     """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`."""
-    with reading_list(path, "this file is damaged; get it again"), path.open("rb") as file:
+    with reading(path, "a list", "get it again"), path.open("rb") as file:
         if _OBJECTS in file.read(128):
             file.seek(0)
             lists = read_objects(file, "lists of rows")
@@ -115,5 +98,5 @@ def _require_integers(rows: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _read_array(path: Path) -> np.ndarray:
-    with reading_list(path, "expected an array of NumPy; get it again"), path.open("rb") as file:
+    with reading(path, "a list", "expected an array of NumPy; get it again"), path.open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False)

@@ -5,7 +5,6 @@ along z and sees flat panels (facades, roofs, trees, cars) in true perspective, 
 RGB, 0..255.
 """
 
-from mfvpr.datasets.streets.drawing import draw_streets, streets_folder
-from mfvpr.datasets.streets.seasons import draw_seasons, seasons_folder
+from mfvpr.datasets.streets.drawing import CONDITIONS, TRUTH, draw_streets, streets_folder
 
-__all__ = ["draw_seasons", "draw_streets", "seasons_folder", "streets_folder"]
+__all__ = ["CONDITIONS", "TRUTH", "draw_streets", "streets_folder"]

@@ -1,6 +1,9 @@
-"""The pinhole camera, and the drives that it makes down the street."""
+"""The pinhole camera, its drives down the street, and the shifts of the scene between two images."""
 
-from dataclasses import dataclass
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,6 +14,7 @@ NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 CAMERA_HEIGHT = 1.6  # meters
 SPACING = 1.75  # between frames, meters
 LANE = 1.8  # x of the driving lane, meters
+STEP = 8  # px between the points that shifts are measured at
 _DEGREE = np.pi / 180
 
 
@@ -71,11 +75,12 @@ def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[lis
     The database keeps to the lane; the queries shift by 0.3 to 1.2 m to either side and turn by up to 9 degrees.
     """
     rng = np.random.default_rng([seed, 6])
-    lane, heading, pitch = _path(rng, count)
+    queries = _weave(rng, count, image_size)
     wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
-    z = SPACING * np.arange(count)
-    database = [Camera(LANE, *pose, image_size) for pose in zip(z, wobble[0], wobble[1], strict=True)]
-    queries = [Camera(*pose, image_size) for pose in zip(lane, z, heading, pitch, strict=True)]
+    database = [
+        replace(query, x=LANE, heading=heading, pitch=pitch)
+        for query, heading, pitch in zip(queries, *wobble, strict=True)
+    ]
     return database, queries
 
 
@@ -85,15 +90,65 @@ def plan_return(seed: int, number: int, count: int, image_size: tuple[int, int])
     Frame i is at most 0.4 of the database's spacing away from the database's frame i.
     """
     rng = np.random.default_rng([seed, 9, number])
-    lane, heading, pitch = _path(rng, count)
-    z = SPACING * (np.arange(count) + rng.uniform(-0.2, 0.2) + 0.2 * smooth_walk(rng, count))
-    return [Camera(*pose, image_size) for pose in zip(lane, z, heading, pitch, strict=True)]
+    cameras = _weave(rng, count, image_size)
+    places = SPACING * (np.arange(count) + rng.uniform(-0.2, 0.2) + 0.2 * smooth_walk(rng, count))
+    return [replace(camera, z=z) for camera, z in zip(cameras, places, strict=True)]
 
 
-def _path(rng: Rng, count: int) -> tuple[Floats, Floats, Floats]:
-    """x in meters, heading and pitch in radians `[count]`."""
+def _weave(rng: Rng, count: int, image_size: tuple[int, int]) -> list[Camera]:
+    """Cameras that leave the lane and the direction of the street."""
     shift = smooth_walk(rng, count)
     lane = LANE + np.where(shift < 0, -1, 1) * (0.3 + 0.9 * np.abs(shift))
     heading = _DEGREE * (7.5 * smooth_walk(rng, count) + np.clip(0.5 * rng.standard_normal(count), -1, 1))
     pitch = _DEGREE * (1.0 * smooth_walk(rng, count) + 0.3 * rng.standard_normal(count))
-    return lane, heading, pitch
+    poses = zip(lane, SPACING * np.arange(count), heading, pitch, strict=True)
+    return [Camera(*pose, image_size) for pose in poses]
+
+
+@dataclass(frozen=True)
+class Facade:
+    """The street side of a house, in meters: the plane x = `x` between two z, up to `height`."""
+
+    x: float
+    start: float
+    end: float
+    height: float
+
+
+def visible_points(facades: Iterable[Facade], camera: Camera) -> Float[np.ndarray, "points 3"]:
+    """Points on the nearest facades, seen through a grid of every `STEP`-th px of the image."""
+    width, height = camera.image_size
+    u, v = np.meshgrid(np.arange(STEP / 2, width, STEP), np.arange(STEP / 2, height, STEP))
+    rays = np.stack([(u - width / 2) / camera.focal, (v - height / 2) / camera.focal, np.ones_like(u)], -1)
+    rays = rays.reshape(-1, 3) @ camera.rotation()
+    nearest = np.full(len(rays), np.inf)
+    for facade in facades:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (facade.x - camera.x) / rays[:, 0]
+            points = camera.center() + distance[:, None] * rays
+        hit = (distance > 0) & (points[:, 2] >= facade.start) & (points[:, 2] <= facade.end)
+        hit &= (points[:, 1] <= 0) & (points[:, 1] >= -facade.height)
+        nearest = np.where(hit & (distance < nearest), distance, nearest)
+    hits = np.isfinite(nearest)
+    return camera.center() + nearest[hits, None] * rays[hits]
+
+
+def image_shift(points: Float[np.ndarray, "points 3"], query: Camera, database: Camera) -> tuple[float, float]:
+    """Shift (x, y) in px that moves the scene of the query image onto the database image.
+
+    It is the median, per axis, of the position in the database image minus the position in the query image, over the
+    world points inside both images.
+    """
+    (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
+    x, y = np.median((after - before)[inside_query & inside_database], axis=0)
+    return float(x), float(y)
+
+
+def write_ground_truth(path: Path, facades: Iterable[Facade], queries: list[Camera], database: list[Camera]) -> None:
+    """Write the pairs of frames and their shifts in px; see `draw_streets`."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("query", "database", "shift_x", "shift_y"))
+        for i, (query, candidate) in enumerate(zip(queries, database, strict=True)):
+            shift = image_shift(visible_points(facades, query), query, candidate)
+            writer.writerow((f"{i:04d}.png", f"{i:04d}.png", *(f"{s:.3f}" for s in shift)))

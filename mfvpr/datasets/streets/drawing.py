@@ -1,26 +1,29 @@
-"""The folders of the synthetic street: images and ground truth, complete or absent."""
+"""The folders of the synthetic street, complete or absent: images of panels in true perspective, and ground truth."""
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import SPACING, Camera, plan_drives
-from mfvpr.datasets.streets.cars import traffic
-from mfvpr.datasets.streets.exposure import expose
-from mfvpr.datasets.streets.ground_truth import write_ground_truth
-from mfvpr.datasets.streets.painting import paint
+from mfvpr.datasets.streets.camera import NEAR, SPACING, Camera, plan_drives, plan_return, write_ground_truth
+from mfvpr.datasets.streets.colors import Floats, Image
+from mfvpr.datasets.streets.objects import traffic
 from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
-from mfvpr.datasets.streets.weather import WEATHERS
+from mfvpr.datasets.streets.sheets import Panel, Prop
+from mfvpr.datasets.streets.weather import WEATHERS, Weather, expose
 from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
+OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges
 SIGHT = 100.0  # panels farther away are not drawn, meters
+CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")  # those of RobotCar Seasons
+TRUTH = "ground_truth.csv"
 Progress = Callable[[int, int], None]
 
 
@@ -41,6 +44,7 @@ class Drive:
 def draw_streets(
     folder: Path | str,
     *,
+    seasons: bool = False,
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
@@ -57,12 +61,16 @@ def draw_streets(
       of the image, x to the right, y down. The shift is the median, per axis, over facade points that are visible in
       both images (trees, signs and cars disregarded); see `image_shift`.
 
-    The files depend on `seed`, `num_frames` and `image_size` only, to the bit.
+    With `seasons`, a folder per condition replaces the queries. Each has its own drive, between the frames of the
+    database, and its own ground_truth.csv.
+
+    The files depend on the arguments only, to the bit.
 
     Args:
         folder: must not exist yet.
+        seasons: whether the queries are drives in seven conditions.
         seed: of the street, its cars and the drives.
-        num_frames: number of places, 1.75 m apart; there are twice as many images.
+        num_frames: number of places, 1.75 m apart; there are twice as many images, with `seasons` eight times.
         image_size: (width, height) in px.
         progress: `progress(done, total)` is called in the caller's thread after every image.
 
@@ -71,35 +79,39 @@ def draw_streets(
     """
     folder = Path(folder)
     database, queries = plan_drives(seed, num_frames, image_size)
-    weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
-    drives = [
-        Drive(folder / "database", database, ["day"] * num_frames, (seed, 7)),
-        Drive(folder / "queries", queries, weathers, (seed, 8), folder / "ground_truth.csv"),
-    ]
-    draw_drives(drives, seed, SPACING * num_frames, progress)
+    key = (seed, 10, 0) if seasons else (seed, 7)
+    drives = [Drive(folder / "database", database, ["day"] * num_frames, key)]
+    if not seasons:
+        weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
+        drives.append(Drive(folder / "queries", queries, weathers, (seed, 8), folder / TRUTH))
+    for number, condition in enumerate(CONDITIONS if seasons else ()):
+        cameras, place = plan_return(seed, number, num_frames, image_size), folder / condition
+        drives.append(Drive(place, cameras, [condition] * num_frames, (seed, 10, number + 1), place / TRUTH))
+    draw_drives(drives, seed, SPACING * (num_frames + seasons), progress)
 
 
 def streets_folder(
     cache: Path | str,
     *,
-    kind: str = "streets",
-    draw: Callable[..., None] = draw_streets,
+    seasons: bool = False,
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
     progress: Progress | None = None,
 ) -> Path:
-    """The folder of the synthetic street inside `cache`, drawn if it is missing; other options as in `draw_streets`.
+    """The folder of the synthetic street inside `cache`, drawn if it is missing; options as in `draw_streets`.
 
-    `draw` draws it under another name. It is renamed when complete, so that a killed run leaves nothing that looks
-    complete.
+    It is renamed when complete, so that a killed run leaves nothing that looks complete.
     """
+    kind = "seasons" if seasons else "streets"
     folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
             drawing = Path(temporary) / folder.name
-            draw(drawing, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress)
+            draw_streets(
+                drawing, seasons=seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
+            )
             try:
                 os.replace(drawing, folder)
             except OSError:
@@ -140,3 +152,81 @@ def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
     path = drive.folder / f"{row:04d}.png"
     if not cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
         raise OSError(f"cannot write {path}")
+
+
+def paint(layers: Iterable[Iterable[Prop]], camera: Camera, weather: Weather) -> Image:
+    """The image (RGB) that the camera sees, before lens, air and sensor; later layers hide earlier ones."""
+    width, height = camera.image_size
+    size = (round(width * OVERSAMPLING), round(height * OVERSAMPLING))
+    canvas = np.empty((size[1], size[0], 4), np.uint8)
+    canvas[:] = (*weather.horizon, 255)
+    projection = np.diag([size[0] / width, size[1] / height, 1.0]) @ camera.projection()
+    for layer in layers:
+        for prop in sorted(layer, key=lambda prop: -prop.z):
+            for panel in prop.panels:
+                paint_panel(canvas, projection, panel, weather)
+    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)[..., :3]
+
+
+def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weather) -> None:
+    """Paint one panel over the canvas (RGBA), unless it is out of view or shows its back.
+
+    `projection` `[3, 4]` takes world points to homogeneous px of the canvas.
+    """
+    frame = np.column_stack([panel.right, panel.down, panel.corner])
+    homography = projection @ np.vstack([frame, (0, 0, 1)])
+    outline = clip_outline(homography)
+    if outline is None or shows_back(outline):
+        return
+    low = np.maximum(np.floor(outline.min(0)).astype(int) - 1, 0)
+    high = np.minimum(np.ceil(outline.max(0)).astype(int) + 2, canvas.shape[1::-1])
+    width, height = (high - low).tolist()
+    if width <= 0 or height <= 0:
+        return
+    depth = float(homography[2] @ (0.5, 0.5, 1))
+    texture = cv2.LUT(shrink(panel.texture(weather), np.ptp(outline, 0)), haze_table(weather, depth))
+    texels = np.diag([1 / texture.shape[1], 1 / texture.shape[0], 1])
+    warp = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]]) @ homography @ texels
+    patch = cv2.warpPerspective(texture, warp, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    mask = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(mask, np.rint((outline - low) * 16).astype(np.int32), 255, shift=4)
+    mask[patch[..., 3] < 128] = 0
+    cv2.copyTo(patch, mask, canvas[low[1] : high[1], low[0] : high[0]])
+
+
+def clip_outline(homography: Floats) -> Floats | None:
+    """Corners `[n, 2]` px of the unit square's image, clipped in front of the camera; None if all of it is behind."""
+    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]) @ homography.T
+    if np.all(corners[:, 2] > NEAR):
+        return corners[:, :2] / corners[:, 2:]
+    outline = []
+    for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if corner[2] > NEAR:
+            outline.append(corner)
+        if (corner[2] > NEAR) != (following[2] > NEAR):
+            outline.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
+    return np.array([point[:2] / point[2] for point in outline]) if outline else None
+
+
+def shows_back(outline: Floats) -> bool:
+    """Whether the corners `[n, 2]` run the wrong way around, or enclose less than half a px."""
+    corners = outline.tolist()
+    double_area = 0.0
+    for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
+        double_area = double_area + x0 * y1 - y0 * x1
+    return double_area <= 1
+
+
+def haze_table(weather: Weather, depth: float) -> Image:
+    """Lookup table `[1, 256, 4]` that mixes the haze of `depth` meters of air into a color."""
+    share = 1 - np.exp(-((depth / weather.haze) ** 2))
+    levels = np.arange(256, dtype=np.float64)[:, None]
+    table = levels + share * (np.array((*weather.horizon, 0)) - levels) * (1, 1, 1, 0)
+    return table.astype(np.uint8)[None]
+
+
+def shrink(texture: Image, extent: Floats) -> Image:
+    """The texture with no more texels than its image has px, against aliasing; extent is (width, height) in px."""
+    rows, columns = texture.shape[:2]
+    size = (int(np.clip(np.ceil(extent[0]), 1, columns)), int(np.clip(np.ceil(extent[1]), 1, rows)))
+    return texture if size == (columns, rows) else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)

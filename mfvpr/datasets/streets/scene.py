@@ -5,12 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from mfvpr.datasets.streets.camera import CAMERA_HEIGHT, Camera
-from mfvpr.datasets.streets.cars import Car, build_car
+from mfvpr.datasets.streets.camera import CAMERA_HEIGHT, Camera, Facade
 from mfvpr.datasets.streets.colors import WALLS, Image, Rng, as_array, pick, tone
-from mfvpr.datasets.streets.ground_truth import Facade
 from mfvpr.datasets.streets.houses import Design, draw_facade, draw_gable, draw_roof, make_design
-from mfvpr.datasets.streets.objects import draw_ground, draw_hedge, draw_lamp, draw_sign, draw_tree
+from mfvpr.datasets.streets.objects import Car, build_car, draw_ground, draw_hedge, draw_lamp, draw_sign, draw_tree
 from mfvpr.datasets.streets.sheets import Panel, Prop, Texture, blotches, texture, upright
 from mfvpr.datasets.streets.weather import WEATHERS, Weather
 

@@ -66,12 +66,6 @@ class Sheet:
         """Let snow settle on the whole sheet: `amount` is 0..255, broadcast over rows and columns."""
         self.effects[..., 3] = amount
 
-    def mirror(self) -> "Sheet":
-        """The sheet with left and right exchanged."""
-        sheet = Sheet(self.width, self.height, None, self.scale)
-        sheet.day[:], sheet.effects[:] = self.day[:, ::-1], self.effects[:, ::-1]
-        return sheet
-
 
 def texture(sheet: Sheet, lamp_light: Floats | float = 0.0, sun: float = 1.0) -> Texture:
     """The texture of a finished sheet, computed when a weather is first used.

@@ -20,7 +20,10 @@ MAGIC = b"MATLAB"
 _HEADER = 128  # bytes
 _COMPRESSED, _MATRIX, _NAMES, _SIZES, _FLAGS = 15, 14, 1, 5, 6  # types of elements
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # numbers
-_CODES = {2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"}  # type of the elements -> encoding of text
+_CODES = {  # encodings of text by the type of the elements
+    "<": {2: "latin-1", 4: "utf-16-le", 16: "utf-8", 17: "utf-16-le"},
+    ">": {2: "latin-1", 4: "utf-16-be", 16: "utf-8", 17: "utf-16-be"},
+}
 _CELL, _STRUCTURE, _TEXT = 1, 2, 4  # classes of matrices; classes of numbers follow
 _NUMBERS = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _COMPLEX = 0x0800
@@ -128,13 +131,8 @@ def _arrays(path: str, content: memoryview, order: str, depth: int) -> Iterator[
         values = np.frombuffer(stored.content, order + _STORED[stored.kind])
         yield path, values.astype(_NUMBERS[kind]).reshape(shape, order="F")
     elif kind == _TEXT and number and shape[0] == 1:
-        yield path, np.array(_text(next(parts), order))
-
-
-def _text(stored: _Element, order: str) -> str:
-    code = _CODES[stored.kind]
-    endian = {"<": "-le", ">": "-be"}[order] if code == "utf-16" else ""
-    return bytes(stored.content).decode(code + endian)
+        stored = next(parts)
+        yield path, np.array(bytes(stored.content).decode(_CODES[order][stored.kind]))
 
 
 def _parts(paths: list[str], parts: Iterator[_Element], order: str, depth: int) -> Iterator[tuple[str, np.ndarray]]:

@@ -7,7 +7,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from mfvpr.io.formats.pickles import DataUnpickler, Name, excerpt, file_size, name_error, natural_number, of_type
+from mfvpr.io.containers import shorten
+from mfvpr.io.formats.pickles import DataUnpickler, Name, file_size, name_error, natural_number, of_type
 from mfvpr.utils.errors import InputError
 
 MAGIC = b"\x93NUMPY"
@@ -36,10 +37,6 @@ class Array:
     is_fortran: bool = False
     values: Any = None  # bytes, a string of bytes, or a list of objects
 
-    def num_bytes(self, where: str = "") -> int:
-        """Bytes of the numbers by shape and type; raises as `numbers` does."""
-        return math.prod(self.shape) * self._dtype(where).itemsize
-
     def numbers(self, where: str = "") -> np.ndarray:
         """The numbers, read-only, in the file's own type; `where` ends the message of an error.
 
@@ -47,14 +44,6 @@ class Array:
             InputError: the array does not hold numbers.
             TypeError, ValueError: the number of values does not fit the shape.
         """
-        dtype = self._dtype(where)
-        content = self.values.encode("latin-1") if isinstance(self.values, str) else of_type(bytes, self.values)
-        if len(content) != math.prod(self.shape) * dtype.itemsize:
-            raise ValueError("the number of values does not fit the shape")
-        view = np.ndarray(self.shape, dtype, content, order="F" if self.is_fortran else "C")
-        return view.astype(dtype.newbyteorder("="), copy=False)
-
-    def _dtype(self, where: str) -> np.dtype:
         if self.type is None or self.type.order is None:
             raise ValueError("an array without a type")
         if self.type.code not in _NUMBERS:
@@ -62,7 +51,11 @@ class Array:
         dtype = np.dtype(self.type.order + self.type.code)
         if (dtype.itemsize == 1) != (self.type.order == "|"):
             raise ValueError("the byte order does not fit the type")
-        return dtype
+        content = self.values.encode("latin-1") if isinstance(self.values, str) else of_type(bytes, self.values)
+        if len(content) != math.prod(self.shape) * dtype.itemsize:
+            raise ValueError("the number of values does not fit the shape")
+        view = np.ndarray(self.shape, dtype, content, order="F" if self.is_fortran else "C")
+        return view.astype(dtype.newbyteorder("="), copy=False)
 
 
 class _ArrayUnpickler(DataUnpickler):
@@ -124,11 +117,11 @@ def _header_shape(file: BinaryIO, expected: str) -> tuple[int, ...]:
     header = file.read(length)
     fields = _HEADER.fullmatch(header)
     if not fields:
-        got = excerpt(header.decode("latin-1").strip())
+        got = shorten(header.decode("latin-1").strip())
         raise InputError(f"expected {expected}, got an array, {got}; use the official file")
     return (int(fields[2]),) if fields[2] else ()
 
 
 def _type_error(array_type: Type, where: str = "") -> InputError:
-    code = excerpt(array_type.code)
+    code = shorten(array_type.code)
     return InputError(f"expected arrays of integers, float32 or float64, got {code}{where}; use the official file")

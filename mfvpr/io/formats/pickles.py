@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, BinaryIO
 
+from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 
 MEND = "nothing was executed, use the official file"
@@ -156,13 +157,8 @@ def file_size(file: BinaryIO) -> int:
     return size
 
 
-def excerpt(text: str) -> str:
-    """Text of a file on one line of at most 60 characters, for messages."""
-    return repr(text if len(text) <= 60 else f"{text[:57]}...")[1:-1]
-
-
 def name_error(name: Name, expected: str) -> InputError:
-    return InputError(f"it asks for {excerpt(str(name))}, where {expected} are expected; {MEND}")
+    return InputError(f"it asks for {shorten(str(name))}, where {expected} are expected; {MEND}")
 
 
 def of_type(kind: type, value: Any) -> Any:

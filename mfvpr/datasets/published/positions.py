@@ -1,4 +1,4 @@
-"""The validation part of Mapillary Street-Level Sequences (Warburg et al., CVPR 2020)."""
+"""Published data sets with ground truth by position: Pittsburgh30k, Mapillary Street-Level Sequences."""
 
 import csv
 from collections.abc import Iterator
@@ -7,22 +7,68 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, QuerySequence
-from mfvpr.datasets.ground_truth import FARTHEST, RadiusTruth
 from mfvpr.datasets.positives import rows_within
-from mfvpr.datasets.published.lists import dataset_of_lists, listed_images, reading_list
+from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images
+from mfvpr.datasets.truth import FARTHEST, RadiusTruth, require_positions
+from mfvpr.io.containers import reading
+from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numbers import parse_number
 
+PITTSBURGH_LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...
+datasets/pitts30k_{part}.mat                                 lists and positions; or, as GSV-Cities has them,
+pitts30k_{part}_dbImages.npy, _qImages.npy, _gt.npy (_gt_25m.npy)"""
+QUERIES = "queries_real"
 CITIES = ("cph", "sf")
 REACH = 25.0  # meters; images without a database image within it are no queries
+_FLAGS = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
 TABLES = ("raw", "postprocessed", "subtask_index")
-LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
+MSLS_LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
 train_val/cph/query, train_val/sf/database, train_val/sf/query  the same; or, as GSV-Cities has them,
 msls_val_dbImages.npy, msls_val_qImages.npy, msls_val_qIdx.npy, msls_val_pIdx.npy  instead of the tables"""
 
 
+def pitts30k(root: Path, name: str) -> Dataset:
+    """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016).
+
+    Database images are correct within a radius of the query, or within the lists' 25 m.
+    """
+    structure = f"{name}.mat"
+    if path := expected_file(root, f"datasets/{structure}", structure):
+        return _dataset_of_structure(root, name, path)
+    lists = [expected_file(root, f"{name}_{part}.npy") for part in ("dbImages", "qImages", "gt_25m", "gt")]
+    database, queries, *truths = lists
+    if database is None or queries is None or not any(truths):
+        raise InputError(f"{root}: expected datasets/{structure}, or {name}_dbImages.npy, {name}_qImages.npy and "
+                         f"{name}_gt.npy, found neither; get the whole data set")  # fmt: skip
+    return dataset_of_lists(root, name, database, queries, next(filter(None, truths)))
+
+
+def _dataset_of_structure(root: Path, name: str, path: Path) -> Dataset:
+    mend = f"expected the structure dbStruct of {name}; get the file again"
+    with reading(path, mend=mend), path.open("rb") as file:
+        arrays = read_matlab(file, text=True)
+        sides = [_cell_texts(arrays, f"dbStruct.{field}.") for field in ("dbImageFns", "qImageFns")]
+        positions = [arrays[f"dbStruct.{field}"].T.astype(np.float64) for field in ("utmDb", "utmQ")]
+    for names, xy in zip(sides, positions, strict=True):
+        require_positions(str(path), xy, len(names))
+    database = listed_images(root, sides[0], path)
+    queries = listed_images(root, [f"{QUERIES}/{query}" for query in sides[1]], path)
+    truth = RadiusTruth(positions[1], positions[0])
+    return Dataset(name, database, (QuerySequence(name, queries, truth),))
+
+
+def _cell_texts(arrays: dict[str, np.ndarray], prefix: str) -> list[str]:
+    """Texts of a cell array, in order."""
+    texts = {int(path.removeprefix(prefix)): str(text) for path, text in arrays.items() if path.startswith(prefix)}
+    return [texts[number] for number in range(len(texts))]
+
+
 def msls_val(root: Path, name: str) -> Dataset:
-    """Copenhagen and San Francisco without panoramas; queries have a database image within 25 m, as in its own code."""
+    """The validation part of Mapillary Street-Level Sequences (Warburg et al., CVPR 2020), without panoramas.
+
+    Queries have a database image within 25 m, as in its own code.
+    """
     lists = database, queries, selection, truth = [
         root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "qIdx", "pIdx")
     ]
@@ -56,7 +102,8 @@ def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]
                          "again")  # fmt: skip
     for key, line in processed.items():
         try:
-            if _flag(raw[key]["pano"]) or not _flag(tasks[key]["all"]):
+            is_panorama, is_of_all = (_FLAGS[text.strip().lower()] for text in (raw[key]["pano"], tasks[key]["all"]))
+            if is_panorama or not is_of_all:
                 continue
             position = parse_number(line["easting"]), parse_number(line["northing"])
             if not all(abs(meters) <= FARTHEST for meters in position):  # NaN neither
@@ -69,17 +116,9 @@ def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]
             ) from None
 
 
-def _flag(text: str) -> bool:
-    """Parse a flag as pandas does."""
-    return {"true": True, "1": True, "false": False, "0": False}[text.strip().lower()]
-
-
 def _table(path: Path) -> dict[str, dict[str, str]]:
     """Lines of a table by key."""
-    with (
-        reading_list(path, "expected a table of commas; get it again", "a table of the data set"),
-        path.open(newline="", encoding="utf-8") as file,
-    ):
+    with reading(path, "a table", "get it again"), path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     table = {line.get("key") or "": line for line in lines}
     if len(table) < len(lines) or "" in table:
