@@ -64,8 +64,9 @@ def require_checkpoint(path: Path) -> bytes:
 
 def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
     """Read a .npy file with a pickled dictionary of layers; many names may share an array of a hostile file."""
-    layers, *others = numpy_objects.read_objects(file, _LAYERS) or [None]
-    if others or not isinstance(layers, dict) or not layers:
+    objects = numpy_objects.read_objects(file, _LAYERS)
+    layers = objects[0] if len(objects) == 1 else None
+    if not isinstance(layers, dict) or not layers:
         raise InputError(f"expected {_LAYERS}, got another object; use the official file")
     arrays, room = {}, file_size(file)
     for layer, parts in layers.items():

@@ -8,9 +8,8 @@ from jaxtyping import Float
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.network import NetworkExtractor
-from mfvpr.networks.imagenet import Images, Pixels
-from mfvpr.networks.lengths import of_unit_length
-from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR, preprocess
+from mfvpr.networks.imagenet import Images, Pixels, of_unit_length
+from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR
 from mfvpr.utils.errors import InputError
 
 
@@ -28,9 +27,6 @@ class MixVprDescriptor(NetworkExtractor):
     model: MixVPR  # 4096, 512 or 128 numbers with published weights
     interpolation: Interpolation = "pil_bicubic"
     batch_size: int = field(default=8, metadata={"recipe": False})
-
-    def compute(self, model: MixVPR, images: jax.Array) -> jax.Array:
-        return model(preprocess(images))
 
 
 class DescriptorNetwork(Protocol):

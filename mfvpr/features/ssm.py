@@ -55,8 +55,7 @@ class SsmMaps(NetworkExtractor):
         self, model: SsmVgg, images: Num[jax.Array, "images height width 3"]
     ) -> Float[jax.Array, "images rows columns 512"]:
         """Maps of a batch; runs in a compiled program."""
-        stage = {1: model.stage1, 2: model.stage2}[self.stage]
-        return normalize_maps(stage(model.preprocess(images, self.preprocessing)))
+        return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
 
 
 class _WhitenedWindows(NetworkExtractor):
