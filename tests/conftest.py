@@ -106,12 +106,13 @@ def cache(tmp_path_factory) -> Iterator[None]:
 def weights(tmp_path_factory) -> Path:
     """A folder of installed weights: random ones, but ALIKED's real ones where they are at hand."""
     root = tmp_path_factory.mktemp("weights")
-    for name, tensors in random_checkpoints.at_hand():
-        entry, source = entry_of(name), root / f"{name}.source"
-        source.write_text("not published")
-        plan = blueprint(entry)
-        arrays = convert(tensors, NETWORKS[name].table, plan.shapes)
-        save(entry, arrays, source, parameters=plan.parameters, folder=root)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MFVPR_WEIGHTS", str(root))
+        for name, tensors in random_checkpoints.at_hand():
+            entry, source = entry_of(name), root / f"{name}.source"
+            source.write_text("not published")
+            plan = blueprint(entry)
+            save(entry, convert(tensors, NETWORKS[name].table, plan.shapes), source, parameters=plan.parameters)
     return root
 
 

@@ -91,14 +91,14 @@ def contests() -> Iterator[Contest]:
         yield Contest(f"{name} features", name, size, extractor, "torch_aliked.aliked", {"threshold": THRESHOLD},
                       note=" (deformable convolution in Python)")  # fmt: skip
     vector = partial(GlobalDescriptor, image_size=PLACES_SIZE)
-    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "torch_places.netvlad")
+    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "torch_networks.netvlad")
     for name, sizes in PATCHES.items():
         step = f"Patch-NetVLAD features, sizes {', '.join(map(str, sizes))}, {name.rpartition('_')[2]} dimensions"
         extractor = partial(PatchNetVladFeatures, patch_sizes=sizes, image_size=PLACES_SIZE)
-        yield Contest(step, name, PLACES_SIZE, extractor, "torch_places.patch_netvlad", {"sizes": sizes})
-    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "torch_places.gem")
+        yield Contest(step, name, PLACES_SIZE, extractor, "torch_networks.patch_netvlad", {"sizes": sizes})
+    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "torch_networks.gem")
     extractor = partial(SelaVprFeatures, image_size=SELAVPR_SIZE)
-    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "torch_places.selavpr", {"blocks": BLOCKS})
+    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "torch_networks.selavpr", {"blocks": BLOCKS})
 
 
 def _program(function: Callable[[Any, Any], Any], model: Any, batch_size: int) -> Callable[[np.ndarray], Any]:

@@ -1,7 +1,4 @@
-"""ALIKED in plain torch, with the keys of the published weights.
-
-The deformable convolution samples with `grid_sample`; torchvision's compiled one is not used.
-"""
+"""ALIKED in plain torch, with the keys of the published weights; deformable convolutions use `grid_sample`."""
 
 import torch
 import torch.nn.functional as F
@@ -109,5 +106,5 @@ def _descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
 def _neighborhood(radius: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Offsets down and to the right, row by row."""
     reach = torch.arange(-radius, radius + 1, device=device)
-    down, right = torch.meshgrid(reach, reach, indexing="ij")
-    return down.flatten(), right.flatten()
+    down, right = torch.cartesian_prod(reach, reach).T
+    return down, right

@@ -2,19 +2,22 @@
 
 import zipfile
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from mfvpr.checkpoints.numpy_files import read_layers
 from mfvpr.checkpoints.torch_files import read_legacy, read_zip
+from mfvpr.io.containers import shorten
 from mfvpr.io.formats import matlab_files, numpy_objects
 from mfvpr.io.formats.matlab_files import read_matlab
+from mfvpr.io.formats.pickles import MEND, file_size, of_type
 from mfvpr.utils.errors import InputError
 
+_MAX_NAME = 100  # characters of layer and name
+_ENTRY = 16  # least bytes of an array in a NumPy file, besides its values
+_LAYERS = "a dictionary of layers"
 _DAMAGE = (ArithmeticError, LookupError, TypeError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile)
 _DAMAGE += (Warning,)  # such as NumPy's for NaN among integers, if warnings are errors
-# First bytes of a file -> reader; every binary pickle begins with the last ones.
-_READERS = {b"PK": read_zip, numpy_objects.MAGIC: read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}
 
 
 def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
@@ -58,3 +61,34 @@ def require_checkpoint(path: Path) -> bytes:
     if start.startswith(b"PK") and not zipfile.is_zipfile(path):
         raise InputError(f"{path}: this checkpoint is truncated; {again}")
     return start
+
+
+def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
+    """Read a .npy file with a pickled dictionary of layers; many names may share an array of a hostile file."""
+    objects = numpy_objects.read_objects(file, _LAYERS)
+    layers = objects[0] if len(objects) == 1 else None
+    if not isinstance(layers, dict) or not layers:
+        raise InputError(f"expected {_LAYERS}, got another object; use the official file")
+    arrays, room = {}, file_size(file)
+    for layer, parts in layers.items():
+        if not isinstance(parts, dict):
+            raise InputError(f"expected arrays by layer, got {type(parts).__name__} at {shorten(str(layer))}; {MEND}")
+        for name, array in parts.items():
+            if len(of_type(str, layer)) + len(of_type(str, name)) > _MAX_NAME:
+                raise ValueError("a name of too many characters")
+            key = f"{layer}.{name}"
+            where = f" at {shorten(key)}"
+            if not isinstance(array, numpy_objects.Array):
+                raise InputError(f"expected arrays by layer, got {type(array).__name__}{where}; {MEND}")
+            numbers = array.numbers(where)
+            room -= numbers.nbytes + _ENTRY
+            if room < 0:
+                raise InputError(f"expected no more values than the file stores{where}; use the official file")
+            if key in arrays:
+                raise ValueError("two arrays of one name")
+            arrays[key] = numbers
+    return arrays
+
+
+# First bytes of a file -> reader; every binary pickle begins with the last ones.
+_READERS = {b"PK": read_zip, numpy_objects.MAGIC: _read_layers, matlab_files.MAGIC: read_matlab, b"\x80": read_legacy}

@@ -47,16 +47,11 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Rules for all keys of a network's checkpoint.
-
-    Args:
-        rules: targets of the keys.
-        ignored: patterns of keys that the network does not need.
-        expected: pattern -> required shape of ignored keys that identify this network's checkpoint.
-    """
+    """Rules for all keys of a network's checkpoint."""
 
     rules: tuple[Rule, ...]
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # patterns of keys that the network does not need
+    # Pattern -> required shape of ignored keys that identify this network's checkpoint.
     expected: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
@@ -110,7 +105,9 @@ def _convert_tensor(
     elif value.dtype not in (np.float32, np.float64):
         problems["of another type"].append(f"{key}: expected float32 or float64, got {value.dtype}")
     else:
-        return _to_layout(value.reshape(expected), layout).reshape(shape)
+        axes = layout.value.axes or range(len(expected))
+        ordered = value.reshape(expected).transpose(axes)
+        return (layout.value.sign * np.array(ordered, np.float32, order="C")).reshape(shape)
     return value
 
 
@@ -128,12 +125,6 @@ def is_ignored(key: str, table: Table) -> bool:
 def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
     matches = ((re.fullmatch(rule.source, key), rule) for rule in table.rules)
     return [(match.expand(rule.target), rule.layout) for match, rule in matches if match]
-
-
-def _to_layout(array: np.ndarray, layout: Layout) -> np.ndarray:
-    axes, sign = layout.value.axes, layout.value.sign
-    ordered = np.array(array if axes is None else array.transpose(axes), np.float32, order="C")
-    return ordered if sign == 1 else np.negative(ordered)
 
 
 def _significant_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:

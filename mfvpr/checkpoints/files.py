@@ -56,20 +56,19 @@ def weights_folder() -> Path:
     return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
 
 
-def install(checkpoint: Path, name: str, folder: Path | None = None, *, own: str | None = None) -> Path:
+def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
     """Convert a checkpoint to a runtime file; the checkpoint does not change.
 
     Args:
         checkpoint: the official file, or one with its keys and shapes; a runtime file if the weights are your own.
         name: of the published weights.
-        folder: `weights_folder()` by default.
         own: name of weights of your own, for the network of `name`. They are installed as `own/<name>`.
 
     Raises:
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
     entry = entry_of(name) if own is None else own_entry(f"{OWN}{own}", name)
-    if own is not None and is_installed(entry, folder):
+    if own is not None and is_installed(entry):
         raise InputError(f"{entry.name}: expected a name that is free, got one of installed weights; choose another")
     network, is_runtime_file = NETWORKS[name], own is not None and checkpoint.suffix == ".safetensors"
     if is_runtime_file:
@@ -86,7 +85,7 @@ def install(checkpoint: Path, name: str, folder: Path | None = None, *, own: str
         raise InputError(f"{checkpoint}: {reason}; use the official {entry_of(name).file}") from error
     needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
     rounded = sum(tensor.dtype == np.float64 for tensor in needed)
-    return save(entry, arrays, checkpoint, parameters=plan.parameters, rounded=rounded, folder=folder)
+    return save(entry, arrays, checkpoint, parameters=plan.parameters, rounded=rounded)
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
@@ -109,15 +108,7 @@ def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
         raise InputError(f"{origin}: expected the sha256 of {entry.name}, {str(entry.sha256)[:12]}..., got {got}")
 
 
-def save(
-    entry: Entry,
-    arrays: Mapping[str, np.ndarray],
-    source: Path,
-    *,
-    parameters: int,
-    rounded: int = 0,
-    folder: Path | None = None,
-) -> Path:
+def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int, rounded: int = 0) -> Path:
     """Write the arrays by dotted path, then the manifest; `load` raises an error for a file without a manifest.
 
     `source` is the checkpoint of the arrays; `parameters` and `rounded` are those of the manifest.
@@ -129,7 +120,7 @@ def save(
         if not np.isfinite(array).all():
             raise InputError(f"{source}: expected finite values, got NaN or infinity in {path}; use the official file")
     content = safetensors.numpy.save({path: np.ascontiguousarray(array) for path, array in arrays.items()})
-    target = _path(entry, folder)
+    target = _path(entry)
     with replacing(target) as temporary:
         temporary.write_bytes(content)
     sha256 = hashlib.sha256(content).hexdigest()
@@ -140,16 +131,15 @@ def save(
     return target
 
 
-def load(name: str, folder: Path | None = None) -> dict[str, np.ndarray]:
+def load(name: str) -> dict[str, np.ndarray]:
     """Read arrays by dotted path, from a file whose hash is that of its manifest.
 
     Raises:
         InputError: the name is unknown.
         WeightsError: the weights are not installed, the manifest is missing or of other weights, or a file is damaged.
     """
-    entry = installed_entry(name, folder)
-    manifest = read_manifest(name, folder)
-    path = _path(entry, folder)
+    entry, manifest = installed_entry(name), read_manifest(name)
+    path = _path(entry)
     if (size := path.stat().st_size) != manifest.size:
         raise WeightsError(f"{path}: expected {manifest.size} bytes, got {size}; {_MEND}", entry)
     content = path.read_bytes()
@@ -168,43 +158,42 @@ def _parse(content: bytes, origin: str) -> dict[str, np.ndarray]:
         raise InputError(f"{origin}expected a safetensors file, got: {error}") from error
 
 
-def installed_entry(name: str, folder: Path | None = None) -> Entry:
+def installed_entry(name: str) -> Entry:
     """`entry_of`, also for installed weights of one's own (`own/<name>`)."""
-    return {entry.name: entry for entry in own_entries(folder)}.get(name) or entry_of(name)
+    return {entry.name: entry for entry in own_entries()}.get(name) or entry_of(name)
 
 
-def own_entries(folder: Path | None = None) -> list[Entry]:
+def own_entries() -> list[Entry]:
     """Entries of the weights of one's own that are installed."""
-    folder, entries = folder or weights_folder(), []
-    for path in sorted(folder.glob(f"{OWN}*.json")):
+    entries = []
+    for path in sorted(weights_folder().glob(f"{OWN}*.json")):
         with suppress(OSError, ValueError, LookupError, TypeError):  # damaged: not installed
             entries.append(own_entry(f"{OWN}{path.stem}", json.loads(path.read_text(encoding="utf-8"))["like"]))
     return entries
 
 
-def load_model(name: str, folder: Path | None = None) -> "nnx.Module":
+def load_model(name: str) -> "nnx.Module":
     """Load the network of this name with its weights, ready for inference.
 
     Raises:
         InputError: the name is unknown.
         WeightsError: as `load`; or the arrays do not fit the network.
     """
-    entry = installed_entry(name, folder)
-    arrays = load(name, folder)
+    entry, arrays = installed_entry(name), load(name)
     try:
         return blueprint(entry).build(arrays)
     except InputError as error:  # the file comes from another version of the network
-        raise WeightsError(f"{_path(entry, folder)}: {error}; {_MEND}", entry) from error
+        raise WeightsError(f"{_path(entry)}: {error}; {_MEND}", entry) from error
 
 
-def read_manifest(name: str, folder: Path | None = None) -> Manifest:
+def read_manifest(name: str) -> Manifest:
     """Read the manifest of an installed runtime file, but not the file.
 
     Raises:
         WeightsError: the weights are not installed, or have no manifest of this name and format.
     """
-    entry = installed_entry(name, folder)
-    path = _path(entry, folder).with_suffix(".json")
+    entry = installed_entry(name)
+    path = _path(entry).with_suffix(".json")
     if not path.with_suffix(".safetensors").is_file():
         source = f"{entry.file} from {entry.source} ({entry.license})"
         raise WeightsError(f"{name}: not installed in {path.parent}; get {source} and install it", entry)
@@ -224,9 +213,9 @@ def read_manifest(name: str, folder: Path | None = None) -> Manifest:
     return manifest
 
 
-def is_installed(entry: Entry, folder: Path | None = None) -> bool:
+def is_installed(entry: Entry) -> bool:
     """Whether the runtime file and its manifest exist; `load` verifies them."""
-    path = _path(entry, folder)
+    path = _path(entry)
     return path.is_file() and path.with_suffix(".json").is_file()
 
 
@@ -236,5 +225,5 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _path(entry: Entry, folder: Path | None) -> Path:
-    return (folder or weights_folder()) / f"{entry.name}.safetensors"
+def _path(entry: Entry) -> Path:
+    return weights_folder() / f"{entry.name}.safetensors"

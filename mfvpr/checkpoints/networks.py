@@ -83,13 +83,10 @@ class Blueprint:
         """Build the network with these values, in evaluation mode; InputError if paths or shapes differ."""
         import jax
         from flax import nnx
-        from flax.traverse_util import unflatten_dict
 
-        arrays = convert(arrays, RUNTIME, self.shapes)
-        values = {_keys(path): jax.device_put(array) for path, array in arrays.items()}
-        state = jax.tree.map(lambda leaf: leaf, self._state)  # a copy, which the next line changes
-        nnx.replace_by_pure_dict(state, unflatten_dict(values))
-        module = nnx.merge(self._graph, state)
+        arrays = jax.device_put(convert(arrays, RUNTIME, self.shapes))
+        leaves = [(keys, leaf.replace(arrays[_path(keys)])) for keys, leaf in nnx.to_flat_state(self._state)]
+        module = nnx.merge(self._graph, nnx.from_flat_state(leaves))
         module.eval()
         return module
 
@@ -118,17 +115,15 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     """Blueprint of the network that `build(rngs=...)` makes."""
     import jax
     from flax import nnx
-    from flax.traverse_util import flatten_dict
 
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
     graph, state = nnx.split(module)
-    leaves: Any = flatten_dict(nnx.to_pure_dict(state))
-    shapes = {".".join(map(str, keys)): leaf.shape for keys, leaf in leaves.items()}
+    shapes = {_path(keys): leaf.shape for keys, leaf in nnx.to_flat_state(state)}
     parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
     return Blueprint(shapes, parameters, graph, state)
 
 
-def _keys(path: str) -> tuple[int | str, ...]:
-    """Keys of a dotted path; digits are positions in a list."""
-    return tuple(int(part) if part.isdigit() else part for part in path.split("."))
+def _path(keys: Sequence[Any]) -> str:
+    """Dotted path of names of attributes and positions in lists."""
+    return ".".join(map(str, keys))

@@ -20,7 +20,6 @@ class Entry:
     sha256: str | None  # None where not published
     code_license: str
     weights_license: str
-    parameters: int  # without the running statistics of batch normalization
     like: str | None = None  # weights of one's own: the published entry of the same network
 
     @property
@@ -41,79 +40,39 @@ _LICENSES = {  # network -> of the code and of the weights
     "dinov2": ("Apache-2.0", "Apache-2.0"),
     "selavpr": ("MIT, Apache-2.0", "none stated"),
 }
-_VGG16 = 14_714_688  # parameters of its convolutions
-_HLOC = "https://cvg-data.inf.ethz.ch/hloc/netvlad"
-_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
 _PLACES365 = (
     "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
     "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel"
 )
+_D2NET, _HLOC = "https://dusmanu.com/files/d2-net", "https://cvg-data.inf.ethz.ch/hloc/netvlad"
+_NANNE = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
+_COSPLACE = "https://github.com/gmberton/CosPlace/releases/download/v1.0"
+_DINOV2 = "https://dl.fbaipublicfiles.com/dinov2"
 
 
 def _entry(
-    network: str,
-    name: str,
-    file: str,
-    source: str,
-    parameters: int,
-    *,
-    published: tuple[int | None, str | None] = (None, None),
+    network: str, name: str, source: str, *, file: str = "", size: int | None = None, sha256: str | None = None,
     license: str | None = None,
-) -> Entry:
-    """Entry with the network's licenses, or with `license` for both; size and sha256 if they are published."""
+) -> Entry:  # fmt: skip
+    """Entry with the network's licenses, or with `license` for both; the source ends with the file by default."""
     licenses = (license, license) if license else _LICENSES[network]
-    return Entry(name, network, file, source, *published, *licenses, parameters)
+    return Entry(name, network, file or source.rpartition("/")[2], source, size, sha256, *licenses)
 
 
-def _d2net(name: str) -> Entry:
-    return _entry("d2net", name, f"{name}.pth", f"https://dusmanu.com/files/d2-net/{name}.pth", 7_635_264)
-
-
-def _mixvpr(channels: int, rows: int, drive_id: str, parameters: int) -> Entry:
+def _mixvpr(channels: int, rows: int, drive_id: str) -> Entry:
     width = channels * rows
     file = f"resnet50_MixVPR_{width}_channels({channels})_rows({rows}).ckpt"
-    return _entry("mixvpr", f"mixvpr_{width}", file, _drive(drive_id), parameters)
+    return _entry("mixvpr", f"mixvpr_{width}", _drive(drive_id), file=file)
 
 
-def _aliked(variant: str, parameters: int, size: int, sha256: str) -> Entry:
-    file = f"aliked-{variant}.pth"
-    source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{file}"
-    return _entry("aliked", f"aliked-{variant}", file, source, parameters, published=(size, sha256))
-
-
-def _netvlad(name: str, file: str, source: str, outputs: int | None, license: str | None = None) -> Entry:
-    parameters = _netvlad_parameters(64, outputs)
-    return _entry("netvlad", f"netvlad_{name}", file, source, parameters, license=license)
+def _aliked(variant: str, size: int, sha256: str) -> Entry:
+    source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-{variant}.pth"
+    return _entry("aliked", f"aliked-{variant}", source, size=size, sha256=sha256)
 
 
 def _patchnetvlad(training: str, outputs: int, size: int | None, sha256: str) -> Entry:
-    file = f"{training}_WPCA{outputs}.pth.tar"
-    source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{file}"
-    parameters = _netvlad_parameters(16 if training == "mapillary" else 64, outputs)
-    name = f"patchnetvlad_{training}_{outputs}"
-    return _entry("patch_netvlad", name, file, source, parameters, published=(size, sha256))
-
-
-def _netvlad_parameters(clusters: int, outputs: int | None) -> int:
-    return _VGG16 + 2 * 512 * clusters + (512 * clusters + 1) * (outputs or 0)
-
-
-def _cosplace(backbone: str, outputs: int) -> Entry:
-    file = f"{backbone}_{outputs}_cosplace.pth"
-    source = f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{file}"
-    convolutions, channels = {"VGG16": (_VGG16, 512), "ResNet50": (23_508_032, 2048)}[backbone]
-    parameters = convolutions + 1 + (channels + 1) * outputs
-    return _entry("gem", f"cosplace_{backbone.lower()}_{outputs}", file, source, parameters)
-
-
-def _dinov2(name: str, parameters: int) -> Entry:
-    name, file = f"dinov2_{name}", f"dinov2_{name}_pretrain.pth"
-    return _entry("dinov2", name, file, f"https://dl.fbaipublicfiles.com/dinov2/{name}/{file}", parameters)
-
-
-def _selavpr(training: str, file: str, drive_id: str, registers: int = 0) -> Entry:
-    parameters = 357_427_585 + 1024 * registers  # without the training's mask token
-    return _entry("selavpr", f"selavpr_{training}", file, _drive(drive_id), parameters)
+    source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{training}_WPCA{outputs}.pth.tar"
+    return _entry("patch_netvlad", f"patchnetvlad_{training}_{outputs}", source, size=size, sha256=sha256)
 
 
 def _drive(file_id: str) -> str:
@@ -122,26 +81,24 @@ def _drive(file_id: str) -> str:
 
 # fmt: off
 _ENTRIES = (
-    _d2net("d2_tf"),
-    _d2net("d2_ots"),
-    _d2net("d2_tf_no_phototourism"),
-    _mixvpr(1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L", 10_880_900),
-    _mixvpr(256, 2, "1khiTUNzZhfV2UUupZoIsPIbsMRBYVDqj", 10_092_898),
-    _mixvpr(64, 2, "1DQnefjk1hVICOEYPwE4-CZAZOvi1NSJz", 9_896_098),
-    _aliked("t16", 192_100, 794_859, "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
-    _aliked("n16", 677_356, 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
-    _aliked("n16rot", 677_356, 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
-    _aliked("n32", 979_500, 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
-    _entry("lightglue", "aliked_lightglue", "aliked_lightglue.pth",
-           "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth", 11_884_625,
-           published=(47_632_827, "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503")),
-    _entry("ssm", "vgg16_places365", "vgg16_places365.npy", _PLACES365, 12_354_880),
-    _netvlad("pitts30k", "Pitts30K_struct.mat", f"{_HLOC}/Pitts30K_struct.mat", 4096),
-    _netvlad("tokyotm", "TokyoTM_struct.mat", f"{_HLOC}/TokyoTM_struct.mat", 4096),
-    _netvlad("pytorch", "checkpoint.pth.tar", _NANNE, None, "none stated"),
-    _cosplace("VGG16", 512),
-    _cosplace("ResNet50", 512),
-    _cosplace("ResNet50", 2048),
+    *(_entry("d2net", name, f"{_D2NET}/{name}.pth") for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")),
+    _mixvpr(1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L"),
+    _mixvpr(256, 2, "1khiTUNzZhfV2UUupZoIsPIbsMRBYVDqj"),
+    _mixvpr(64, 2, "1DQnefjk1hVICOEYPwE4-CZAZOvi1NSJz"),
+    _aliked("t16", 794_859, "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
+    _aliked("n16", 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
+    _aliked("n16rot", 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
+    _aliked("n32", 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+    _entry("lightglue", "aliked_lightglue",
+           "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+           size=47_632_827, sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
+    _entry("ssm", "vgg16_places365", _PLACES365, file="vgg16_places365.npy"),
+    _entry("netvlad", "netvlad_pitts30k", f"{_HLOC}/Pitts30K_struct.mat"),
+    _entry("netvlad", "netvlad_tokyotm", f"{_HLOC}/TokyoTM_struct.mat"),
+    _entry("netvlad", "netvlad_pytorch", _NANNE, file="checkpoint.pth.tar", license="none stated"),
+    _entry("gem", "cosplace_vgg16_512", f"{_COSPLACE}/VGG16_512_cosplace.pth"),
+    _entry("gem", "cosplace_resnet50_512", f"{_COSPLACE}/ResNet50_512_cosplace.pth"),
+    _entry("gem", "cosplace_resnet50_2048", f"{_COSPLACE}/ResNet50_2048_cosplace.pth"),
     _patchnetvlad("mapillary", 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
     _patchnetvlad("mapillary", 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
     _patchnetvlad("mapillary", 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),
@@ -149,12 +106,12 @@ _ENTRIES = (
     _patchnetvlad("pitts", 512, None, "309611d927c759e897e1eb27977994236b5618d9d3cd7202035cea1b56c08c1c"),
     _patchnetvlad("pitts", 4096, 1_132_901_186, "2c3cf17de91974156cb6aee40a6f7a229825095273d7de87c0792084ae1bf4aa"),
     _patchnetvlad("landmarks", 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
-    _dinov2("vits14", 22_056_192),
-    _dinov2("vitb14", 86_579_712),
-    _dinov2("vitl14", 304_367_616),
-    _selavpr("pitts30k", "SelaVPR_pitts30k.pth", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO"),
-    _selavpr("msls", "SelaVPR_msls.pth", "1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV"),
-    _selavpr("msls_registers", "SelaVPR_reg4_msls.pth", "16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk", registers=4),
+    *(_entry("dinov2", f"dinov2_{name}", f"{_DINOV2}/dinov2_{name}/dinov2_{name}_pretrain.pth")
+      for name in ("vits14", "vitb14", "vitl14")),
+    _entry("selavpr", "selavpr_pitts30k", _drive("1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO"), file="SelaVPR_pitts30k.pth"),
+    _entry("selavpr", "selavpr_msls", _drive("1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV"), file="SelaVPR_msls.pth"),
+    _entry("selavpr", "selavpr_msls_registers", _drive("16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk"),
+           file="SelaVPR_reg4_msls.pth"),
 )
 # fmt: on
 

@@ -27,8 +27,7 @@ from .aliked import AlikedFeatures
 from .d2net import D2NetFeatures
 from .extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
-from .global_descriptor import GlobalDescriptor
-from .mixvpr import MixVprDescriptor
+from .global_descriptor import GlobalDescriptor, MixVprDescriptor
 from .patch_netvlad import PatchNetVladFeatures
 from .selavpr import SelaVprFeatures
 from .sift import Sift

@@ -13,17 +13,16 @@ from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import compile_network, in_batches, require_at_least, require_size
+from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.aliked import Aliked
 from mfvpr.networks.aliked_detection import RADIUS, Detections
-from mfvpr.types import Features
 
 _SMALLEST = 2 * RADIUS + 1  # px: one pixel within the border, which has no keypoints
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
 
 
 @dataclass(frozen=True)
-class AlikedFeatures:
+class AlikedFeatures(NetworkExtractor):
     """ALIKED's keypoints and descriptors, as the public code extracts them.
 
     Keypoints are in row order, or by falling score if an image has more than `max_keypoints`.
@@ -56,8 +55,7 @@ class AlikedFeatures:
         """
         return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        require_size("ALIKED", images, self.image_size)
+    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         extracted = in_batches(self._program(usual), images, self.batch_size)
         counts = [int(detections.count) for detections, _ in extracted]
@@ -68,7 +66,7 @@ class AlikedFeatures:
             again = in_batches(self._program(capacity), images[crowded], self.batch_size)
             for row, result in zip(crowded, again, strict=True):
                 extracted[row] = result
-        return [Description(local=(self._features(*result),)) for result in extracted]
+        return extracted
 
     @property
     def _limit(self) -> int:
@@ -84,6 +82,8 @@ class AlikedFeatures:
 
         return cache(lambda capacity: compile_network(self.model, partial(extract, capacity=capacity)))
 
-    def _features(self, detections: Detections, descriptors: Float[np.ndarray, "slots dimensions"]) -> Features:
+    def _describe(self, result: tuple[Detections, Float[np.ndarray, "slots dimensions"]]) -> Description:
+        detections, descriptors = result
         keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))
-        return local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])
+        features = local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])
+        return Description(local=(features,))

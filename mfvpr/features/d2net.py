@@ -10,17 +10,16 @@ from jaxtyping import Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import compile_network, in_batches, require_at_least, require_size
+from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
-from mfvpr.types import Features
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth
 _SMALLEST_MAP = 2
 
 
 @dataclass(frozen=True)
-class D2NetFeatures:
+class D2NetFeatures(NetworkExtractor):
     """D2-Net's keypoints and descriptors, as the public code extracts them and in its order.
 
     Scores are activations, which are not comparable between images.
@@ -58,13 +57,12 @@ class D2NetFeatures:
         usual = round(740 * share * (1.4 if self.multiscale else 1))
         return (Scale(512, usual if self.max_keypoints is None else min(usual, self.max_keypoints)),)
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        require_size("D2-Net", images, self.image_size)
+    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         results = in_batches(self._program(_SHARE), images, self.batch_size)
         crowded = [row for row, levels in enumerate(results) if any(level.count > len(level.mask) for level in levels)]
         for row, levels in zip(crowded, in_batches(self._program(1.0), images[crowded], self.batch_size), strict=True):
             results[row] = levels
-        return [Description(local=(self._features(levels),)) for levels in results]
+        return results
 
     @property
     def _network_scales(self) -> tuple[float, ...]:
@@ -76,10 +74,11 @@ class D2NetFeatures:
         function = partial(extract, preprocessing=self.preprocessing, scales=self._network_scales)
         return cache(lambda share: compile_network(self.model, partial(function, share=share)))
 
-    def _features(self, levels: tuple[Detections, ...]) -> Features:
+    def _describe(self, result: tuple[Detections, ...]) -> Description:
         keypoints, descriptors, scores = (
-            np.concatenate([getattr(level, name)[level.mask] for level in levels])
+            np.concatenate([getattr(level, name)[level.mask] for level in result])
             for name in ("keypoints", "descriptors", "scores")
         )
         strongest = np.sort(np.argsort(-scores, kind="stable")[: self.max_keypoints])
-        return local_features(keypoints[strongest], descriptors[strongest], self.image_size, scores[strongest])
+        features = local_features(keypoints[strongest], descriptors[strongest], self.image_size, scores[strongest])
+        return Description(local=(features,))

@@ -48,7 +48,10 @@ def describe_images(images: Num[np.ndarray, "images height width 3"], extractor:
     descriptions = list(extractor(images))
     _check_descriptions(descriptions, extractor, len(images))
     unpadded = (Description(vector, tuple(map(without_padding, local))) for vector, local in descriptions)
-    return [description if _is_finite(description) else None for description in unpadded]
+    return [
+        description if all(np.isfinite(array).all() for array in jax.tree.leaves(description)) else None
+        for description in unpadded
+    ]
 
 
 def _check_descriptions(descriptions: list[Description], extractor: Extractor, num_images: int) -> None:
@@ -92,7 +95,3 @@ def _readable_images(
             bad[row] = str(image)
         else:
             raise InputError(f"{image}, or skip bad images")
-
-
-def _is_finite(description: Description) -> bool:
-    return all(np.isfinite(array).all() for array in jax.tree.leaves(description))

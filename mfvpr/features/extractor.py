@@ -14,16 +14,11 @@ from mfvpr.types import Features
 
 
 class Scale(NamedTuple):
-    """One scale of an extractor's local features.
+    """One scale of an extractor's local features."""
 
-    dimension: D of the descriptors.
-    typical_count: usual number of features in an image, for forecasts of disk space.
-    weight: weight of the scale's score when the scores of several scales are fused.
-    """
-
-    dimension: int
-    typical_count: int
-    weight: float = 1.0
+    dimension: int  # D of the descriptors
+    typical_count: int  # usual number of features in an image, for forecasts of disk space
+    weight: float = 1.0  # weight of the scale's score when the scores of several scales are fused
 
 
 class Description(NamedTuple):
@@ -55,13 +50,8 @@ def local_features(
     scores: Float[np.ndarray, " keypoints"] | None = None,
 ) -> Features:
     """Features of one image without padding, from keypoints (x, y) px; scores are 1 by default."""
-    return Features(
-        keypoints=keypoints.astype(np.float32),
-        descriptors=descriptors,
-        scores=np.ones(len(keypoints), np.float32) if scores is None else scores,
-        mask=np.ones(len(keypoints), bool),
-        image_size=np.array(image_size, np.float32),
-    )
+    size = np.array(image_size, np.float32)
+    return Features.of(keypoints.astype(np.float32), descriptors, scores=scores, image_size=size)
 
 
 @runtime_checkable

@@ -144,15 +144,11 @@ def few_sizes(number: int) -> int:
 
 
 class Staged(NamedTuple):
-    """Slots of rows on the device, and the rows that have to be written to them first.
+    """Slots of rows on the device, and the rows that have to be written to them first."""
 
-    capacity: of each row's slot.
-    slot: number of each row's slot, among those of its capacity.
-    new: rows to write: (capacity, slots, Features `[WRITTEN, N, ...]`); padding has a slot beyond the last.
-    """
-
-    capacity: Int[np.ndarray, " rows"]
-    slot: Int[np.ndarray, " rows"]
+    capacity: Int[np.ndarray, " rows"]  # of each row's slot
+    slot: Int[np.ndarray, " rows"]  # number of each row's slot, among those of its capacity
+    # Rows to write: (capacity, slots, Features `[WRITTEN, N, ...]`); padding has a slot beyond the last.
     new: Sequence[tuple[int, Int[np.ndarray, " WRITTEN"], Features]]
 
 

@@ -1,48 +1,54 @@
-"""Global descriptors of networks that take images of many sizes: NetVLAD, generalized mean pooling, transformers."""
+"""Global descriptors of networks: MixVPR, the paper's retrieval; NetVLAD, generalized mean pooling, transformers."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
-import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.datasets.images import Interpolation
-from mfvpr.features.extractor import Description
-from mfvpr.features.network import compile_network, in_batches, require_size
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.features.network import NetworkExtractor
+from mfvpr.networks.imagenet import Images, Pixels, of_unit_length
+from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR
 from mfvpr.utils.errors import InputError
 
 
+@dataclass(frozen=True)
+class MixVprDescriptor(NetworkExtractor):
+    """MixVPR's global descriptors, as the public code extracts them.
+
+    Attributes, beside those of `Extractor`:
+        model: the network with its weights, which are for 320 x 320 px only.
+        interpolation: the authors' demonstration and OpenVPRLab use "pil_bicubic", the authors' training
+            "pil_bilinear", VPR-methods-evaluation "torch_bilinear".
+    """
+
+    image_size = IMAGE_SIZE
+    model: MixVPR  # 4096, 512 or 128 numbers with published weights
+    interpolation: Interpolation = "pil_bicubic"
+    batch_size: int = field(default=8, metadata={"recipe": False})
+
+
 class DescriptorNetwork(Protocol):
-    """A network that maps preprocessed images to descriptors of unit length."""
+    """A network that maps preprocessed images to descriptors of unit length.
 
-    @property
-    def dimension(self) -> int:
-        """Length of a descriptor."""
-        ...
+    `has_components` says whether a descriptor consists of principal components, the largest first. `require` raises an
+    InputError if the network cannot take images of this (width, height) px.
+    """
 
-    @property
-    def has_components(self) -> bool:
-        """Whether a descriptor consists of principal components, the largest first."""
-        ...
+    dimension: int
+    has_components: bool
 
-    def require(self, size: tuple[int, int]) -> None:
-        """Raise an InputError if the network cannot take images of this (width, height) px."""
-        ...
+    def require(self, size: tuple[int, int]) -> None: ...
 
-    def preprocess(
-        self, images: Num[jax.Array, "images height width 3"]
-    ) -> Float[jax.Array, "images height width 3"]: ...
+    def preprocess(self, images: Pixels) -> Images: ...
 
-    def __call__(self, images: Float[jax.Array, "images height width 3"]) -> Float[jax.Array, "images dimensions"]: ...
+    def __call__(self, images: Images) -> Float[jax.Array, "images dimensions"]: ...
 
 
 @dataclass(frozen=True)
-class GlobalDescriptor:
-    """A network's global descriptors, as the public code extracts them.
+class GlobalDescriptor(NetworkExtractor):
+    """Global descriptors of a network that takes images of many sizes, as the public code extracts them.
 
     Attributes, beside those of `Extractor`:
         image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
@@ -52,7 +58,6 @@ class GlobalDescriptor:
         InputError: the network cannot take images of this size, or has fewer principal components.
     """
 
-    scales = ()  # no local features
     model: DescriptorNetwork
     image_size: tuple[int, int] = (640, 480)
     interpolation: Interpolation = "pil_bilinear"
@@ -70,15 +75,6 @@ class GlobalDescriptor:
     def vector_size(self) -> int:
         return self.components or self.model.dimension
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of unit length, float32, of images, RGB, 0 .. 255, uint8 or float32."""
-        require_size(type(self.model).__name__, images, self.image_size)
-        return [Description(vector) for vector in in_batches(self._program, images, self.batch_size)]
-
-    @cached_property
-    def _program(self) -> Callable[..., Any]:
-        def describe(model: Any, images: jax.Array) -> jax.Array:
-            descriptors = model(model.preprocess(images))
-            return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
-
-        return compile_network(self.model, describe)  # pyright: ignore[reportArgumentType]  (a module, whatever else it is)
+    def compute(self, model: DescriptorNetwork, images: jax.Array) -> jax.Array:
+        descriptors = model(model.preprocess(images))
+        return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])

@@ -1,6 +1,8 @@
 """Run networks: weights are arguments of one compiled program; images and batches have one size."""
 
 from collections.abc import Callable
+from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import jax
@@ -8,9 +10,44 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Num
 
+from mfvpr.features.extractor import Description
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import device_bytes
+
+
+class NetworkExtractor:
+    """Base of the extractors with a network, which are dataclasses with these fields."""
+
+    model: Any
+    image_size: tuple[int, int]
+    batch_size: int
+    vector_size: Any = property(attrgetter("model.dimension"))  # of the global descriptor
+    scales: Any = ()  # no local features
+
+    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
+        """Descriptions of images, RGB, 0 .. 255, uint8 or float32; an `InputError` for images of another size."""
+        (rows, columns), size = images.shape[1:3], self.image_size
+        if (columns, rows) != tuple(size):
+            name = type(self).__name__
+            raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
+        return [self._describe(result) for result in self._extract(images)]
+
+    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+        """Results of the network for each image."""
+        return in_batches(self._program, images, self.batch_size)
+
+    @cached_property
+    def _program(self) -> Callable[..., Any]:
+        """The compiled network."""
+        return compile_network(self.model, self.compute)
+
+    def compute(self, model: Any, images: jax.Array) -> Any:
+        """Results for a batch; runs in a compiled program."""
+        return model(model.preprocess(images))
+
+    def _describe(self, result: Any) -> Description:
+        return Description(result.reshape(-1))
 
 
 def compile_network(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -26,13 +63,6 @@ def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
     if not isinstance(model, expected):
         raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; "
                          "`mfvpr.checkpoints.files.load_model` gives a network by its name")  # fmt: skip
-
-
-def require_size(name: str, images: Num[np.ndarray, "images height width 3"], size: tuple[int, int]) -> None:
-    """Raise an InputError unless images have this (width, height)."""
-    rows, columns = images.shape[1:3]
-    if (columns, rows) != tuple(size):
-        raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
 
 
 def require_at_least(name: str, size: tuple[int, int], smallest: int) -> None:

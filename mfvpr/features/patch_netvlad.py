@@ -1,16 +1,15 @@
 """Patch-NetVLAD's features (Hausler et al., CVPR 2021): NetVLAD of all square patches of a map, of several sizes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
+import jax
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import compile_network, in_batches, require_network, require_size
+from mfvpr.features.network import NetworkExtractor, require_network
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
 from mfvpr.types import Features
@@ -20,7 +19,7 @@ _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a
 
 
 @dataclass(frozen=True)
-class PatchNetVladFeatures:
+class PatchNetVladFeatures(NetworkExtractor):
     """Global descriptor and patch descriptors, as the public code extracts them.
 
     Patches are in row order; their scores are 1.
@@ -54,10 +53,6 @@ class PatchNetVladFeatures:
                              f"patch_sizes={list(self.patch_sizes)}, or None")  # fmt: skip
 
     @property
-    def vector_size(self) -> int:
-        return self.model.dimension
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
         """One for each size of patches."""
         columns, rows = self._map_size
@@ -72,16 +67,12 @@ class PatchNetVladFeatures:
         width, height = self.image_size
         return width // STRIDE, height // STRIDE
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Descriptors of images, RGB, 0 .. 255, uint8 or float32."""
-        require_size("Patch-NetVLAD", images, self.image_size)
-        pairs = in_batches(self._program, images, self.batch_size)
-        return [Description(vector, tuple(map(self._features, self.patch_sizes, patches))) for vector, patches in pairs]
+    def compute(self, model: VggNetVlad, images: jax.Array) -> Any:
+        return model.with_patches(model.preprocess(images), self.patch_sizes)
 
-    @cached_property
-    def _program(self) -> Callable[..., Any]:
-        sizes = self.patch_sizes
-        return compile_network(self.model, lambda model, images: model.with_patches(model.preprocess(images), sizes))
+    def _describe(self, result: tuple[np.ndarray, tuple[np.ndarray, ...]]) -> Description:
+        vector, patches = result
+        return Description(vector, tuple(map(self._features, self.patch_sizes, patches)))
 
     def _features(self, size: int, descriptors: Float[np.ndarray, "keypoints dimensions"]) -> Features:
         columns, rows = (side - size + 1 for side in self._map_size)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Num
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import compile_network, in_batches
+from mfvpr.features.network import NetworkExtractor, compile_network
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
@@ -26,7 +26,7 @@ _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its mid
 
 
 @dataclass(frozen=True)
-class SsmMaps:
+class SsmMaps(NetworkExtractor):
     """Feature maps of one stage as global descriptors, of unit length at every position.
 
     Attributes, beside those of `Extractor`:
@@ -34,7 +34,6 @@ class SsmMaps:
         preprocessing: "torch" as the public code, or "caffe", which the weights are for.
     """
 
-    scales = ()  # no local features
     model: SsmVgg
     stage: Literal[1, 2]
     image_size: tuple[int, int]
@@ -52,35 +51,42 @@ class SsmMaps:
     def vector_size(self) -> int:
         return int(np.prod(self.shape))
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        return [Description(maps.reshape(-1)) for maps in in_batches(self._program, images, self.batch_size)]
-
     def compute(
         self, model: SsmVgg, images: Num[jax.Array, "images height width 3"]
     ) -> Float[jax.Array, "images rows columns 512"]:
-        """Maps; call it from a compiled function."""
-        stage = {1: model.stage1, 2: model.stage2}[self.stage]
-        return normalize_maps(stage(model.preprocess(images, self.preprocessing)))
+        """Maps of a batch; runs in a compiled program."""
+        return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
+
+
+class _WhitenedWindows(NetworkExtractor):
+    """Base of the extractors of whitened windows, which are dataclasses with the fields of `SsmMaps`."""
+
+    stage: Literal[1, 2]
+    interpolation: Interpolation
+    preprocessing: Preprocessing
+    whitening: WindowFitting | Whitening
+    windows: Any
+
+    @property
+    def maps(self) -> SsmMaps:
+        """Extractor of the stage's maps."""
+        return SsmMaps(self.model, self.stage, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
-        return compile_network(self.model, self.compute)
+        """Images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
+        maps, windows = self.maps, self.windows
+        convolution = jax.device_put(kernels(learned_whitening(self), windows))
 
+        def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
+            return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
 
-def _whitening_program(extractor: "SsmWindows | SsmCells") -> Callable[..., Any]:
-    """Compile images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
-    maps, windows = extractor.maps, extractor.windows
-    convolution = jax.device_put(kernels(learned_whitening(extractor), windows))
-
-    def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
-        return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
-
-    program = compile_network(extractor.model, describe)
-    return lambda images: program(images, *convolution)
+        program = compile_network(self.model, describe)
+        return lambda images: program(images, *convolution)
 
 
 @dataclass(frozen=True)
-class SsmWindows:
+class SsmWindows(_WhitenedWindows):
     """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
 
     Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
@@ -89,18 +95,12 @@ class SsmWindows:
         whitening: settings to learn it from the database, or the learned whitening.
     """
 
-    image_size = STAGE1_SIZE
-    scales = ()  # no local features
+    image_size, stage = STAGE1_SIZE, 1
     model: SsmVgg
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "torch"
     whitening: WindowFitting | Whitening = STAGE1_FITTING
     batch_size: int = field(default=8, metadata={"recipe": False})
-
-    @property
-    def maps(self) -> SsmMaps:
-        """Extractor of the first stage's maps."""
-        return SsmMaps(self.model, 1, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
 
     @property
     def windows(self) -> Windows:
@@ -112,15 +112,9 @@ class SsmWindows:
         """Length of all windows' descriptors, one after the other."""
         return self.windows.count * self.whitening.dimension
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Whitened windows of images, `[36 * D']` float32 each; an `InputError` if the whitening was not learned."""
-        return [Description(vectors.reshape(-1)) for vectors in in_batches(self._program, images, self.batch_size)]
-
-    _program = cached_property(_whitening_program)
-
 
 @dataclass(frozen=True)
-class SsmCells:
+class SsmCells(_WhitenedWindows):
     """Local features for matching: whitened windows of 3 x 3 positions of the second stage's map, the cells of a grid.
 
     Descriptors are of any length. Match each cell of the candidate to the cell of the largest dot product
@@ -135,7 +129,7 @@ class SsmCells:
         InputError: images of this size have no cells.
     """
 
-    vector_size = 0  # no global descriptor
+    vector_size, stage = 0, 2  # no global descriptor
     model: SsmVgg
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
@@ -150,11 +144,6 @@ class SsmCells:
         self.windows  # noqa: B018  # refuses images that are too small
 
     @property
-    def maps(self) -> SsmMaps:
-        """Extractor of the second stage's maps."""
-        return SsmMaps(self.model, 2, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
-
-    @property
     def windows(self) -> Windows:
         """The windows of a map: 40 x 40 at 336 px."""
         return Windows(self.maps.shape, 3, self.stride)
@@ -164,12 +153,6 @@ class SsmCells:
         """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
-    def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
-        """Cells of images in row order; scores are 1. An `InputError` if the whitening was not learned."""
+    def _describe(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:
         middles = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
-        return [
-            Description(local=(local_features(middles, descriptors, self.image_size),))
-            for descriptors in in_batches(self._program, images, self.batch_size)
-        ]
-
-    _program = cached_property(_whitening_program)
+        return Description(local=(local_features(middles, result, self.image_size),))

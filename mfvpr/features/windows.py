@@ -24,17 +24,11 @@ from mfvpr.utils.whitening import Whitening, fit_bytes, fit_whitening
 
 @dataclass(frozen=True)
 class Windows:
-    """Positions of the windows of a map, in row order.
+    """Positions of the windows of a map, in row order."""
 
-    Attributes:
-        shape: (rows, columns, channels) of the map.
-        size: positions per side of a window.
-        stride: positions from window to window.
-    """
-
-    shape: tuple[int, int, int]
-    size: int
-    stride: int = 1
+    shape: tuple[int, int, int]  # (rows, columns, channels) of the map
+    size: int  # positions per side of a window
+    stride: int = 1  # positions from window to window
 
     def __post_init__(self) -> None:
         if min(self.shape[:2]) < self.size:

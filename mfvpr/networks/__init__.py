@@ -1,4 +1,5 @@
-"""Networks as Flax NNX modules: arrays in, arrays out. Images are `[B, H, W, 3]` float32.
+"""Networks as Flax NNX modules: arrays in, arrays out. Images are `[B, H, W, 3]` float32. `precision` is that of
+products on hardware with less than float32; a lower one than "highest" moves keypoints.
 
 Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, convolution, sampling, imagenet.
 

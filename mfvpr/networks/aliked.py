@@ -86,7 +86,6 @@ class Aliked(nnx.Module):
 
     Args:
         variant: "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
-        precision: of products on hardware with less than float32; a lower one moves keypoints.
 
     Raises:
         InputError: there is no such variant.
@@ -142,11 +141,8 @@ class Aliked(nnx.Module):
         return jax.vmap(extract_one)(levels, scores)
 
     def _scores(self, levels: list[Array]) -> Float[Array, "batch height width"]:
-        """Scores of the padded images.
-
-        The first convolution (1 x 1) and the enlargement are linear, so the convolution runs first: 8 channels are
-        enlarged instead of all.
-        """
+        """Scores of the padded images."""
+        # The first convolution (1 x 1) and the enlargement are linear: it runs first, so that 8 channels are enlarged.
         first, *convolutions = self.score_head
         parts = jnp.split(first.kernel[0, 0], len(levels))
         total = jnp.zeros((), levels[0].dtype)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float, Int
 
-from mfvpr.networks.lengths import EPSILON, of_unit_length
+from mfvpr.networks.imagenet import EPSILON, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors
 from mfvpr.types import Array
 
@@ -47,10 +47,8 @@ class Field(NamedTuple):
     def _weighted_parts(
         self, y: Int[Array, " pixels"], x: Int[Array, " pixels"], weight: Float[Array, " pixels"]
     ) -> list[Float[Array, "pixels _"]]:
-        """Parts of each level for the features of pixels inside the image, times `weight`.
-
-        Sums of separate parts are several times faster than sums of concatenated features.
-        """
+        """Parts of each level for the features of pixels inside the image, times `weight`."""
+        # Sums of separate parts are several times faster than sums of concatenated features.
         weight *= _rows_at(self.inverse_norm.reshape(-1), y * self.inverse_norm.shape[1] + x)
         parts = []
         for rows, columns in self.levels:
@@ -115,10 +113,7 @@ class DescriptorHead(nnx.Module):
         return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
 
     def _describe(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "slots dimensions"]:
-        """Descriptors of all keypoints.
-
-        Adds one place after the other, so that intermediate values stay in the CPU's caches.
-        """
+        """Descriptors of all keypoints, place by place, so that intermediate values stay in the CPU's caches."""
 
         def add(total: Array, place: tuple[Array, Array]) -> tuple[Array, None]:
             move, mixing = place

@@ -45,11 +45,7 @@ _OUTPUT = (
 class Conv3x3(nnx.Module):
     """3 x 3 convolution that keeps the size: `kernel` `[3, 3, C, D]`, `bias` `[D]`; zeros outside.
 
-    Args:
-        inputs: channels C.
-        outputs: channels D.
-        dilation: distance between the kernel's columns and rows.
-        precision: of the products where the hardware offers less than float32.
+    `dilation` is the distance between the kernel's columns and rows.
     """
 
     def __init__(self, inputs: int, outputs: int, *, dilation: int = 1, precision: str, rngs: nnx.Rngs) -> None:

@@ -16,8 +16,7 @@ from flax import nnx
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, preprocess
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, of_unit_length, preprocess
 from mfvpr.networks.sampling import between, neighbors
 from mfvpr.networks.vgg import Vgg16
 from mfvpr.types import Array
@@ -31,9 +30,7 @@ _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 class D2Net(nnx.Module):
     """VGG16 to `conv4_3`. The third pooling only smooths, so the stride stays 4, and block 4 is dilated instead.
 
-    Args:
-        relu: end with a ReLU, as published.
-        precision: of products on hardware with less than float32; a lower one moves keypoints.
+    The published network ends with a ReLU (`relu`).
     """
 
     def __init__(self, *, relu: bool = True, precision: str = "highest", rngs: nnx.Rngs) -> None:
@@ -104,7 +101,6 @@ def extract(
     """Keypoints of images: one Detections per scale, each with a leading axis `batch`.
 
     Args:
-        model: the network.
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.
         preprocessing: of the pixels; the published weights expect "caffe".
         scales: of the images, see `detect`; `SCALES` are the original's.
@@ -129,7 +125,6 @@ def detect(
     of the n-th map are divided by n.
 
     Args:
-        maps: maps of the scales.
         ratios: (width, height) of the image, divided by those of each scale.
         share: slots per position of a map; 1 has room for all keypoints.
     """
@@ -177,10 +172,7 @@ def survey(dense: Float[Array, "height width channels"]) -> Survey:
 def _parabola(
     around: dict[tuple[int, int], Float[Array, "height width"]],
 ) -> tuple[Bool[Array, "height width"], Float[Array, "height width 2"]]:
-    """Whether a position is no edge, and the step to the maximum.
-
-    `around` holds the values at (down, right) of the position.
-    """
+    """Whether a position is no edge, and the step to the maximum, from the values at (down, right) of the position."""
     center = around[0, 0]
     ii = around[-1, 0] - 2 * center + around[1, 0]
     jj = around[0, -1] - 2 * center + around[0, 1]

@@ -6,15 +6,14 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
-from mfvpr.networks.imagenet import Images, preprocess
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
 from mfvpr.types import Array
 
 Backbone = Literal["vgg16", "resnet50"]
 
-_CHANNELS = {"vgg16": 512, "resnet50": 2048}
+_BACKBONES = {"vgg16": (Vgg16, 512), "resnet50": (ResNet50, 2048)}  # with the channels of their maps
 _MIN_VALUE = 1e-6  # before pooling, as published
 
 
@@ -32,21 +31,18 @@ class GeneralizedMean(nnx.Module):
 
 
 class Gem(nnx.Module):
-    """Generalized mean of a backbone's last map, of unit length at each position, and a projection.
+    """Generalized mean of a backbone's last map, of unit length at each position, and a projection to `outputs`.
 
-    Args:
-        backbone: VGG16 to `conv5_3`, before its ReLU, or ResNet-50 without its classifier.
-        outputs: numbers of a descriptor.
-        precision: of products on hardware with less than float32.
+    The backbone is VGG16 to `conv5_3`, before its ReLU, or ResNet-50 without its classifier.
     """
 
     def __init__(
         self, backbone: Backbone = "resnet50", outputs: int = 2048, *, precision: str = "highest", rngs: nnx.Rngs
     ) -> None:
-        backbone_class = {"vgg16": Vgg16, "resnet50": ResNet50}[backbone]
+        backbone_class, channels = _BACKBONES[backbone]
         self.backbone = backbone_class(precision=precision, rngs=rngs)
         self.pool = GeneralizedMean()
-        self.projection = nnx.Linear(_CHANNELS[backbone], outputs, precision=precision, rngs=rngs)
+        self.projection = nnx.Linear(channels, outputs, precision=precision, rngs=rngs)
         self.dimension = outputs
         self.has_components = False
 

@@ -1,4 +1,4 @@
-"""Preprocessing of images for networks that were trained on ImageNet."""
+"""Inputs and outputs of networks: images as for networks trained on ImageNet, and vectors of unit length."""
 
 from typing import Literal
 
@@ -12,6 +12,7 @@ Preprocessing = Literal["caffe", "torch"]
 
 MEAN = (0.485, 0.456, 0.406)  # of the training images, RGB in 0 .. 1
 DEVIATION = (0.229, 0.224, 0.225)
+EPSILON = 1e-12  # least divisor of vectors, as in the public codes
 Pixels = Num[Array, "batch height width 3"]  # RGB, 0 .. 255, uint8 or float32
 Images = Float[Array, "batch height width 3"]  # inputs of networks
 
@@ -44,3 +45,8 @@ def _table(scale: float, mean: Float[np.ndarray, "3"], deviation: Float[np.ndarr
 
 
 _TABLES = {name: _table(*statistics) for name, statistics in _STATISTICS.items()}
+
+
+def of_unit_length(vectors: Float[Array, "*batch dimensions"]) -> Float[Array, "*batch dimensions"]:
+    """Vectors divided by their lengths."""
+    return vectors / jnp.maximum(jnp.linalg.norm(vectors, axis=-1, keepdims=True), EPSILON)

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jax import Array
 
-from mfvpr.networks.lightglue_assignment import Packed, PackedLayer
-from mfvpr.networks.lightglue_attention import Affine, Block, product
+from mfvpr.networks.lightglue_assignment import Affine, Block, Packed, PackedLayer, product
 
 
 class FeedForward(nnx.Module):

@@ -1,21 +1,22 @@
-"""MixVPR (Ali-bey et al., WACV 2023): a global descriptor from feature maps that small perceptrons mix.
-
-Each of the backbone's 1024 feature maps is a vector of 20 x 20 positions. Four mixers add the output of a perceptron,
-which all maps share. Two projections then reduce the number of maps and the number of positions.
-"""
+"""MixVPR (Ali-bey et al., WACV 2023): a global descriptor from feature maps that small perceptrons mix."""
 
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
-from mfvpr.networks.imagenet import DEVIATION, MEAN, Images, Pixels
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import DEVIATION, MEAN, Images, Pixels, of_unit_length
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.types import Array
 
 IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
 _NORM_EPSILON = 1e-5  # as published; Flax's default of 1e-6 changes descriptors if maps are faint
+
+
+def preprocess(images: Pixels) -> Images:
+    """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
+    mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (MEAN, DEVIATION))
+    return (images.astype(jnp.float32) / 255 - mean) / deviation
 
 
 class FeatureMixer(nnx.Module):
@@ -31,12 +32,11 @@ class FeatureMixer(nnx.Module):
 
 
 class MixVPR(nnx.Module):
-    """ResNet-50 to its third layer, four mixers, two projections.
+    """ResNet-50 to its third layer, four mixers that all maps share, projections of the maps and of the positions.
 
     Args:
         out_channels: maps after the projection; published: 1024, 256, 64.
         out_rows: values per map after the projection; published: 4, 2, 2.
-        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -48,6 +48,8 @@ class MixVPR(nnx.Module):
         self.mix = nnx.List([FeatureMixer(_POSITIONS, precision=precision, rngs=rngs) for _ in range(4)])
         self.channel_proj = nnx.Linear(_CHANNELS, out_channels, precision=precision, rngs=rngs)
         self.row_proj = nnx.Linear(_POSITIONS, out_rows, precision=precision, rngs=rngs)
+
+    preprocess = staticmethod(preprocess)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px.
@@ -80,9 +82,3 @@ class MixVPR(nnx.Module):
         narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)
         projected = jnp.matmul(narrow, channels.kernel[...], precision=self.precision) + bias[None]
         return projected.swapaxes(1, 2)
-
-
-def preprocess(images: Pixels) -> Images:
-    """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
-    mean, deviation = (jnp.array(values, jnp.float32)[None, None, None] for values in (MEAN, DEVIATION))
-    return (images.astype(jnp.float32) / 255 - mean) / deviation

@@ -10,8 +10,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
-from mfvpr.networks.imagenet import Images, Pixels, preprocess
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import Images, Pixels, of_unit_length, preprocess
 from mfvpr.networks.resnet import PointwiseConv
 from mfvpr.networks.vgg import Vgg16, require_position
 from mfvpr.types import Array
@@ -32,7 +31,6 @@ class NetVlad(nnx.Module):
     Args:
         clusters: K.
         order: "clusters" gives V as `[K, D]`, as PyTorch's codes, "channels" as `[D, K]`, as the original.
-        precision: of products on hardware with less than float32.
     """
 
     def __init__(self, clusters: int, order: Order = "clusters", *, precision: str, rngs: nnx.Rngs) -> None:
@@ -79,7 +77,6 @@ class VggNetVlad(nnx.Module):
         outputs: numbers of a descriptor; None = NetVLAD's, without projection.
         original: preprocess as the original code, which subtracts the average image of its weights, and order
             descriptors by channels; otherwise as PyTorch's networks.
-        precision: of products on hardware with less than float32.
     """
 
     def __init__(

@@ -16,10 +16,7 @@ _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": 
 
 
 class PointwiseConv(nnx.Module):
-    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as a matrix product.
-
-    It is up to twice as fast as XLA's convolution on a CPU, and 1.07 times in the whole network.
-    """
+    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as a matrix product, which is faster on a CPU."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: int = 1, precision: str, rngs: nnx.Rngs) -> None:
         initial = nnx.initializers.he_normal()
@@ -57,9 +54,7 @@ class Bottleneck(nnx.Module):
 class ResNet50(nnx.Module):
     """ResNet-50: `conv1`, `bn1`, a max pooling, then `layer1`, `layer2`, ..., which are lists of bottlenecks.
 
-    Args:
-        last: the last layer: "layer1" to "layer4", of 256, 512, 1024, 2048 channels and stride 4, 8, 16, 32.
-        precision: of products on hardware with less than float32.
+    `last` is the last layer: "layer1" to "layer4", of 256, 512, 1024, 2048 channels and stride 4, 8, 16, 32.
     """
 
     def __init__(self, last: str = "layer4", *, precision: str = "highest", rngs: nnx.Rngs) -> None:

@@ -37,10 +37,7 @@ def sample(
 def around(
     points: Float[Array, "*points 2"], height: int, width: int
 ) -> Iterator[tuple[Int[Array, "*points"], Int[Array, "*points"], Float[Array, "*points"]]]:
-    """Yield y, x and weight of the four pixels around positions (x, y) px.
-
-    Pixels outside are moved inside, with weight 0.
-    """
+    """Yield y, x and weight of the four pixels around positions (x, y) px; those outside move inside, with weight 0."""
     low = jnp.floor(points)
     part, pixel = points - low, low.astype(int)
     for down in (0, 1):

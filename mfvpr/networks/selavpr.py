@@ -5,8 +5,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.imagenet import Images
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import Images, of_unit_length
 from mfvpr.networks.vit import Block, VisionTransformer
 from mfvpr.types import Array
 
@@ -78,12 +77,7 @@ def _part(values: Array, start: int, stop: int, axis: int) -> Array:
 class SelaVpr(nnx.Module):
     """SelaVPR's global descriptor, and local descriptors on a grid four times as fine as the patches.
 
-    Args:
-        width: of the transformer, see `VisionTransformer`; ViT-L is published.
-        depth: blocks of the transformer.
-        heads: heads of its attention.
-        registers: additional tokens; 4 in the variant with registers.
-        precision: of products on hardware with less than float32.
+    The arguments are those of `VisionTransformer`; ViT-L is published, with 4 registers and without.
     """
 
     def __init__(

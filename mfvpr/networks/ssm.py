@@ -5,6 +5,8 @@ the second stage, which ranks it, uses `conv4_2`; both before their ReLU. Poolin
 ceil(H / stride) x ceil(W / stride) positions.
 """
 
+from typing import Literal
+
 from flax import nnx
 from jaxtyping import Float
 
@@ -12,28 +14,18 @@ from mfvpr.networks.imagenet import Images, preprocess
 from mfvpr.networks.vgg import Vgg16
 from mfvpr.types import Array
 
-STAGE1_LAYER, STAGE2_LAYER = "conv5_2", "conv4_2"
+_LAYERS = {1: "conv5_2", 2: "conv4_2"}
 STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps
 
 
 class SsmVgg(nnx.Module):
-    """VGG16 to `conv5_2`; `precision` is of products on hardware with less than float32."""
+    """VGG16 to `conv5_2`."""
 
     def __init__(self, *, precision: str = "highest", rngs: nnx.Rngs) -> None:
-        self.vgg = Vgg16(STAGE1_LAYER, pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
+        self.vgg = Vgg16(_LAYERS[1], pools=("max_ceil",) * 4, precision=precision, rngs=rngs)
 
     preprocess = staticmethod(preprocess)  # published with "torch", although the weights were trained with "caffe"
 
-    def __call__(self, images: Images) -> tuple[Float[Array, "batch _ _ 512"], Float[Array, "batch _ _ 512"]]:
-        """`stage1` and `stage2` of the same images, in one pass."""
-        first, second = self.vgg.maps(images, (STAGE1_LAYER, STAGE2_LAYER))
-        return first, second
-
-    def stage1(self, images: Images) -> Float[Array, "batch rows columns 512"]:
-        """The first map of preprocessed images."""
-        return self.vgg(images)
-
-    def stage2(self, images: Images) -> Float[Array, "batch rows columns 512"]:
-        """The second map of preprocessed images."""
-        (second,) = self.vgg.maps(images, (STAGE2_LAYER,))
-        return second
+    def __call__(self, images: Images, stage: Literal[1, 2]) -> Float[Array, "batch rows columns 512"]:
+        """The map of a stage, of preprocessed images."""
+        return self.vgg(images, _LAYERS[stage])

@@ -1,6 +1,5 @@
 """VGG16 (Simonyan & Zisserman, ICLR 2015) up to a named convolution: a backbone of several networks."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import jax.numpy as jnp
@@ -32,7 +31,6 @@ class Vgg16(nnx.Module):
             "max_ceil" also pools an odd last row or column; "average" smooths the map (2 x 2, stride 1, no padding:
             one row and one column fewer).
         dilations: of the convolutions of block 1, 2, ...
-        precision: of products on hardware with less than float32.
     """
 
     def __init__(
@@ -54,28 +52,15 @@ class Vgg16(nnx.Module):
             inputs = LAYERS[name]
 
     def __call__(
-        self, images: Images, uniform: bool | Bool[Array, ""] = False
+        self, images: Images, layer: str | None = None, *, uniform: bool | Bool[Array, ""] = False
     ) -> Float[Array, "batch rows columns channels"]:
-        """Map before the last layer's ReLU; `uniform` as in `Conv3x3`."""
-        (last,) = self.maps(images, self.layers[-1:], uniform)
-        return last
-
-    def maps(
-        self, images: Images, layers: Sequence[str], uniform: bool | Bool[Array, ""] = False
-    ) -> tuple[Float[Array, "batch _ _ _"], ...]:
-        """Outputs of these layers before their ReLU; later layers do not run."""
-        outputs = {}
+        """Map before the ReLU of a layer, by default the last; later layers do not run. `uniform` as in `Conv3x3`."""
         x = images
-        for name in self.layers:
+        for name in self.layers[: self.layers.index(layer or self.layers[-1]) + 1]:
             if name != self.layers[0]:
-                starts_block = name.endswith("_1")
-                x = _POOLS[self.pools[_block(name) - 2]](x) if starts_block else nnx.relu(x)
+                x = _POOLS[self.pools[_block(name) - 2]](x) if name.endswith("_1") else nnx.relu(x)
             x = getattr(self, name)(x, uniform)
-            if name in layers:
-                outputs[name] = x
-            if len(outputs) == len(layers):
-                break
-        return tuple(outputs[name] for name in layers)
+        return x
 
 
 def require_position(size: tuple[int, int]) -> None:
@@ -89,10 +74,8 @@ def _block(name: str) -> int:
 
 
 def _max_pool(x: Array) -> Array:
-    """Maximum, then ReLU, which equals the other order with a quarter of the work.
-
-    Slices are used because a window reduction does not fuse with its neighbors on a CPU.
-    """
+    """Maximum, then ReLU, which equals the other order with a quarter of the work."""
+    # Slices: a window reduction does not fuse with its neighbors on a CPU.
     height, width = x.shape[1] // 2 * 2, x.shape[2] // 2 * 2
     top, bottom = x[:, 0:height:2, :width], x[:, 1:height:2, :width]
     rows = jnp.maximum(top, bottom)

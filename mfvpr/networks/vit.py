@@ -9,8 +9,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.imagenet import Images, preprocess
-from mfvpr.networks.lengths import of_unit_length
+from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
@@ -97,13 +96,7 @@ class VisionTransformer(nnx.Module):
 
     DINOv2's small, base and large networks have widths 384, 768, 1024, depths 12, 12, 24 and heads 6, 12, 16.
 
-    Args:
-        width: numbers D of a token.
-        depth: number of blocks.
-        heads: heads of the attention.
-        registers: additional tokens, which are not returned; 4 or none are published.
-        block: class of the blocks.
-        precision: of products on hardware with less than float32.
+    `registers` are additional tokens, which are not returned; 4 or none are published.
     """
 
     def __init__(

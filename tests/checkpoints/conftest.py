@@ -43,7 +43,6 @@ def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
     values = {
         "name": name, "network": "tiny", "file": f"{name}.pth", "source": f"https://example.org/{name}.pth",
         "size": None, "sha256": None, "code_license": "MIT", "weights_license": "none stated",
-        "parameters": PARAMETERS,
     }  # fmt: skip
     return registry.Entry(**(values | changes))
 

@@ -166,13 +166,10 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
         assembly._network("features", ("tiny",), "tiny")
 
 
-def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path, monkeypatch):
+def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path):
     (tmp_path / "tiny.pth").write_bytes(b"the source")
     save(REGISTRY["tiny"], arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
     assert program("verify", "tiny")[0] == 0
-    monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(parameters=1))
-    code, stdout, _ = program("verify")
-    assert (code, stdout) == (2, f"tiny: BAD, expected 1 parameters, got {PARAMETERS}\n")
     path = folder / "tiny.safetensors"
     content = bytearray(path.read_bytes())
     content[-1] ^= 4

@@ -145,12 +145,12 @@ def test_mistakes_with_installed_weights_are_one_line(evaluate, options, words):
     ("netvlad", ("retrieval.weights=patchnetvlad_mapillary_128", "retrieval.components=32")),
     ("gem", ("retrieval.weights=cosplace_vgg16_512",)),
 ])  # fmt: skip
-def test_global_descriptors_of_networks_are_retrievers(evaluate, weights, small_street, tmp_path, name, options):
+def test_global_descriptors_of_networks_are_retrievers(evaluate, small_street, tmp_path, name, options):
     size = "retrieval.image_size=[96,64]"
     stderr = evaluate(f"retrieval={name}", *options, size, "candidates=3", "figures=0")
     assert "note: R@5 and R@10 are R@3, of retrieval too" in stderr
     assert "GlobalDescriptor" in store_names(tmp_path)
-    model, components = load_model(options[0].partition("=")[2], weights), 32 if name == "netvlad" else None
+    model, components = load_model(options[0].partition("=")[2]), 32 if name == "netvlad" else None
     extractor, vectors = GlobalDescriptor(model, (96, 64), components=components), []
     for side in ("queries", "database"):
         images = image_folder(small_street / side)

@@ -217,12 +217,14 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
 
 def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, dataset, tmp_path):
     image = np.zeros((1, 40, 48, 3), np.uint8)
+    turned = {"image_size": (40, 48)}
     for change in (
-        {"model": published(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2},
-        {"image_size": (40, 48)},
+        {"model": published(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2}, turned,
     ):  # fmt: skip
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
-            replace(learned, **change)(image)
+            replace(learned, **change)(image.swapaxes(1, 2) if change is turned else image)
+    with pytest.raises(InputError, match="SsmCells: expected images of 48 x 40 px, got 40 x 48"):
+        learned(image.swapaxes(1, 2))
     assert len(replace(learned, batch_size=1)(image)) == 1
     cached = fit_to_database(cells, dataset.database, FeatureCache(tmp_path))
     assert cached.whitening.origin == learned.whitening.origin != ""

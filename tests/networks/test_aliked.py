@@ -262,7 +262,7 @@ def test_other_variants_and_images_too_small_or_of_another_size_are_refused(draw
         Aliked("aliked-n64", rngs=nnx.Rngs(0))
     with pytest.raises(InputError, match=r"ALIKED: .*5 x 5 px .*got 60 x 4$"):
         AlikedFeatures(drawn, (60, 4))
-    with pytest.raises(InputError, match=r"ALIKED: .*40 x 60 px, got 60 x 40$"):
+    with pytest.raises(InputError, match=r"AlikedFeatures: .*40 x 60 px, got 60 x 40$"):
         AlikedFeatures(Direct(), (40, 60))(crowded())
 
 

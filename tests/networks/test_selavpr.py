@@ -145,7 +145,7 @@ def test_sizes_without_whole_patches_are_refused(size):
     for extractor in (SelaVprFeatures, lambda model, size: GlobalDescriptor(TokenDescriptor(model.backbone), size)):
         with pytest.raises(InputError, match=r"image_size=\[.*\]: .*multiples of 14"):
             extractor(model, size)
-    with pytest.raises(InputError, match=r"SelaVPR: .*28 x 14 px, got 14 x 28"):
+    with pytest.raises(InputError, match=r"SelaVprFeatures: .*28 x 14 px, got 14 x 28"):
         SelaVprFeatures(model, (28, 14))(np.zeros((1, 28, 14, 3), np.uint8))
 
 
