@@ -17,11 +17,13 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from mfvpr.cli import programs, stages
+from mfvpr.cli import programs
+from mfvpr.cli.inputs import prepare
 from mfvpr.cli.launch import exit_at_once, launch
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.manifest import MATCHES, store_path
 from mfvpr.systems.settings import CONF
+from mfvpr.utils import Stopwatch
 
 ROOT = Path(__file__).parent.parent
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
@@ -83,9 +85,9 @@ def job_of(root, config, job, figures):
 
 def matches_path(settings):
     """The folder in which a program keeps the matches of its data set, and their recipe."""
-    tools, images = stages.prepare(settings, stages.Stopwatch())
-    recipe = stages.recipe(tools, images)
-    return store_path(tools.cache.root, "matches", recipe, MATCHES), recipe
+    inputs = prepare(settings, Stopwatch())
+    recipe = inputs.matches_recipe()
+    return store_path(inputs.cache.root, "matches", recipe, MATCHES), recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

@@ -14,7 +14,7 @@ from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.checkpoints import how_to_install
 from mfvpr.cli import build, run_folder, truth
 from mfvpr.cli.console import tell
-from mfvpr.cli.stages import dataset_of
+from mfvpr.cli.inputs import dataset_of
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table, write_json, write_table
@@ -133,11 +133,12 @@ def evaluate_all(
         try:
             chosen = runs.settings_of(names[0], place, settings)
             dataset = dataset_of(chosen["dataset"])
+            description = truth.describe(chosen["dataset"], chosen["recall"], dataset)
             cache = build.cache(chosen)
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}
-            correct = dataset.positives_fingerprint(truth.thresholds(chosen, dataset.sequences[0].truth))
+            correct = dataset.positives_fingerprint(description.get("thresholds", []))
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue

@@ -12,9 +12,8 @@ from omegaconf import OmegaConf
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder
+from mfvpr.cli.inputs import Inputs
 from mfvpr.cli.overrides import compose_program
-from mfvpr.cli.stages import Tools
-from mfvpr.datasets import ImageFolder
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
 from mfvpr.report.run_files import ground_truth, write_run_folder
@@ -102,25 +101,25 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
 
 def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
-    with run_folder.claim(settings, own=True) as folder:
+    with run_folder.claim(settings["out"], settings["dataset"]["name"], own=True) as folder:
         outcome = evaluation.evaluation_of(dict(settings))
 
         def write(new: Path) -> None:
             write_run_folder(new, outcome.calibrated, outcome.description)
             write_json(new / INPUTS, dict(inputs))
-            write_json(new / SIZES, bytes_of_an_image(outcome.tools, outcome.report.ranked.dataset.database))
+            write_json(new / SIZES, bytes_of_an_image(outcome.inputs))
             run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
 
         run_folder.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 
-def bytes_of_an_image(tools: Tools, database: ImageFolder) -> dict[str, float]:
+def bytes_of_an_image(inputs: Inputs) -> dict[str, float]:
     """Average bytes in float32 of what was already extracted: `local` features, and the `descriptor` of retrieval.
 
     They are counted as in the paper: with detected keypoints, without those of a grid.
     """
-    cache, pipeline = tools.cache, tools.pipeline
+    cache, pipeline, database = inputs.cache, inputs.pipeline, inputs.dataset.database
     sources = cache.local(database, fit_to_database(pipeline.extractor, database, cache), [])  # extracts nothing
     keypoint = 0 if isinstance(pipeline.extractor, _GRIDS) else _KEYPOINT
     local = 0.0

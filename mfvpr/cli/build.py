@@ -1,6 +1,6 @@
 """Turn checked settings into a data set, a cache and a runtime; `mfvpr.systems.assembly` has the parts of a system."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,7 +17,7 @@ from mfvpr.utils import Cluster, Runtime
 from mfvpr.utils.files import expand_user
 
 
-def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> Dataset:
+def dataset(settings: Mapping[str, Any], progress: Callable[[int, int], None]) -> Dataset:
     """The data set; `streets` is drawn first if the cache does not have it."""
     if settings["name"] == "streets_seasons":
         root = seasons_folder(expand_user(settings["cache"]), seed=settings["seed"], progress=progress)
@@ -44,7 +44,7 @@ def dataset(settings: dict[str, Any], progress: Callable[[int, int], None]) -> D
     return datasets.folder(expand_user(database), queries, ground_truth=_ground_truth(settings), **options)
 
 
-def _ground_truth(settings: dict[str, Any]) -> IndexFile | LabelFiles | str:
+def _ground_truth(settings: Mapping[str, Any]) -> IndexFile | LabelFiles | str:
     """The ground truth of folders of images, whose files must be those that it needs."""
     kind = settings["ground_truth"]
     for option, reader in {"index_file": "index", "database_labels": "label", "query_labels": "label"}.items():
@@ -61,7 +61,7 @@ def _ground_truth(settings: dict[str, Any]) -> IndexFile | LabelFiles | str:
     return kind
 
 
-def cache(settings: dict[str, Any]) -> FeatureCache:
+def cache(settings: Mapping[str, Any]) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if settings["cache"] is None else expand_user(settings["cache"])
     skip_bad, wait = settings["on_bad_image"] == "skip", bool(settings.get("multirun"))
@@ -69,7 +69,7 @@ def cache(settings: dict[str, Any]) -> FeatureCache:
 
 
 @contextmanager
-def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
+def cluster(settings: Mapping[str, Any]) -> Iterator[Cluster | None]:
     """Connect to the cluster that the settings name, or start it, until the block ends."""
     if (chosen := settings.get("cluster")) is None:
         yield None
@@ -81,7 +81,7 @@ def cluster(settings: dict[str, Any]) -> Iterator[Cluster | None]:
         yield started
 
 
-def runtime(settings: dict[str, Any]) -> Runtime:
+def runtime(settings: Mapping[str, Any]) -> Runtime:
     """Devices, memory, progress, messages, and the cluster that `command_line` started."""
     import jax
 

@@ -3,9 +3,8 @@
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
-from mfvpr.cli import truth
 from mfvpr.cli.console import tell
-from mfvpr.cli.stages import Images
+from mfvpr.cli.inputs import Inputs
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import Confidence, System, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
@@ -25,35 +24,30 @@ class ConfidenceFile(NamedTuple):
     origin: Mapping[str, Any]
 
 
-def read_file(settings: Mapping[str, Any]) -> ConfidenceFile | None:
-    """Read the file that the settings name; None if there is none."""
-    path = settings["confidence"]
-    return None if path is None else ConfidenceFile(path, *read_confidences(expand_user(path)))
+def read_file(path: str) -> ConfidenceFile:
+    """Read a file of confidences."""
+    return ConfidenceFile(path, *read_confidences(expand_user(path)))
 
 
-def check_confidence(
-    file: ConfidenceFile | None, system: System, settings: Mapping[str, Any], images: Images
-) -> ConfidenceFile | None:
+def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> ConfidenceFile:
     """Keep the final scores of a file whose settings fit this run at least as well as those of the one that decides.
 
     Warns if the file was fitted on the same images, or with other settings. The score that decides must be in the file.
     """
-    if file is None:
-        return None
-    headline = system.headline
+    headline, settings = system.headline, system.settings or {}
     if not file.systems:
         raise SettingsError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
                             "none, as where there is but one candidate")  # fmt: skip
     if headline not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
                             f"{', '.join(file.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
-    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), images.fingerprints))
+    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), inputs.fingerprints))
     if before & now:
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
     if not any(file.systems[headline].weights):
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
-    recall = [] if _threshold(settings, images) in (None, file.origin.get("correct_within")) else ["recall"]
-    candidates = num_candidates(settings["candidates"], images.dataset.database)
+    recall = [] if _threshold(inputs) in (None, file.origin.get("correct_within")) else ["recall"]
+    candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
     scores = system.final_scores
     other = {name: other_settings(file.origin, scores[name].scorers, settings, candidates) + recall
              for name in file.systems if name in scores}  # fmt: skip
@@ -76,12 +70,9 @@ def other_settings(
     return names + ["candidates"] * (origin.get("candidates") != candidates)
 
 
-def _threshold(settings: Mapping[str, Any], images: Images) -> list[Any] | None:
+def _threshold(inputs: Inputs) -> list[Any] | None:
     """The middle threshold of a correct prediction, and its unit; None without ground truth."""
-    ground_truth = images.dataset.sequences[0].truth
-    if ground_truth is None:
-        return None
-    return [middle(truth.thresholds(settings, ground_truth)), ground_truth.unit]
+    return [middle(inputs.thresholds), inputs.ground_truth["unit"]] if inputs.thresholds else None
 
 
 def _query_fingerprints(fingerprints: Any) -> set[str]:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mfvpr.cli import confidences, run_folder, stages, truth
-from mfvpr.cli.stages import Images, Tools
+from mfvpr.cli import confidences, run_folder, truth
+from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Shard, System, fill_shard, rank_dataset
 from mfvpr.report.confidences import CalibratedPredictions, confidence_figures, confidence_table
@@ -20,7 +20,7 @@ from mfvpr.utils import Stopwatch
 class Outcome:
     """The results of one evaluation, for its run folder."""
 
-    tools: Tools
+    inputs: Inputs
     calibrated: CalibratedPredictions
     description: RunDescription
     figures: list[Figure]
@@ -36,7 +36,7 @@ def evaluate(settings: dict[str, Any]) -> None:
     if settings["shard"] is not None:
         _fill_shard(settings)
         return
-    with run_folder.claim(settings) as folder:
+    with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         outcome = evaluation_of(settings)
         truth_of_run = ground_truth(outcome.report, outcome.description)
         run_folder.write_results(
@@ -50,34 +50,33 @@ def evaluate(settings: dict[str, Any]) -> None:
 def _fill_shard(settings: dict[str, Any]) -> None:
     """Do the part of a shard, and print what is done, and what to do next."""
     shard = Shard.parse(settings["shard"])
-    tools, images = stages.prepare(settings, Stopwatch())
-    print(fill_shard(images.dataset, assembly.system(settings, tools.pipeline), tools.cache, shard))
+    rankings, inputs = assembly.rankings(settings), prepare(settings, Stopwatch())
+    print(fill_shard(inputs.dataset, System(inputs.pipeline, **rankings), inputs.cache, shard))
 
 
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
     """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
-    scorers, watch, confidence = assembly.scorers(settings["scorer"]), Stopwatch(), confidences.read_file(settings)
-    assembly.fusion(settings).check(assembly.main_scorer(scorers), scorers)  # before anything slow
-    tools, images = stages.prepare(settings, watch)
-    system, figure_queries = assembly.system(settings, tools.pipeline), query_rows(settings["figures"], images.dataset)
-    confidence = confidences.check_confidence(confidence, system, settings, images)
-    ranked = rank_dataset(images.dataset, system, cache=tools.cache)
+    rankings, watch = assembly.rankings(settings), Stopwatch()  # errors come before anything slow
+    confidence = settings["confidence"] and confidences.read_file(settings["confidence"])
+    inputs = prepare(settings, watch)
+    system, figure_queries = System(inputs.pipeline, **rankings), query_rows(settings["figures"], inputs.dataset)
+    confidence = confidence and confidences.check_confidence(confidence, system, inputs)
+    ranked = rank_dataset(inputs.dataset, system, cache=inputs.cache)
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
-    thresholds = truth.thresholds(settings, images.dataset.sequences[0].truth)
-    report = EvaluationReport.of(ranked, thresholds, settings["recall"]["ks"])
+    report = EvaluationReport.of(ranked, inputs.thresholds, settings["recall"]["ks"])
     calibrated = CalibratedPredictions(report, confidence and confidence.systems, settings["threshold"])
     figures = query_figures(report, figure_queries, calibrated.refused_of_headline)
     figures += confidence_figures(calibrated) if figure_queries else []
-    return Outcome(tools, calibrated, _describe(settings, images, system), figures)
+    return Outcome(inputs, calibrated, _describe(settings, inputs, system), figures)
 
 
-def _describe(settings: dict[str, Any], images: Images, system: System) -> RunDescription:
+def _describe(settings: dict[str, Any], inputs: Inputs, system: System) -> RunDescription:
     """The settings of the run, for its folder."""
-    scorers, ground_truth = assembly.describe_settings(settings["scorer"]), truth.describe(settings, images.dataset)
+    scorers = assembly.describe_settings(settings["scorer"])
     return RunDescription(
         {name: settings[name] for name in ("retrieval", "features", "matching")},
         parameters(system.final_scores.values(), scorers, settings["fusion"]),
-        ground_truth, truth.in_words(ground_truth), images.contents,
+        inputs.ground_truth, truth.in_words(inputs.ground_truth), inputs.contents,
         confidences.scoring_settings(settings), settings.get("command"),
     )  # fmt: skip
 

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mfvpr.cli import build, console, run_folder, stages, truth
+from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
+from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.cli.stages import Images
 from mfvpr.datasets.sequences import OwnRows, own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
@@ -29,17 +29,15 @@ _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
 
 
 class Prepared(NamedTuple):
-    """A data set with its matches, their recipe, and a description of the ground truth."""
+    """A data set with its matches, and what they were made from."""
 
     part: Part
-    images: Images
-    recipe: dict[str, Any]
-    ground_truth: dict[str, Any]
+    inputs: Inputs
 
 
 def learn(settings: dict[str, Any]) -> None:
     """Learn, search, compare on queries that were not learned on, fill the run folder."""
-    with run_folder.claim(settings) as folder:
+    with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         axes, options, watch = learning_axes(settings), _options(settings), Stopwatch()
         teach = [_prepare(choice, watch) for choice in _settings_by_data_set(settings)]
         report, data = [], teach[0].part
@@ -71,8 +69,8 @@ def learn(settings: dict[str, Any]) -> None:
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.comparison_figures(comparison)
-        by_name = {data_set.part.name: data_set.ground_truth for data_set in report}
-        ground_truth = by_name if report else teach[0].ground_truth
+        by_name = {data_set.part.name: data_set.inputs.ground_truth for data_set in report}
+        ground_truth = by_name if report else teach[0].inputs.ground_truth
         run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 
@@ -89,13 +87,11 @@ def _settings_by_data_set(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
-    tools, images = stages.prepare(settings, watch)
-    protocol = truth.evaluation_protocol(settings, images.dataset)
-    matches, candidates = stages.match_data_set(tools, images, watch)
+    inputs = prepare(settings, watch)
+    protocol = truth.evaluation_protocol(inputs.dataset, inputs.thresholds, settings["split"])
+    matches, candidates = inputs.match(watch)
     assert not isinstance(matches, Scales)
-    recipe = stages.recipe(tools, images)
-    part = Part(label(settings["dataset"]), protocol, matches, candidates)
-    return Prepared(part, images, recipe, truth.describe(settings, images.dataset))
+    return Prepared(Part(label(settings["dataset"]), protocol, matches, candidates), inputs)
 
 
 def label(settings: dict[str, Any]) -> str:
@@ -106,7 +102,7 @@ def label(settings: dict[str, Any]) -> str:
 def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
     """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
-        sides = itertools.product(second.images.contents.values(), first.images.contents.values())
+        sides = itertools.product(second.inputs.contents.values(), first.inputs.contents.values())
         if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
             raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
                                 f"which is learned on; {same} are the same")  # fmt: skip
@@ -121,14 +117,14 @@ def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
 
 
 def _same_images(first: Prepared, second: Prepared, side: str) -> OwnRows:
-    return own_rows(first.images.contents[side], second.images.contents[side])
+    return own_rows(first.inputs.contents[side], second.inputs.contents[side])
 
 
 def _about(data_set: Prepared) -> dict[str, Any]:
-    images = data_set.images
+    inputs = data_set.inputs
     return {
-        "dataset": images.dataset.name, "ground_truth": data_set.ground_truth,
-        "data_fingerprint": images.fingerprints, "reading": images.reading,
+        "dataset": inputs.dataset.name, "ground_truth": inputs.ground_truth,
+        "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
     }  # fmt: skip
 
 
@@ -147,7 +143,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
         return None
     names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
-        "matches": [data_set.recipe for data_set in sets], "scorer": recipe_of(scorer),
+        "matches": [data_set.inputs.matches_recipe() for data_set in sets], "scorer": recipe_of(scorer),
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
         "retrieval_score": settings["fusion"]["retrieval_score"], "positives": data.protocol.fingerprint,
         "reported": dict(data.protocol.reported_sets),
@@ -159,7 +155,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
 
 def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
     system = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
-    ground_truth = truth.in_words(*(data_set.ground_truth for data_set in report or teach))
+    ground_truth = truth.in_words(*(data_set.inputs.ground_truth for data_set in report or teach))
     if report:
         teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))
         return f"{teach_names}: {system}; what was learned here is reported on {report_names}; {ground_truth}"

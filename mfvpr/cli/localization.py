@@ -135,7 +135,7 @@ def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | Non
         return None
     from mfvpr.cli import confidences  # here: it imports the reports
 
-    file: Any = confidences.read_file(settings)
+    file = confidences.read_file(settings["confidence"])
     map_settings, name = read_declaration(expand_user(settings["map"])), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.cli.console import track
-from mfvpr.cli.stages import dataset_of
+from mfvpr.cli.inputs import dataset_of
 from mfvpr.localization import Map
 from mfvpr.localization.declaration import read_declaration
 from mfvpr.storage.disk import used_bytes
@@ -38,6 +38,5 @@ def add_images(folder: Path, images: list[Path], place: str | None) -> None:
 
 def map_of_settings(settings: Mapping[str, Any]) -> Map:
     """The map in the folder of the settings, which may be missing or empty."""
-    complete = {**settings, "cohort": None, "previous_queries": 0}
-    system = assembly.system(complete, assembly.pipeline(complete, None))
+    system = assembly.system({**settings, "cohort": None, "previous_queries": 0})
     return Map(expand_user(settings["map"]), system)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.cli import console
+from mfvpr.cli.inputs import dataset_of
 from mfvpr.cli.launch import refuse
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.cli.stages import dataset_of
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents
 from mfvpr.datasets.published import PUBLISHED, published_differences

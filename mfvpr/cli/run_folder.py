@@ -18,10 +18,9 @@ _NO_SETTINGS = ("multirun", "command", "cluster")  # added by `command_line`; re
 
 
 @contextmanager
-def claim(settings: Mapping[str, Any], **options: Any) -> Iterator[Path]:
-    """The run folder that the settings name, for this run alone; with options of `runs.claim_run_folder`."""
-    out, name = settings["out"], settings["dataset"]["name"]
-    folder = expand_user(out) if out else runs.new_run_folder(Path("runs"), name)
+def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
+    """The run folder `out`, for this run alone; None = a new one of a data set. Options as of `claim_run_folder`."""
+    folder = expand_user(out) if out else runs.new_run_folder(Path("runs"), dataset)
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))

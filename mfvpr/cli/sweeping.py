@@ -4,8 +4,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import run_folder, stages, truth
+from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
+from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
@@ -18,15 +19,15 @@ from mfvpr.utils.versions import versions
 def sweep(settings: dict[str, Any]) -> None:
     """Search the settings, print the table, fill the run folder."""
     settings = with_final_axis(settings)
-    with run_folder.claim(settings) as folder:
+    with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         axes, watch = search_axes(settings), Stopwatch()
-        tools, images = stages.prepare(settings, watch)
-        protocol = truth.evaluation_protocol(settings, images.dataset)
-        matches, candidates = stages.match_data_set(tools, images, watch)
-        blocks = _block_folder(settings, tools, images)
+        inputs = prepare(settings, watch)
+        protocol = truth.evaluation_protocol(inputs.dataset, inputs.thresholds, settings["split"])
+        matches, candidates = inputs.match(watch)
+        blocks = _block_folder(settings, inputs)
         options = SweepOptions(
             settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
-            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, tools.cache.runtime,
+            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, inputs.cache.runtime,
         )  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
@@ -36,31 +37,29 @@ def sweep(settings: dict[str, Any]) -> None:
             else:
                 trials = {"trials": settings["trials"], "seed": settings["seed"]}
                 outcome = sweeping.search_optuna(axes, protocol, matches, candidates, options, **trials)
-        heading = _heading(settings, images, outcome)
-        results = _results(settings, images, outcome, watch.seconds)
+        heading = _heading(settings, inputs, outcome)
+        results = _results(settings, inputs, outcome, watch.seconds)
         run_folder.write_results(
-            folder, settings, truth.describe(settings, images.dataset), text=sweeps.sweep_summary(outcome, heading),
+            folder, settings, inputs.ground_truth, text=sweeps.sweep_summary(outcome, heading),
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results), figures=sweeps.sweep_figures(outcome),
         )  # fmt: skip
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
 
 
-def _block_folder(settings: dict[str, Any], tools: stages.Tools, images: stages.Images) -> Path | None:
+def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:
     """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
     if settings["cache"] is None:
         return None
-    recipe = stages.recipe(tools, images)
     names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = fingerprint({"matches": recipe, "sweep": sweep_settings, "versions": software})
+    name = fingerprint({"matches": inputs.matches_recipe(), "sweep": sweep_settings, "versions": software})
     return expand_user(settings["cache"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
-def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) -> str:
-    dataset, features = images.dataset, settings["features"]
-    ground_truth = truth.in_words(truth.describe(settings, dataset))
+def _heading(settings: dict[str, Any], inputs: Inputs, outcome: Outcome) -> str:
+    dataset, features, ground_truth = inputs.dataset, settings["features"], truth.in_words(inputs.ground_truth)
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
@@ -69,13 +68,11 @@ def _heading(settings: dict[str, Any], images: stages.Images, outcome: Outcome) 
     )
 
 
-def _results(
-    settings: dict[str, Any], images: stages.Images, outcome: Outcome, seconds: dict[str, float]
-) -> dict[str, Any]:
+def _results(settings: dict[str, Any], inputs: Inputs, outcome: Outcome, seconds: dict[str, float]) -> dict[str, Any]:
     return {
-        "dataset": images.dataset.name, "data_fingerprint": images.fingerprints, "reading": images.reading,
+        "dataset": inputs.dataset.name, "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
         "scorer": settings["scorer"], "features": settings["features"], "retrieval": settings["retrieval"],
         "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
-        "final": settings["final"], "ground_truth": truth.describe(settings, images.dataset),
+        "final": settings["final"], "ground_truth": inputs.ground_truth,
         **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

@@ -38,7 +38,7 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
     try:
         values = _read_run(Path(name), settings) if str(name).endswith(".json") else _compose(str(name), settings)
         check(values)
-        return assembly.system(values, assembly.pipeline(values, None))
+        return assembly.system(values)
     except SettingsError as error:
         raise InputError(str(error)) from error
 

@@ -1,11 +1,12 @@
 """Ground truth of a recall: its source, its thresholds, and their words in results."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mfvpr import evaluation
-from mfvpr.datasets import Dataset, Truth
+from mfvpr.datasets import Dataset
 from mfvpr.evaluation import EvaluationProtocol
+from mfvpr.evaluation.protocol import Split
 from mfvpr.systems.settings import SettingsError
 
 _FILES = ("index_file", "query_labels", "database_labels")
@@ -13,30 +14,27 @@ _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "draw
           "published": "as published"}  # fmt: skip
 
 
-def thresholds(settings: Mapping[str, Any], truth: Truth | None) -> list[float]:
-    """Thresholds of a correct prediction, ascending, in the ground truth's unit; empty without ground truth."""
-    recall = settings["recall"]
-    return [] if truth is None else truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
-
-
-def evaluation_protocol(settings: Mapping[str, Any], dataset: Dataset) -> EvaluationProtocol:
+def evaluation_protocol(dataset: Dataset, thresholds: Sequence[float], split: Split | None) -> EvaluationProtocol:
     """The protocol of rankings for sweeps and learning."""
     if dataset.truth is None:
         raise SettingsError(
             "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
         )
-    return evaluation.evaluation_protocol(dataset.truth, thresholds(settings, dataset.truth), settings["split"])
+    return evaluation.evaluation_protocol(dataset.truth, thresholds, split)
 
 
-def describe(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
-    """Kind, files, unit and thresholds of the ground truth, as results store them."""
-    choice, truth = settings["dataset"], dataset.sequences[0].truth
+def describe(choice: Mapping[str, Any], recall: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:
+    """Kind, files, unit and thresholds of the ground truth, as results store them, from `dataset` and `recall`."""
+    truth = dataset.sequences[0].truth
     entries = {
         "kind": choice.get("ground_truth", "drawn" if "cache" in choice else "published"),
         "files": [choice[name] for name in _FILES if choice.get(name)],
         "exclude_neighbors": choice.get("exclude_neighbors"),
     }
-    return entries if truth is None else entries | {"unit": truth.unit, "thresholds": thresholds(settings, truth)}
+    if truth is None:
+        return entries
+    thresholds = truth.thresholds(tolerances=recall["tolerances"], radius=recall["radius"])
+    return entries | {"unit": truth.unit, "thresholds": thresholds}
 
 
 def in_words(*descriptions: Mapping[str, Any]) -> str:

@@ -42,7 +42,7 @@ def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
     settings = read_declaration(folder) | {"cohort": None, "previous_queries": 0}
     try:
-        return assembly.system(settings, assembly.pipeline(settings, None))
+        return assembly.system(settings)
     except SettingsError as error:
         raise InputError(f"{folder / _FILE}: {error}") from None
 

@@ -39,7 +39,7 @@ _NETWORK_EXTRACTORS = {
 }
 
 
-def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
+def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
     """The extractor of local features, or the feature files of another program."""
     name, options = settings["name"], _without(settings, "name")
     options["image_size"] = options["image_size"] and tuple(options["image_size"])
@@ -52,11 +52,11 @@ def extractor(settings: dict[str, Any], data: Dataset | None) -> Extractor | Fea
     return Sift(**_require_fields(options, Sift, "features=sift"))
 
 
-def retriever(settings: dict[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
+def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
     name, options = settings["name"], _without(settings, "name", "whiten")
     if name == "pairs":
-        return ShortlistFiles(_files("retrieval", {"database": None} | settings, data), settings["database_prefix"])
+        return ShortlistFiles(_files("retrieval", {"database": None, **settings}, data), settings["database_prefix"])
     if name == "ssm":
         from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
 
@@ -98,7 +98,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
 
 
-def matcher(settings: dict[str, Any]) -> Matcher:
+def matcher(settings: Mapping[str, Any]) -> Matcher:
     """The matcher of an image pair."""
     name, options = settings["name"], _without(settings, "name")
     weights = options.pop("weights", None)
@@ -108,7 +108,7 @@ def matcher(settings: dict[str, Any]) -> Matcher:
     return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
 
 
-def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[Path, File]:
+def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dict[Path, File]:
     """Files of another program, by folder of the images."""
     if data is None:
         raise SettingsError(f"{group}: files of other programs belong to a data set; choose others")
@@ -130,23 +130,32 @@ def _files(group: str, settings: dict[str, Any], data: Dataset | None) -> dict[P
     return files
 
 
-def pipeline(settings: dict[str, Any], data: Dataset | None) -> Pipeline:
+def pipeline(settings: Mapping[str, Any], data: Dataset | None) -> Pipeline:
     """The pipeline that the settings name; files of other programs need their data set."""
     local = extractor(settings["features"], data)
     retrieval = retriever(settings["retrieval"], local, data)
     return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"])
 
 
-def system(settings: dict[str, Any], pipeline: Pipeline) -> System:
-    """The system that the settings name: the main scorer is fused with the retrieval, also its scores with a cohort."""
+def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:
+    """The system that the settings name; files of other programs need their data set."""
+    return System(pipeline(settings, data), **rankings(settings))
+
+
+def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """All of a system but its pipeline: the main scorer is fused with the retrieval, also its scores with a cohort."""
     chosen, fusing, cohort = scorers(settings["scorer"]), fusion(settings), settings["cohort"]
     main = main_scorer(chosen)
+    fusing.check(main, chosen)
     fused = {main: fusing}
     if cohort is not None and fusing.members(main) == [main]:
         fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
     headline = fusing.system(main) if settings["final"] == "combined" else main
     correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
-    return System(pipeline, chosen, fused, correlated, cohort, settings["ties"], headline, settings)
+    return {
+        "scorers": chosen, "fused": fused, "correlated": correlated, "cohort": cohort, "ties": settings["ties"],
+        "final": headline, "settings": settings,
+    }  # fmt: skip
 
 
 def main_scorer(scorers: Mapping[str, Any]) -> str:
@@ -154,7 +163,7 @@ def main_scorer(scorers: Mapping[str, Any]) -> str:
     return "histogram" if "histogram" in scorers else next(iter(scorers))
 
 
-def fusion(settings: dict[str, Any]) -> Fusion:
+def fusion(settings: Mapping[str, Any]) -> Fusion:
     """The fusion of a score with that of the retrieval, and with those of other scorers."""
     c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
     c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import stages
 from mfvpr.cli.evaluation import evaluate
+from mfvpr.cli.inputs import prepare
+from mfvpr.utils import Stopwatch
 from tests.programs import composed, csv_rows, folder
 
 pytestmark = pytest.mark.thorough
@@ -108,8 +109,8 @@ def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
     Image.new("RGB", (120, 160)).save(tmp_path / "database" / "0.png", exif=exif)
     Image.fromarray(np.full((120, 160), 65535, np.uint16)).save(tmp_path / "queries" / "0.png")
     data = folder(tmp_path)[:3]
-    _, images = stages.prepare(composed(*QUICK, *data, "dataset.ground_truth=order"), stages.Stopwatch())
-    assert images.reading == {
+    inputs = prepare(composed(*QUICK, *data, "dataset.ground_truth=order"), Stopwatch())
+    assert inputs.reading == {
         "database": {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
         "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 1, "largest_16bit": 65535},
     }  # fmt: skip
@@ -126,7 +127,7 @@ def test_a_range_of_16_bit_images_that_does_not_fit_is_told(tmp_path, capsys, la
     (tmp_path / "database").mkdir()
     Image.fromarray(np.full((120, 160), largest, np.uint16)).save(tmp_path / "database" / "0.png")
     settings = composed(*QUICK, *same(tmp_path, "dataset.ground_truth=order", "dataset.bits=12"))
-    stages.prepare(settings, stages.Stopwatch())
+    prepare(settings, Stopwatch())
     stderr = capsys.readouterr().err
     assert words in stderr
     assert ("the largest value of all 16-bit images" in stderr) == bool(words)

@@ -92,8 +92,8 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         database, queries = (overrides.compose_data_sets("report", streets[number])[0] for number in (1, of_queries))
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
-        _, images = learning.stages.prepare(settings, evaluation.Stopwatch())
-        several.append(learning.Prepared(SimpleNamespace(name=name), images, {}, {}))
+        inputs = learning.prepare(settings, evaluation.Stopwatch())
+        several.append(learning.Prepared(SimpleNamespace(name=name), inputs))
     learning.require_disjoint([], several)
     assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
     learning.require_disjoint([], several[:1])
@@ -115,5 +115,5 @@ def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, t
         ]
         assert stderr.count("was learned") == len(warns)
     [reported] = overrides.compose_data_sets("report", streets[2])
-    learning.stages.prepare(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
+    learning.prepare(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
     assert "was learned" not in capsys.readouterr().err

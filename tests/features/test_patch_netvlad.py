@@ -9,7 +9,7 @@ import pytest
 
 import mfvpr
 from mfvpr.checkpoints.networks import plan_network
-from mfvpr.cli import stages
+from mfvpr.cli import inputs
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.reranking import fuse_scales
@@ -220,7 +220,7 @@ def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
     options = "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]"
     _, stderr = program("learn", *scales, *options, code=2)
     assert "features.patch_sizes=[2, 4]: expected one size" in stderr.splitlines()[-1]
-    monkeypatch.setattr(stages, "dataset_of", None)  # told before
+    monkeypatch.setattr(inputs, "dataset_of", None)  # told before
     _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]", code=2)
     assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mfvpr import HistogramOfShifts
-from mfvpr.cli import evaluation, stages
+from mfvpr.cli import evaluation
+from mfvpr.cli.inputs import prepare
 from mfvpr.evaluation.stages import dominant_shifts
 from mfvpr.matching import MatchSet
 from mfvpr.report.run_files import SHIFTS
@@ -37,11 +38,11 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     assert [(line["query"], line["prediction"]) for line in lines] == [
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
-    tools, images = stages.prepare(settings, Stopwatch())
-    matches, candidates = stages.match_data_set(tools, images, Stopwatch())
+    inputs = prepare(settings, Stopwatch())
+    matches, candidates = inputs.match(Stopwatch())
     weight = evaluation.assembly.scorers(settings["scorer"])["histogram"].weight
     scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
-    names = images.dataset.database.names
+    names = inputs.dataset.database.names
     for row, line in enumerate(lines):
         place = list(candidates.indices[row]).index(names.index(line["prediction"]))
         pair = jax.tree.map(lambda leaf: leaf[place], matches[row])  # noqa: B023

@@ -1,0 +1,98 @@
+"""What the settings of a program name, as values: data, pipeline, cache, and what counts as correct."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mfvpr.cli import build, notes, truth
+from mfvpr.cli.console import Progress
+from mfvpr.datasets import Dataset
+from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.sequences import own_rows, without_neighbors
+from mfvpr.evaluation import Pipeline, match_sequence
+from mfvpr.evaluation.sequence_matching import matches_recipe
+from mfvpr.matching import MatchSet, Scales
+from mfvpr.storage import FeatureCache
+from mfvpr.systems import assembly
+from mfvpr.types import Shortlist
+from mfvpr.utils import Stopwatch
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The inputs of a program.
+
+    Attributes:
+        dataset: without neighbors of the queries, if the settings exclude them.
+        contents: of the image files, by side.
+        pipeline: finds and matches candidates.
+        cache: of the pipeline's results.
+        ground_truth: kind, files, unit and thresholds, as results store them.
+    """
+
+    dataset: Dataset
+    contents: Mapping[str, Contents]
+    pipeline: Pipeline
+    cache: FeatureCache
+    ground_truth: dict[str, Any]
+
+    @property
+    def thresholds(self) -> list[float]:
+        """Thresholds of a correct prediction, ascending; empty without ground truth."""
+        return self.ground_truth.get("thresholds", [])
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Fingerprints of all folders, by side."""
+        return {side: contents.fingerprint for side, contents in self.contents.items()}
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """Conversions of the images when they are read, by side."""
+        return {side: contents.summary() for side, contents in self.contents.items()}
+
+    def match(self, watch: Stopwatch) -> tuple[MatchSet | Scales, Shortlist]:
+        """Matches and shortlist of the only sequence, from their store if it has all of them."""
+        result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=self.cache, watch=watch)
+        return result.by_scale, result.candidates
+
+    def matches_recipe(self) -> dict[str, Any]:
+        """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
+        recipe = matches_recipe(self.dataset, self.dataset.only, self.pipeline, self.cache)
+        scales = self.pipeline.extractor.scales
+        return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
+
+
+def prepare(settings: Mapping[str, Any], watch: Stopwatch) -> Inputs:
+    """The inputs that the settings name; notes and warnings tell what is peculiar about them.
+
+    The pipeline comes first, since its errors should come before anything slow, unless it needs files about the images.
+    """
+    cache = build.cache(settings)
+    names = {settings[group]["name"] for group in ("features", "retrieval")}
+    pipeline = None if names & {"import", "pairs"} else assembly.pipeline(settings, None)
+    with watch("data"):
+        dataset, contents = _data(settings["dataset"], cache)
+        ground_truth = truth.describe(settings["dataset"], settings["recall"], dataset)
+        notes.tell_peculiarities(settings, dataset, contents, ground_truth.get("thresholds", []))
+    return Inputs(dataset, contents, pipeline or assembly.pipeline(settings, dataset), cache, ground_truth)
+
+
+def _data(settings: Mapping[str, Any], cache: FeatureCache) -> tuple[Dataset, dict[str, Contents]]:
+    """The data set, without neighbors of the queries, and the contents of its files by side."""
+    dataset, neighbors = dataset_of(settings), settings.get("exclude_neighbors")
+    sides, sequences = {"database": cache.recipes.contents(dataset.database)}, []
+    for sequence in dataset.sequences:
+        contents = cache.recipes.contents(sequence.images)
+        sides[f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"] = contents
+        if neighbors is not None:
+            same_images = own_rows(contents, sides["database"])
+            sequence = without_neighbors(sequence, len(dataset.database), same_images, neighbors)
+        sequences.append(sequence)
+    return replace(dataset, sequences=tuple(sequences)), sides
+
+
+def dataset_of(settings: Mapping[str, Any]) -> Dataset:
+    """The data set, with a progress bar if it must be drawn."""
+    with Progress("drawing streets", 0) as progress:
+        return build.dataset(settings, progress.reach)

@@ -1,0 +1,101 @@
+"""Notes and warnings about the data of a program, before it begins."""
+
+from collections.abc import Mapping, Sequence
+from itertools import takewhile
+from typing import Any
+
+from mfvpr.cli.console import tell
+from mfvpr.datasets import Dataset, QuerySequence
+from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.published import published_differences
+from mfvpr.datasets.sequences import OwnRows, own_rows
+from mfvpr.datasets.truth import threshold_words
+from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.scoring.weight_registry import provenance
+from mfvpr.systems import assembly
+
+# A learned match weight depends on these settings.
+_LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}
+
+
+def tell_peculiarities(
+    settings: Mapping[str, Any], dataset: Dataset, contents: Mapping[str, Contents], thresholds: Sequence[float]
+) -> None:
+    """Tell what is peculiar about the images, the ground truth, the candidates and learned weights."""
+    for difference in published_differences(dataset):
+        tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
+    database, *queries = contents.values()
+    for sequence, images in zip(dataset.sequences, queries, strict=True):
+        _warn_of_sequence(sequence, own_rows(images, database), thresholds)
+    _warn_of_reading(contents, dataset.database.bits)
+    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
+        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
+    available = num_candidates(settings["candidates"], dataset.database)
+    _note_candidates(settings["candidates"], settings["recall"]["ks"], available)
+    weights = {values.get("weight", "fs") for values in assembly.by_scorer(settings["scorer"]).values()}
+    for name in sorted(weights | {*((settings.get("grid") or {}).get("weight") or ())}):
+        _warn_of_weight(name, settings, dataset.name, {content.fingerprint for content in contents.values()})
+
+
+def _warn_of_sequence(sequence: QuerySequence, same_images: OwnRows, thresholds: Sequence[float]) -> None:
+    """Warn of queries that are database images, and of thresholds without any correct prediction."""
+    queries, same, excluded = len(same_images), sum(map(bool, same_images)), sequence.excluded
+    if same and excluded is None:
+        tell(f"warning: {same} of {queries} queries are database images themselves, so that each finds itself; set "
+              "dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)")  # fmt: skip
+    if excluded is not None and same < queries:
+        tell(f"note: {queries - same} of {queries} queries are no database images; nothing is left out for them")
+    if (ground_truth := sequence.truth) is None:
+        return
+    without = list(takewhile(lambda threshold: not ground_truth.positives(threshold).any(), thresholds))
+    if without == thresholds:
+        tell("warning: the ground truth has no correct image for any query; every recall will be 0")
+    elif without:
+        words = ", ".join(threshold_words(ground_truth.unit, threshold).strip() for threshold in without)
+        remedy = "larger recall.tolerances" + ", or fewer dataset.exclude_neighbors" * (excluded is not None)
+        tell(f"warning: no query has a correct image within {words}; recall will be 0 there; use {remedy}")
+
+
+def _warn_of_reading(contents: Mapping[str, Contents], bits: int | None) -> None:
+    """Note conversions of the images, and warn of 16-bit images whose range does not fit."""
+    readings = {side: content.summary() for side, content in contents.items()}
+    for side, reading in readings.items():
+        if reading["turned"]:
+            tell(f"note: {reading['turned']} {side} images are turned as their EXIF orientation says")
+        if reading["scaled_16bit"]:
+            tell(f"note: {reading['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
+    largest = max(reading["largest_16bit"] or 0 for reading in readings.values())
+    used = max(largest.bit_length(), 8)
+    if largest and bits is not None and not bits - 1 <= used <= bits:
+        look = "dark" if used < bits else "cut off"
+        tell(f"warning: the largest value of all 16-bit images is {largest}, so that they come out {look}; "
+              f"dataset.bits={used} would use their range")  # fmt: skip
+
+
+def _note_candidates(candidates: int | str, ks: Sequence[int], available: int) -> None:
+    """Note that fewer candidates are available than `candidates` or `recall.ks` expect."""
+    if isinstance(candidates, int) and candidates > available:
+        tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
+    deeper = [f"R@{k}" for k in ks if k > available]
+    if deeper:
+        verb = "is" if len(deeper) == 1 else "are"
+        tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of retrieval too: no more candidates are looked at")
+
+
+def _warn_of_weight(name: str, settings: Mapping[str, Any], dataset: str, images: set[str]) -> None:
+    """Warn of a match weight that was learned on these images, or with other features or matches."""
+    origin = provenance(name)
+    data_sets = origin["data_sets"] if isinstance(origin.get("data_sets"), list) else [origin]
+    if images & {str(folder) for each in data_sets for folder in _mapping(each, "data_fingerprint").values()}:
+        tell(f"warning: weight={name} was learned on images of {dataset}, so that it flatters here")
+    for group, keys in _LEARNED_WITH.items() if origin else ():
+        before, now = _mapping(_mapping(origin, "settings"), group), settings[group]
+        if other := [key for key in keys if before.get(key) != now.get(key)]:
+            words = ", ".join(f"{before.get(key, 'unknown')} instead of {now.get(key)}" for key in other)
+            tell(f"warning: weight={name} was learned with other {group} ({words}); it may mean nothing here")
+
+
+def _mapping(content: Any, name: str) -> Mapping[str, Any]:
+    """The mapping under a name in a file's content, which may be anything; empty if there is none."""
+    entry = content.get(name) if isinstance(content, Mapping) else None
+    return entry if isinstance(entry, Mapping) else {}
