@@ -1,4 +1,4 @@
-"""Draw the pictures of the README into notebooks/pictures: `python notebooks/pictures.py`.
+"""Draw the pictures of the README into notebooks/pictures: `python notebooks/draw_pictures.py`.
 
 The first is made with the code of the first notebook, the second by `mfvpr evaluate`.
 """
