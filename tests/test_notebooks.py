@@ -83,4 +83,7 @@ def test_they_run_and_show_pictures(path, executed):
 @pytest.mark.slow
 def test_they_leave_no_files(executed):
     assert not list(executed[1].iterdir())
-    assert {path.suffix for path in FOLDER.iterdir()} == {".ipynb"}
+    assert {path.name for path in FOLDER.iterdir()} - {"__pycache__"} == {path.name for path in PATHS} | {
+        "pictures",
+        "pictures.py",
+    }
