@@ -1,4 +1,4 @@
-"""What the pages show is run: commands, code, links, and names of settings."""
+"""Pages: their commands, code, links and names of settings are run and checked."""
 
 import re
 import shlex

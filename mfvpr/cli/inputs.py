@@ -1,4 +1,4 @@
-"""What the settings of a program name, as values: data, pipeline, cache, and what counts as correct."""
+"""The inputs of a program as values: data, pipeline, cache, and what counts as correct, from its settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

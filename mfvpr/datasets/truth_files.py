@@ -18,7 +18,7 @@ from mfvpr.utils.errors import InputError
 
 MAX_DIGITS = 20  # of a row number
 _LINES = "lines (with an empty cell if it has no place or label)"
-_reading = partial(reading, kind="a ground truth file", mend="see README, Your own images")
+_reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets/README.md")
 
 
 def truth_from_labels(

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.datasets.datasets import ImageFolder, image_folder
+from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.calibration import Confidence
 from mfvpr.evaluation.system import System, noise_image
@@ -109,7 +109,10 @@ class Map(MapImages):
         """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
         images = images if isinstance(images, ImageFolder) else image_folder(images)
         known = cls(folder, system, runtime=runtime)
-        known.build(images, places, cache=cache, track=runtime.progress("images"))
+        added = known.build(images, places, cache=cache, track=runtime.progress("images"))
+        if added < len(images):
+            runtime.log(f"{folder}: has {len(images) - added} of {len(images)} images already, by their names, and "
+                        "keeps them; make another map if their content is new")  # fmt: skip
         return known
 
     def calibrate(
@@ -117,7 +120,7 @@ class Map(MapImages):
         database: Path | str,
         queries: Path | str,
         *,
-        ground_truth: str = "order",
+        ground_truth: GroundTruth | str = "order",
         cache: FeatureCache | None = None,
     ) -> Confidence:
         """Fit the confidence on a drive, and keep it in the folder of the map.

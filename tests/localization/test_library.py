@@ -35,8 +35,11 @@ def test_a_map_is_opened_by_its_folder_alone(street, small_street):
 
 
 def test_what_is_there_is_not_added_again(street, small_street):
-    extended = Map.create(street.folder, small_street / "database", street.system)
+    lines = []
+    runtime = mfvpr.Runtime(log=lines.append)
+    extended = Map.create(street.folder, small_street / "database", street.system, runtime=runtime)
     assert len(extended) == len(street) == 10
+    assert [line for line in lines if "has 10 of 10 images already, by their names" in line]
 
 
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
