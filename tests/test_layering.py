@@ -104,9 +104,7 @@ def test_a_library_is_used_where_it_belongs_and_in_all_these_places(library):
 
 
 @pytest.mark.parametrize("package", [package for package in PERMISSIONS if (ROOT / package).is_dir()])
-def test_a_package_says_what_it_imports_and_exports_what_it_names(package):
+def test_a_package_exports_what_it_names(package):
     module = importlib.import_module(f"mfvpr.{package}")
-    words = module.__doc__.partition("\nImports ")[2].replace(",", " ").replace(".", " ").split()
-    assert set(words) - {"nothing", "of", "mfvpr"} == PERMISSIONS[package]
     assert all(hasattr(module, name) for name in module.__all__)
     assert len(module.__all__) > 1

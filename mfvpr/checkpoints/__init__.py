@@ -2,8 +2,6 @@
 
 Read first: registry (published files), files (install, save, load), conversion (layouts), networks (network of each
 file), checkpoint and torch_files (readers).
-
-Imports io, networks, utils.
 """
 
 import lazy_loader

@@ -7,11 +7,8 @@
 
 Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
 systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text, wording (of errors), declare (files in conf/
-that follow from scorers). Settings are checked and become systems in `mfvpr.systems`; other values in build, truth and
-confidences. Jobs share stages, run_folder, axes, console.
-
-Imports checkpoints, datasets, evaluation, features, localization, matching, report, reranking, retrieval, scoring,
-storage, systems, tuning, types, utils.
+that follow from scorers). Settings are checked and become systems in `mfvpr.systems`; they become the inputs of a job
+in inputs, with notes about them, and its parts in build, truth and confidences. Jobs share run_folder, axes, console.
 """
 
 import lazy_loader

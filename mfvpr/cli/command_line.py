@@ -59,7 +59,10 @@ def run(config: str) -> None:
 
             _set_up_jax(settings.pop("compiled"))
             interruptible = on_interrupt(signal.default_int_handler)
-            multirun_job = is_multirun and _multirun_of(hydra_settings)
+            multirun_job = is_multirun and {
+                "multirun": hydra_settings.sweep.dir, "number": hydra_settings.job.num,
+                "overrides": dict(override.split("=", 1) for override in hydra_settings.overrides.task),
+            }  # fmt: skip
             with interruptible, in_settings(settings), _frozen_imports(), build.cluster(settings) as cluster:
                 job(settings | {"multirun": multirun_job, "command": command, "cluster": cluster})
 
@@ -79,12 +82,6 @@ def run(config: str) -> None:
         quoted = [quote(argument, several=bool(multirun)) for argument in arguments if argument not in _MULTIRUN]
         sys.argv[1:] = multirun[:1] + quoted  # Hydra takes no settings before --multirun
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
-
-
-def _multirun_of(hydra_settings: Any) -> dict[str, Any]:
-    """Folder of a multirun, and number and settings of a job, for its joint table."""
-    overrides = dict(override.split("=", 1) for override in hydra_settings.overrides.task)
-    return {"multirun": hydra_settings.sweep.dir, "number": hydra_settings.job.num, "overrides": overrides}
 
 
 def _set_up_jax(compiled: bool) -> None:

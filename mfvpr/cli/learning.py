@@ -9,7 +9,7 @@ from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.datasets.contents import OwnRows, own_rows
+from mfvpr.datasets.contents import own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
@@ -107,17 +107,13 @@ def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
             raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
                                 f"which is learned on; {same} are the same")  # fmt: skip
     for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
-        if same := sum(map(bool, _same_images(second, first, "query"))):
+        if same := sum(map(bool, own_rows(second.inputs.contents["query"], first.inputs.contents["query"]))):
             raise SettingsError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
                                 "are the same, and would count twice")  # fmt: skip
     for first, second in itertools.combinations(report, 2):
-        if any(_same_images(second, first, "database")):
+        if any(own_rows(second.inputs.contents["database"], first.inputs.contents["database"])):
             console.tell(f"warning: {first.part.name} and {second.part.name} are of one map, but their queries are "
                          "taken for independent, so that intervals are too narrow and p too low")  # fmt: skip
-
-
-def _same_images(first: Prepared, second: Prepared, side: str) -> OwnRows:
-    return own_rows(first.inputs.contents[side], second.inputs.contents[side])
 
 
 def _about(data_set: Prepared) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 Read first: datasets (folders of images), truth and positives (what is correct), images (decoding and resizing),
 contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic street).
-
-Imports io, utils.
 """
 
 import lazy_loader

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.datasets.positives import Positives, rows_within
+from mfvpr.io.checks import parse_number
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numbers import parse_number
 
 Unit = Literal["frames", "m", "exact"]
 TOLERANCES = (1, 2, 5)  # frames

@@ -2,8 +2,6 @@
 
 Read first: evaluation (`rank_dataset`: all stages), sequence_matching and stages (its steps), protocol and selection
 (choose settings on one half, report on the other), precision, calibration, statistics.
-
-Imports datasets, features, matching, reranking, retrieval, scoring, storage, types, utils.
 """
 
 import lazy_loader

@@ -3,8 +3,6 @@
 Read first: extractor (the protocols), sift (the shortest extractor), network (what the extractors with a network
 share), then the others; vlad (global descriptors from local ones), feature_set (features on demand), extraction
 (threads and batches).
-
-Imports datasets, networks, types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 Read first: features and descriptors (the formats), names (matches entries of a file to images), then the readers:
 npz, h5, and formats/ (MATLAB files, pickles and NumPy objects, read as data).
-
-Imports types, utils.
 """
 
 import lazy_loader

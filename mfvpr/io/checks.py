@@ -1,4 +1,4 @@
-"""Checks of arrays from other programs."""
+"""Checks of numbers and arrays from other programs."""
 
 from typing import Literal
 
@@ -10,6 +10,13 @@ from mfvpr.utils.errors import InputError
 Lengths = Literal["unit", "normalize", "keep"]
 TOLERANCE = 0.01  # of unit length, relative; the error of float16 is 5e-4
 EXACT = 1e-6  # the error of float32
+
+
+def parse_number(text: str) -> float:
+    """The number in a text, as C writes it, or a `ValueError`; Python's own `float` also reads `1_0` as 10."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"not a number: {text!r}")
+    return float(text)
 
 
 def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:

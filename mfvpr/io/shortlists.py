@@ -11,13 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import FileEntry, reading, shorten
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_file, write_text
-from mfvpr.utils.numbers import parse_number
 
 PairLayout = Literal["hloc", "kapture"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first

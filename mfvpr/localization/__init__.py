@@ -10,8 +10,6 @@ Other processes may read a map while one process adds to it, and several threads
 Read first: map (localize one image), images (the images of a map, and how they are added), predictions. Then their
 parts: vocabulary, describing, vectors, matching, resident (features on the device), evidence (too few features or
 matches), declaration and calibration (what a map keeps in its folder), route (a drive through a map).
-
-Imports datasets, evaluation, features, matching, reranking, retrieval, scoring, storage, systems, types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 Read first: nearest_neighbors (one pair), matcher (matchers as values), similarity (the product), soft, lightglue;
 then batched (whole shortlists) and match_set (matches of many queries).
-
-Imports features, networks, types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 products on hardware with less than float32; a lower one than "highest" moves keypoints.
 
 Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, convolution, sampling, imagenet.
-
-Imports types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations, evaluation_files and run_files
 (files of an evaluation), sweeps, comparisons (of learning), figures, then pages/ (HTML).
-
-Imports datasets, evaluation, features, localization, reranking, scoring, storage, tuning, types, utils.
 """
 
 import lazy_loader

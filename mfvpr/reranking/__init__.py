@@ -2,8 +2,6 @@
 
 Read first: ranking (score, fuse, rank), grids (whole grids of parameters), fusion (several scores as one),
 batched_scoring (many queries), cohort_normalization, results.
-
-Imports datasets, matching, scoring, types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 Read first: search (exact search), retriever (the protocol), fitting (vocabularies and whitenings of the database),
 ssm_voting, precomputed (shortlists and descriptors from files).
-
-Imports datasets, features, io, storage, types, utils.
 """
 
 import lazy_loader

@@ -3,8 +3,6 @@
 Read first: scorer (the contract), aggregate (the shortest score), histogram, anchor, then the others; weights (of
 matches), fields (units, bounds and choices of settings), registry (scores by name). Parts of scores: shifts, lattice
 and tallest (histogram), planes (homography), parameters (by dotted name).
-
-Imports types, utils.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 Read first: feature_cache (what is cached for a folder of images), rows (a store: one file per image), features,
 vectors, matches, map_entries and maps (formats of rows), manifest (what a store belongs to).
-
-Imports datasets, features, matching, types, utils.
 """
 
 import lazy_loader

@@ -1,8 +1,6 @@
 """Systems from settings: checked values become an extractor, a retrieval, a matcher, scorers and their fusion.
 
 Read first: settings (checks), assembly (settings -> System), rules (of values).
-
-Imports checkpoints, datasets, evaluation, features, matching, networks, reranking, retrieval, scoring, utils.
 """
 
 import lazy_loader

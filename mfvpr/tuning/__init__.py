@@ -2,8 +2,6 @@
 
 Read first: sweeps/ (grids and Optuna, over whole data sets in compiled calls), learning/ (losses, training, match
 weights).
-
-Imports datasets, evaluation, matching, reranking, scoring, types, utils.
 """
 
 import lazy_loader

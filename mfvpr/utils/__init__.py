@@ -1,10 +1,8 @@
 """Files, hashes, errors, progress and arithmetic that several packages need.
 
-Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), arrays and
-numbers (their files and texts), progress, runtime, cluster, compiled_programs (on disk), threads, locks, ragged
+Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), arrays
+(their files), progress, runtime, cluster, compiled_programs (on disk), threads, locks, ragged
 (padding), whitening, versions.
-
-Imports nothing of mfvpr.
 """
 
 import lazy_loader

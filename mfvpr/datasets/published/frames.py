@@ -14,8 +14,8 @@ from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_f
 from mfvpr.datasets.published.lists import expected_file, listed_images, read_lines
 from mfvpr.datasets.truth import FARTHEST, FrameTruth
 from mfvpr.datasets.truth_files import truth_from_file
+from mfvpr.io.checks import parse_number
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numbers import parse_number
 
 SSM_LAYOUT = """Reference/image0000.png (or .jpg), ...  the database, numbered from 0
 Live/image0000.png (or .jpg), ...       the queries, numbered from 0

@@ -10,10 +10,10 @@ from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.positives import rows_within
 from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images
 from mfvpr.datasets.truth import FARTHEST, RadiusTruth, require_positions
+from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import reading
 from mfvpr.io.formats.matlab_files import read_matlab
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numbers import parse_number
 
 PITTSBURGH_LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...
 datasets/pitts30k_{part}.mat                                 lists and positions; or, as GSV-Cities has them,
