@@ -2,8 +2,8 @@
 
 | command | job |
 | :-- | :-- |
-| evaluate, sweep, learn, localize | evaluation, sweeping, learning, localization |
-| map, data, weights, report | maps, published_data, checkpoints, mfvpr.report.pages |
+| evaluate, sweep, learn | evaluation, sweeping, learning |
+| map and localize, data, weights, report | localization, published_data, checkpoints, mfvpr.report.pages |
 
 Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
 systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text, wording (of errors), declare (files in conf/

@@ -9,6 +9,7 @@ from urllib.request import urlopen
 
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
 from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, installed_entry, read_manifest
+from mfvpr.checkpoints.networks import blueprint
 from mfvpr.checkpoints.registry import Entry, how_to_install
 from mfvpr.cli.console import Progress
 from mfvpr.cli.launch import refuse
@@ -125,7 +126,9 @@ def _verify(entry: Entry) -> str:
         checks.append(f"{entry.file} has the published hash")
     if has_runtime_file or not has_checkpoint:
         load_model(entry.name)
-        manifest = read_manifest(entry.name)
+        manifest, expected = read_manifest(entry.name), blueprint(entry).parameters
+        if manifest.parameters != expected:
+            raise InputError(f"expected {expected:,} parameters, got {manifest.parameters:,}")
         checks.append(f"{manifest.parameters:,} parameters as converted")
         if entry.sha256 is None:
             origin = "is your own" if entry.like else "nobody published"

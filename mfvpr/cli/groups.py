@@ -15,7 +15,7 @@ PROGRAMS = {
     "sweep": ("mfvpr sweep", "mfvpr.cli.sweeping:sweep"),
     "learn": ("mfvpr learn", "mfvpr.cli.learning:learn"),
     "paper": ("python -m experiments.paper", "experiments.paper.program:paper"),
-    "map": ("mfvpr map build", "mfvpr.cli.maps:build_map"),
+    "map": ("mfvpr map build", "mfvpr.cli.localization:build_map"),
     "localize": ("mfvpr localize", "mfvpr.cli.localization:localize"),
 }
 

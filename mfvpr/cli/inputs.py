@@ -8,32 +8,26 @@ from mfvpr.cli import build, notes, truth
 from mfvpr.cli.console import Progress
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import Contents, own_rows
-from mfvpr.evaluation import Pipeline, match_sequence
+from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
+from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
+from mfvpr.systems.settings import SettingsError
 from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """The inputs of a program.
+    """The inputs of a program."""
 
-    Attributes:
-        dataset: without neighbors of the queries, if the settings exclude them.
-        contents: of the image files, by side.
-        pipeline: finds and matches candidates.
-        cache: of the pipeline's results.
-        ground_truth: kind, files, unit and thresholds, as results store them.
-    """
-
-    dataset: Dataset
-    contents: Mapping[str, Contents]
+    dataset: Dataset  # without neighbors of the queries, if the settings exclude them
+    contents: Mapping[str, Contents]  # of the image files, by side
     pipeline: Pipeline
     cache: FeatureCache
-    ground_truth: dict[str, Any]
+    ground_truth: dict[str, Any]  # kind, files, unit and thresholds, as results store them
 
     @property
     def thresholds(self) -> list[float]:
@@ -49,6 +43,14 @@ class Inputs:
     def reading(self) -> dict[str, Any]:
         """Conversions of the images when they are read, by side."""
         return {side: contents.summary() for side, contents in self.contents.items()}
+
+    def protocol(self, split: Split | None) -> EvaluationProtocol:
+        """The protocol of rankings for sweeps and learning."""
+        if self.dataset.truth is None:
+            raise SettingsError(
+                "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
+            )
+        return evaluation_protocol(self.dataset.truth, self.thresholds, split)
 
     def match(self, watch: Stopwatch) -> tuple[MatchSet | Scales, Shortlist]:
         """Matches and shortlist of the only sequence, from their store if it has all of them."""

@@ -1,15 +1,15 @@
 """Learn scores on one half of the path, or on some data sets, and compare them with hand-set and searched ones."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
-from mfvpr.cli.inputs import Inputs, prepare
+from mfvpr.cli.inputs import prepare
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.datasets.contents import own_rows
+from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
@@ -32,7 +32,9 @@ class Prepared(NamedTuple):
     """A data set with its matches, and what they were made from."""
 
     part: Part
-    inputs: Inputs
+    contents: Mapping[str, Contents]  # of the image files, by side
+    recipe: dict[str, Any]
+    about: dict[str, Any]  # in results
 
 
 def learn(settings: dict[str, Any]) -> None:
@@ -53,9 +55,9 @@ def learn(settings: dict[str, Any]) -> None:
         heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command", "cluster")
-        about = {"data_sets": [*map(_about, teach)], "reported_sets": [*map(_about, report)]}
+        about = {"data_sets": [each.about for each in teach], "reported_sets": [each.about for each in report]}
         results = {
-            **(about if report else _about(teach[0])), **comparisons.comparison_json(comparison),
+            **(about if report else teach[0].about), **comparisons.comparison_json(comparison),
             "settings": {name: value for name, value in settings.items() if name not in left_out},
             "seconds": watch.seconds, "versions": versions(),
         }  # fmt: skip
@@ -69,8 +71,8 @@ def learn(settings: dict[str, Any]) -> None:
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.comparison_figures(comparison)
-        by_name = {data_set.part.name: data_set.inputs.ground_truth for data_set in report}
-        ground_truth = by_name if report else teach[0].inputs.ground_truth
+        by_name = {data_set.part.name: data_set.about["ground_truth"] for data_set in report}
+        ground_truth = by_name if report else teach[0].about["ground_truth"]
         run_folder.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 
@@ -88,10 +90,14 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
         raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     inputs = prepare(settings, watch)
-    protocol = truth.evaluation_protocol(inputs.dataset, inputs.thresholds, settings["split"])
+    protocol = inputs.protocol(settings["split"])
     matches, candidates = inputs.match(watch)
     assert not isinstance(matches, Scales)
-    return Prepared(Part(label(settings["dataset"]), protocol, matches, candidates), inputs)
+    part = Part(label(settings["dataset"]), protocol, matches, candidates)
+    return Prepared(part, inputs.contents, inputs.matches_recipe(), {
+        "dataset": inputs.dataset.name, "ground_truth": inputs.ground_truth,
+        "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
+    })  # fmt: skip
 
 
 def label(settings: dict[str, Any]) -> str:
@@ -102,26 +108,18 @@ def label(settings: dict[str, Any]) -> str:
 def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
     """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
-        sides = itertools.product(second.inputs.contents.values(), first.inputs.contents.values())
+        sides = itertools.product(second.contents.values(), first.contents.values())
         if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
             raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
                                 f"which is learned on; {same} are the same")  # fmt: skip
     for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
-        if same := sum(map(bool, own_rows(second.inputs.contents["query"], first.inputs.contents["query"]))):
+        if same := sum(map(bool, own_rows(second.contents["query"], first.contents["query"]))):
             raise SettingsError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
                                 "are the same, and would count twice")  # fmt: skip
     for first, second in itertools.combinations(report, 2):
-        if any(own_rows(second.inputs.contents["database"], first.inputs.contents["database"])):
+        if any(own_rows(second.contents["database"], first.contents["database"])):
             console.tell(f"warning: {first.part.name} and {second.part.name} are of one map, but their queries are "
                          "taken for independent, so that intervals are too narrow and p too low")  # fmt: skip
-
-
-def _about(data_set: Prepared) -> dict[str, Any]:
-    inputs = data_set.inputs
-    return {
-        "dataset": inputs.dataset.name, "ground_truth": inputs.ground_truth,
-        "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
-    }  # fmt: skip
 
 
 def _options(settings: dict[str, Any]) -> Options:
@@ -139,7 +137,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
         return None
     names = ("loss", "every", "patience", "batch", "learning_rate", "hidden", "inputs", "seed")
     recipe = {
-        "matches": [data_set.inputs.matches_recipe() for data_set in sets], "scorer": recipe_of(scorer),
+        "matches": [data_set.recipe for data_set in sets], "scorer": recipe_of(scorer),
         "tolerances": settings["recall"], **{name: settings[name] for name in names},
         "retrieval_score": settings["fusion"]["retrieval_score"], "positives": data.protocol.fingerprint,
         "reported": dict(data.protocol.reported_sets),
@@ -151,7 +149,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
 
 def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
     system = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
-    ground_truth = truth.in_words(*(data_set.inputs.ground_truth for data_set in report or teach))
+    ground_truth = truth.in_words(*(data_set.about["ground_truth"] for data_set in report or teach))
     if report:
         teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))
         return f"{teach_names}: {system}; what was learned here is reported on {report_names}; {ground_truth}"

@@ -1,25 +1,56 @@
-"""Localize images in a map: a line of JSON for each, and figures of some."""
+"""Maps: build one, add images, print what it holds; localize images, a line of JSON for each, with figures of some."""
 
 import json
 import time
 from collections.abc import Mapping
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli.console import tell
+from mfvpr.cli.console import tell, track
+from mfvpr.cli.inputs import dataset_of
 from mfvpr.cli.query_images import images
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
 from mfvpr.localization.declaration import read_declaration, read_system
 from mfvpr.report.runs import file_names
+from mfvpr.storage.disk import used_bytes
 from mfvpr.storage.maps import Entry
+from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime
 from mfvpr.utils.files import expand_user, printable
+
+
+def build_map(settings: dict[str, Any]) -> None:
+    """Map the database of a data set."""
+    robot_map = map_of_settings(settings)
+    added = robot_map.build(dataset_of(settings["dataset"]).database, track=track("images"))
+    print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
+
+
+def print_map(folder: Path) -> None:
+    """Print the number of images, the size on disk and the settings of a map."""
+    settings, robot_map = read_declaration(folder), Map.open(folder)
+    print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
+    print(json.dumps(settings, indent=1, ensure_ascii=False))
+
+
+def add_images(folder: Path, images: list[Path], place: str | None) -> None:
+    """Add image files to a map, one by one."""
+    robot_map = Map.open(folder)
+    for path in images:
+        robot_map.add(path, path.name if place is None else place)
+        print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
+
+
+def map_of_settings(settings: Mapping[str, Any]) -> Map:
+    """The map in the folder of the settings, which may be missing or empty."""
+    system = assembly.system({**settings, "cohort": None, "previous_queries": 0})
+    return Map(expand_user(settings["map"]), system)
 
 
 def localize(settings: dict[str, Any]) -> None:

@@ -75,8 +75,7 @@ def _note_candidates(candidates: int | str, ks: Sequence[int], available: int) -
     """Note that fewer candidates are available than `candidates` or `recall.ks` expect."""
     if isinstance(candidates, int) and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
-    deeper = [f"R@{k}" for k in ks if k > available]
-    if deeper:
+    if deeper := [f"R@{k}" for k in ks if k > available]:
         verb = "is" if len(deeper) == 1 else "are"
         tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of retrieval too: no more candidates are looked at")
 

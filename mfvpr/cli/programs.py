@@ -54,12 +54,12 @@ def _add_map_commands(parser: Parser) -> None:
     commands.add_parser("build", help="build map=DIR dataset=...: of the database of a data set")
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
-    command.set_defaults(run="mfvpr.cli.maps:print_map")
+    command.set_defaults(run="mfvpr.cli.localization:print_map")
     command = commands.add_parser("add", help="add images, one by one; other processes may localize meanwhile")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")
     command.add_argument("--place", help="where they were taken; by default their names")
-    command.set_defaults(run="mfvpr.cli.maps:add_images")
+    command.set_defaults(run="mfvpr.cli.localization:add_images")
 
 
 def _add_weights_commands(parser: Parser) -> None:

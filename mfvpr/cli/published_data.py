@@ -70,8 +70,8 @@ def check_data_set(name: str, settings: list[str], sheet: Path | None) -> None:
     target = sheet or Path(f"{dataset.name}.png")
     contact_sheet(target, dataset)
     print(f"pairs of images: {target}")
-    bad = sum(map(len, unreadable))
-    if wrong := [*published_differences(dataset), *([f"{bad:,} images cannot be read"] if bad else [])]:
+    unread = [f"{bad:,} images cannot be read"] if (bad := sum(map(len, unreadable))) else []
+    if wrong := [*published_differences(dataset), *unread]:
         refuse(f"{dataset.name}: {'; '.join(wrong)}")
 
 

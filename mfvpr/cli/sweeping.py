@@ -22,7 +22,7 @@ def sweep(settings: dict[str, Any]) -> None:
     with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         axes, watch = search_axes(settings), Stopwatch()
         inputs = prepare(settings, watch)
-        protocol = truth.evaluation_protocol(inputs.dataset, inputs.thresholds, settings["split"])
+        protocol = inputs.protocol(settings["split"])
         matches, candidates = inputs.match(watch)
         blocks = _block_folder(settings, inputs)
         options = SweepOptions(

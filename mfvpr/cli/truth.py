@@ -1,26 +1,13 @@
 """Ground truth of a recall: its source, its thresholds, and their words in results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from mfvpr import evaluation
 from mfvpr.datasets import Dataset
-from mfvpr.evaluation import EvaluationProtocol
-from mfvpr.evaluation.protocol import Split
-from mfvpr.systems.settings import SettingsError
 
 _FILES = ("index_file", "query_labels", "database_labels")
 _WORDS = {"order": "file order", "utm": "positions in the names", "drawn": "drawn with the images",
           "published": "as published"}  # fmt: skip
-
-
-def evaluation_protocol(dataset: Dataset, thresholds: Sequence[float], split: Split | None) -> EvaluationProtocol:
-    """The protocol of rankings for sweeps and learning."""
-    if dataset.truth is None:
-        raise SettingsError(
-            "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
-        )
-    return evaluation.evaluation_protocol(dataset.truth, thresholds, split)
 
 
 def describe(choice: Mapping[str, Any], recall: Mapping[str, Any], dataset: Dataset) -> dict[str, Any]:

@@ -62,10 +62,14 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
     with reading(path, "an image file", "replace or remove it"):
         if path.stat().st_size == 0:
             raise InputError("expected an image file, got 0 bytes; replace or remove it")
-        with Image.open(path) as image:
+        limit = f"expected at most {MAX_PIXELS // 10**6} megapixels"
+        try:
+            image = Image.open(path)
+        except Image.DecompressionBombError:
+            raise InputError(f"{limit}, got several times as many; shrink the image") from None
+        with image:
             if image.width * image.height > MAX_PIXELS:
-                size = f"{image.width} x {image.height} px"
-                raise InputError(f"expected at most {MAX_PIXELS // 10**6} megapixels, got {size}; shrink the image")
+                raise InputError(f"{limit}, got {image.width} x {image.height} px; shrink the image")
             used = _bits_in_use(image, bits)
             if used is None and bits is not None and image.mode in ("I", "F"):
                 raise InputError("expected 8 or 16 bits a channel, got 32, of unknown range; convert it")

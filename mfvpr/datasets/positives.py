@@ -156,7 +156,7 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
     """Database rows int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
     query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
-    tree = scipy.spatial.KDTree(database_xy)
+    tree = scipy.spatial.KDTree(database_xy.reshape(-1, 2))
     for first in range(0, len(query_xy), _QUERIES_AT_A_TIME):
         block = query_xy[first : first + _QUERIES_AT_A_TIME]
         for rows in tree.query_ball_point(block, radius, return_sorted=True):

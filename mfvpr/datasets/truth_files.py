@@ -105,7 +105,7 @@ def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[s
 
 
 def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | dict[str, np.ndarray]:
-    arrays = read_npz(path)
+    arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
     if {"utmQ", "utmDb"} <= arrays.keys():
         return {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
     if {"query", "database"} <= arrays.keys():
@@ -114,7 +114,9 @@ def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | dict[str, np.ndarray]:
             shapes = f"{query.shape} and {database.shape}"
             raise InputError(f"{path}: expected query and database of one length, got {shapes}")
         return list(zip(query.tolist(), database.tolist(), strict=True))
-    raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {shorten(', '.join(arrays))}")
+    raise InputError(
+        f"{path}: expected arrays query and database, or utmQ and utmDb; got {shorten(', '.join(arrays)) or 'neither'}"
+    )
 
 
 def _json_pairs(path: Path) -> list[tuple[Any, Any]]:

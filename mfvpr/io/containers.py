@@ -51,8 +51,8 @@ def choose_reader(path: Path, readers: Mapping[str, Callable]) -> Callable:
 @contextmanager
 def reading(path: Path, kind: str = "a file", mend: str = "is it whole, and of this kind?") -> Iterator[None]:
     """Require a regular file, and turn any error of its reader into an InputError of one line with the path."""
-    require_file(path, kind)
     try:
+        require_file(path, kind)
         yield
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
@@ -63,8 +63,9 @@ def reading(path: Path, kind: str = "a file", mend: str = "is it whole, and of t
 
 def shorten(text: str, limit: int = 60) -> str:
     """Text of a file in at most `limit` printable characters, for messages."""
-    text = text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text
-    return text if len(text) <= limit else f"{text[: limit - 20]}... ({len(text)} characters)"
+    start = text[: limit + 1]
+    start = start if start.isprintable() else start.encode("unicode_escape").decode("ascii")
+    return start if len(start) <= limit else f"{start[: limit - 20]}... ({len(text)} characters)"
 
 
 def require_plain(where: str, dtype: np.dtype) -> None:

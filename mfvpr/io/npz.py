@@ -81,11 +81,11 @@ class NpzFolder(Container):
         return FileEntry(self._paths[image], "")
 
 
-def read_npz(path: Path, parts: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays, or those among `parts`, of an archive; InputError if it is damaged, or holds objects."""
+def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
+    """Read the arrays of an archive among `parts`, and no others; InputError if it is damaged, or holds objects."""
     with _open_archive(path) as archive:
         members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-        return {part: _array(archive, members[part]) for part in parts or members if part in members}
+        return {part: _array(archive, members[part]) for part in parts if part in members}
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:

@@ -30,7 +30,13 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     threshold = middle(sequence.truth.thresholds())
     [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
     [positives] = result.positives(threshold)
-    return fit_confidence(confidence_inputs(ranked, by_retrieval), positives.contains(ranked.rows)[:, 0])
+    is_correct = positives.contains(ranked.rows)[:, 0]
+    confidence = fit_confidence(confidence_inputs(ranked, by_retrieval), is_correct)
+    if not any(confidence.weights) and not is_correct.all():
+        raise InputError(f"{sequence.images.root}: expected scores that tell correct predictions from incorrect ones, "
+                         f"got {is_correct.sum()} correct of {len(is_correct)}, which all would have the same "
+                         "confidence; calibrate on a longer drive")  # fmt: skip
+    return confidence
 
 
 def write_confidence(folder: Path, system: System, confidence: Confidence) -> None:

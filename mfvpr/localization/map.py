@@ -109,10 +109,10 @@ class Map(MapImages):
         """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
         images = images if isinstance(images, ImageFolder) else image_folder(images)
         known = cls(folder, system, runtime=runtime)
-        added = known.build(images, places, cache=cache, track=runtime.progress("images"))
-        if added < len(images):
-            runtime.log(f"{folder}: has {len(images) - added} of {len(images)} images already, by their names, and "
-                        "keeps them; make another map if their content is new")  # fmt: skip
+        if same := len({*known.names} & {*images.names}):
+            runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; make "
+                        "another map if their content is new")  # fmt: skip
+        known.build(images, places, cache=cache, track=runtime.progress("images"))
         return known
 
     def calibrate(

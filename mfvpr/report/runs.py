@@ -93,7 +93,7 @@ def _clear(folder: Path, only_runs: bool) -> None:
             else:
                 path.unlink()
     elif names - {_UNFINISHED}:
-        raise InputError(f"{folder}: expected a new or empty run folder; remove it, or name another")
+        raise InputError(f"{folder}: expected a new or empty run folder; name another")
     shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
     with tempfile.TemporaryFile(dir=folder):
         pass

@@ -1,7 +1,7 @@
 """Search by global descriptors -> Shortlist: exact, in chunks, optionally after whitening."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -81,38 +81,52 @@ class WhitenedSearch:
         dimension: D', number of components.
         max_samples: maximum number of descriptors to learn from, evenly spread over the database.
         search: search among the whitened descriptors.
-        whitening: of the database, by `fit`.
     """
 
     dimension: int
     max_samples: int = 4096
     search: ExactSearch = EXACT
-    whitening: Whitening | None = field(default=None, metadata={"recipe": False})
 
     def __post_init__(self) -> None:
         if self.dimension < 1:
             raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
-    def fit(self, database: Database) -> "WhitenedSearch":
+    def fit(self, database: Database) -> "Whitened":
         """Search with the principal components of a database."""
         usable = database[np.isfinite(database).all(axis=1)]
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
         sample = usable[rows].astype(np.float64)
         fitted = fit_whitening(sample, self.dimension)
         single = Whitening(fitted.mean.astype(np.float32), fitted.components.astype(np.float32))
-        return replace(self, whitening=single)
+        return Whitened(single, self.search)
 
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """As `ExactSearch.shortlist`; learns from the database first unless it is fitted."""
-        if self.whitening is None:
-            return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
+        """As `ExactSearch.shortlist`; learns from the database first."""
+        return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """`WhitenedSearch` with components that were learned."""
+
+    whitening: Whitening
+    search: ExactSearch
+
+    def fit(self, database: Database) -> "Whitened":
+        """Return itself: the components are known."""
+        return self
+
+    def shortlist(
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """As `ExactSearch.shortlist`."""
         queries, database = _whiten(queries, self.whitening), _whiten(database, self.whitening)
         return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
 
 
-Search = ExactSearch | WhitenedSearch
+Search = ExactSearch | WhitenedSearch | Whitened
 
 
 def _whiten(rows: np.ndarray, whitening: Whitening) -> Float[np.ndarray, "images dimensions"]:

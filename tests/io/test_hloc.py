@@ -24,7 +24,7 @@ def test_float32_comes_back_exactly_in_the_order_of_the_names(path):
     source = open_features(path, NAMES[::-1])
     assert source.counts.tolist() == [40] * 3
     assert source.counts.dtype == np.int32
-    assert (len(source), source.dimension, source.scored, source.paths) == (3, 16, True, (path,))
+    assert (len(source), source.dimension, source.scored) == (3, 16, True)
     for (row, features), expected in zip(source.read(), written[::-1], strict=True):
         assert_equal(features, expected)
         assert 0 <= row < 3

@@ -37,7 +37,6 @@ def test_files_of_d2net_beside_their_images(tmp_path):
         (tmp_path / name).write_bytes(b"the image itself")
     source = open_features(tmp_path, names[::-1], image_size=SIZE)
     assert source.counts.tolist() == [30] * 3
-    assert source.paths == tuple(tmp_path / f"{name}.d2-net" for name in names[::-1])
     for (_, features), expected in zip(source.read(), written[::-1], strict=True):
         assert_equal(features, expected)
     with pytest.raises(InputError, match=r"b/1\.jpg: expected image_size"):
@@ -61,7 +60,6 @@ def test_one_for_all(tmp_path):
     np.savez_compressed(tmp_path / "all.npz", **named_parts(dict(zip(names, written, strict=True))))
     source = open_features(tmp_path / "all.npz", names)
     assert source.counts.tolist() == [5, 6, 7]
-    assert source.paths == (tmp_path / "all.npz",)
     for row, features in source.read([2, 0, 1]):
         assert_equal(features, written[row])
 

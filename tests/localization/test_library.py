@@ -109,6 +109,14 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
 
 
+def test_a_confidence_that_tells_nothing_is_refused(street, small_street, tmp_path):
+    rows = ["query,database", *(f"{row:04d}.png,{(row + 5) % 10:04d}.png" for row in range(10))]
+    (tmp_path / "far.csv").write_text("\n".join(rows))
+    truth = mfvpr.datasets.IndexFile(tmp_path / "far.csv")
+    with pytest.raises(InputError, match="got 0 correct of 10, which all would have the same confidence"):
+        street.calibrate(small_street / "database", small_street / "queries", ground_truth=truth)
+
+
 def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
     known.calibrate(small_street / "database", small_street / "queries")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import maps, query_images
+from mfvpr.cli import localization, query_images
 from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.images import read_frames
 from mfvpr.evaluation import write_confidences
@@ -185,7 +185,7 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
 
 def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
     settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    first, second = map(maps.map_of_settings, settings)
+    first, second = map(localization.map_of_settings, settings)
     images = image_folder(small_street / "database")
     second.build(images)
     with pytest.raises(InputError, match="was made with other candidates"):

@@ -102,8 +102,7 @@ def _images(folder: Path, root: Path) -> Iterator[tuple[str, tuple[float, float]
                          "again")  # fmt: skip
     for key, line in processed.items():
         try:
-            is_panorama, is_of_all = (_FLAGS[text.strip().lower()] for text in (raw[key]["pano"], tasks[key]["all"]))
-            if is_panorama or not is_of_all:
+            if _FLAGS[raw[key]["pano"].strip().lower()] or not _FLAGS[tasks[key]["all"].strip().lower()]:
                 continue
             position = parse_number(line["easting"]), parse_number(line["northing"])
             if not all(abs(meters) <= FARTHEST for meters in position):  # NaN neither

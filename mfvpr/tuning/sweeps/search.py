@@ -67,9 +67,11 @@ class Outcome:
 
     @cached_property
     def _tuning(self) -> Float[np.ndarray, "halves settings"]:
-        """Recall@1 on the queries to choose on, of the settings that may be chosen."""
-        size = self.axes.size if self.is_grid else len(self.settings)
-        return self.protocol.tuning(self.rows)[:, :size, self.protocol.main]
+        """Recall@1 on the queries to choose on; below 0 for the scorer's own values where they are no choice."""
+        recall = self.protocol.tuning(self.rows)[..., self.protocol.main]
+        if self.is_grid:
+            return recall[:, : self.axes.size]
+        return np.where(np.arange(len(self.settings)) == self.own, -1.0, recall)
 
     def _choose(self, recall: Float[np.ndarray, " settings"]) -> int:
         return best_setting(recall, self.axes.values if self.is_grid else None)

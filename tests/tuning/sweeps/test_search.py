@@ -141,7 +141,8 @@ def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_c
     outcome = sweeping.search_optuna(axes, protocol, *data, sweeping.SweepOptions(ks=[1]), trials=3, seed=1)
     assert outcome.settings[0] == axes.own
     assert outcome.rows.shape == (3, 4, QUERIES, 1)
-    assert outcome.chosen == np.argmax(outcome.protocol.tuning(outcome.rows)[..., 1], axis=1).tolist()
+    trials = outcome.protocol.tuning(outcome.rows)[:, 1:, 1]  # the own values are no choice
+    assert outcome.chosen == (1 + np.argmax(trials, axis=1)).tolist()
     [(name, draw)] = sweeps.sweep_figures(outcome)
     draw(tmp_path / name)
     assert np.asarray(Image.open(tmp_path / "trials.png").convert("RGB")).std() > 20
