@@ -243,7 +243,7 @@ def twice(path):
         ),
         ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [2, 2]"),
         ("gt.npz", {"query": np.arange(2), "database": np.arange(3)}, "of one length"),
-        ("gt.npz", {"other": np.zeros(2)}, "got none of them"),
+        ("gt.npz", {"other": np.zeros(2)}, "got neither"),
         ("gt.npz", twice, "got query.npy again"),
         ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
         ("gt.csv", os.mkfifo, "got a pipe"),
