@@ -24,7 +24,7 @@ from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
 from mfvpr.systems import assembly, settings
 from mfvpr.systems.settings import CONF
-from mfvpr.tuning.learning.parameters import can_learn, starts
+from mfvpr.tuning.learning.models import can_learn, first_numbers
 from mfvpr.types import Array, Matches
 from tests.programs import composed
 
@@ -157,9 +157,13 @@ def test_plain_values_become_the_fields(near):
 
 def test_where_learning_starts_follows_from_the_fields():
     assert [name for name, scorer in SCORERS.items() if can_learn(scorer)] == ["sum", "anchor", "histogram"]
-    assert starts(HistogramOfShifts(sigma=7.0), 2.0) == {"sigma": 7.0, "temperature": 0.2}  # of the spread
-    assert starts(AnchorPoints(temperature=0.5), 2.0) == {"tolerance": 3.0, "temperature": 0.5}
-    assert starts(AnchorPoints(), 2.0) == {"tolerance": 3.0, "temperature": 0.03}
-    assert starts(AggregatedScore(), 2.0) == {"temperature": 1.0}
+    for scorer, expected in {
+        HistogramOfShifts(sigma=7.0): {"sigma": 7.0, "temperature": 0.2},  # of the spread
+        AnchorPoints(temperature=0.5): {"tolerance": 3.0, "temperature": 0.5},
+        AnchorPoints(): {"tolerance": 3.0, "temperature": 0.03},
+        AggregatedScore(): {"temperature": 1.0},
+    }.items():
+        values = {name: float(jnp.exp(number)) for name, number in first_numbers(scorer, 2.0).items()}
+        assert values == pytest.approx(expected)
     searched = axes.learning_axes(composed("scorer=anchor", config="learn"))
     assert {*searched.without("c").values} == {"window", "tolerance", "weight"}

@@ -14,7 +14,7 @@ from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
-from mfvpr.storage import FeatureCache, features, vectors
+from mfvpr.storage import FeatureCache, features
 from mfvpr.utils import InputError
 from tests.builders import evaluate_parts, read_golden
 from tests.features.conftest import read_rows
@@ -125,7 +125,7 @@ def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs,
     extractor = PatchNetVladFeatures(_vacant(outputs), size, patch_sizes=patch_sizes)
     numbers = extractor.vector_size + sum(scale.dimension * scale.typical_count for scale in extractor.scales)
     assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
-    stored = vectors.forecast_bytes(images, extractor.vector_size)
+    stored = features.forecast_vector_bytes(images, extractor.vector_size)
     stored += sum(features.forecast_bytes(images, scale.typical_count, scale.dimension) for scale in extractor.scales)
     assert stored / 2**20 == pytest.approx(printed / 2, rel=0.03)
 
