@@ -1,34 +1,72 @@
-"""Draw the pictures of the README into notebooks/pictures: `python notebooks/draw_pictures.py`.
+"""Run the notebooks, keep their output, and draw the pictures of the README: `python notebooks/build.py`.
 
-The first is made with the code of the first notebook, the second by `mfvpr evaluate`.
+A notebook keeps a hash of the code that its output is of.
 """
 
-import json
+import base64
+import hashlib
+import io
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
 matplotlib.use("agg")
 
 import matplotlib.pyplot as plt
+import nbformat
 import numpy as np
+from nbclient import NotebookClient
 from PIL import Image
 
 FOLDER = Path(__file__).parent
 PICTURES = FOLDER / "pictures"
+RUN_OF = "code_sha256"  # the notebook's metadata
 CORRECT, INCORRECT = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+
+
+def run_notebook(path: Path) -> None:
+    """Execute a notebook in an empty folder, and keep its output with small pictures."""
+    notebook = nbformat.read(path, as_version=4)
+    with tempfile.TemporaryDirectory() as folder:
+        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": folder}}).execute()
+    for cell in notebook.cells:
+        cell.metadata = {}
+        for output in cell.get("outputs", ()):
+            if "image/png" in output.get("data", {}):
+                output.metadata = {}
+                image = Image.open(io.BytesIO(base64.b64decode(output.data["image/png"])))
+                output.data["image/png"] = base64.b64encode(small(image)).decode()
+                output.data["text/plain"] = "<Figure>"
+    notebook.metadata = {"kernelspec": notebook.metadata.kernelspec, RUN_OF: code_hash(notebook)}
+    nbformat.write(notebook, path)
+
+
+def code_hash(notebook: nbformat.NotebookNode) -> str:
+    """The hash of all code of a notebook."""
+    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    return hashlib.sha256(code.encode()).hexdigest()
+
+
+def small(image: Image.Image) -> bytes:
+    """A PNG of 64 colors, at most 960 px wide: below 100 kB."""
+    image = image.convert("RGB")
+    if image.width > 960:
+        image = image.resize((960, round(960 * image.height / image.width)), Image.Resampling.LANCZOS)
+    content = io.BytesIO()
+    image.quantize(64).save(content, "png", optimize=True)
+    return content.getvalue()
 
 
 def draw_reranking() -> None:
     """The query of the first notebook, its candidates before and after re-ranking, and the histogram of shifts."""
-    notebook = json.loads((FOLDER / "1_rerank_one_query.ipynb").read_text())
-    names: dict = {}
-    for cell in notebook["cells"]:
-        if cell["cell_type"] == "code":
-            exec("".join(cell["source"]), names)
+    notebook, names = nbformat.read(FOLDER / "1_rerank_one_query.ipynb", as_version=4), dict[str, Any]()
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            exec(cell.source, names)
     plt.close("all")
     figure = plt.figure(figsize=(12, 4.2), layout="constrained")
     grid = figure.add_gridspec(2, 7, width_ratios=(2.1, 1, 1, 1, 1, 0.1, 2.4))
@@ -46,7 +84,8 @@ def draw_reranking() -> None:
     panel.invert_yaxis()
     figure.suptitle("blue: correct, orange: incorrect", fontsize=10)
     figure.canvas.draw()
-    save(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())), "reranking.png")
+    picture = Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))
+    (PICTURES / "reranking.png").write_bytes(small(picture))
 
 
 def show(panel: plt.Axes, image: np.ndarray, title: str, color: str = "black") -> None:
@@ -65,17 +104,11 @@ def draw_run() -> None:
             [sys.executable, "-c", "from mfvpr.cli.programs import main; main()", "evaluate", *settings], check=True
         )
         [figure] = Path(folder, "run", "figures").glob("*correct*.png")
-        save(Image.open(figure), "run.png")
-
-
-def save(image: Image.Image, name: str) -> None:
-    """Write a picture with 128 colors, at most 1000 px wide."""
-    image = image.convert("RGB")
-    if image.width > 1000:
-        image = image.resize((1000, round(1000 * image.height / image.width)), Image.Resampling.LANCZOS)
-    image.quantize(128).save(PICTURES / name, optimize=True)
+        (PICTURES / "run.png").write_bytes(small(Image.open(figure)))
 
 
 if __name__ == "__main__":
+    for path in sorted(FOLDER.glob("*.ipynb")):
+        run_notebook(path)
     draw_reranking()
     draw_run()
