@@ -248,7 +248,7 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
         shutil.copy(dataset.database.root / name, tmp_path)
     (tmp_path / dataset.database.names[1]).write_bytes(b"no image")
     folder = ImageFolder(tmp_path, dataset.database.names[:3])
-    with pytest.raises(InputError, match=r"0001\.png: .*read as an image .*skip"):
+    with pytest.raises(InputError, match=r"0001\.png: .*cannot be read .*skip"):
         fit_to_database(cells, folder, FeatureCache(tmp_path / "strict"))
     assert not kept(tmp_path / "strict")
     learned = fit_to_database(cells, folder, FeatureCache(tmp_path / "s", skip_bad=True))
