@@ -1,6 +1,7 @@
 """`mfvpr weights` as a user types it."""
 
 import hashlib
+import json
 import signal
 import subprocess
 import sys
@@ -171,6 +172,11 @@ def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path):
     save(REGISTRY["tiny"], arrays, tmp_path / "tiny.pth", parameters=PARAMETERS)
     assert program("verify", "tiny")[0] == 0
     path = folder / "tiny.safetensors"
+    manifest = path.with_suffix(".json")
+    before = manifest.read_text()
+    manifest.write_text(json.dumps(json.loads(before) | {"parameters": 1}))
+    assert program("verify")[1] == f"tiny: BAD, expected {PARAMETERS} parameters, got 1\n"
+    manifest.write_text(before)
     content = bytearray(path.read_bytes())
     content[-1] ^= 4
     path.write_bytes(content)

@@ -52,7 +52,7 @@ def test_order(folders):
     ("csv", "\ufeffquery,database\r\n0,2\r\n1,\r\n0,0\r\n"),
     ("json", json.dumps([[0, [2, 0]], [1, []]])),
     ("npz", {"query": np.array([0, 1, 0]), "database": np.array(["2", "", "0.png"])}),
-    ("npz", {"utmQ": np.array([[0, 0], [60, 0]]), "utmDb": np.array([[0, 25], [0, 26], [25, 0]])}),
+    ("npz", {"utmQ": np.array([[0, 0], [60, 0]]), "utmDb": np.array([[0, 25], [0, 26], [25, 0]]), "other": None}),
 ])  # fmt: skip
 def test_pairs_or_positions_of_a_file(folders, tmp_path, suffix, content):
     path = tmp_path / f"gt.{suffix}"

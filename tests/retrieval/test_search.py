@@ -10,7 +10,8 @@ from mfvpr.datasets import Positives
 from mfvpr.retrieval import ExactSearch, WhitenedSearch
 from mfvpr.retrieval import search as retrieval
 from mfvpr.retrieval.search import EXACT
-from mfvpr.utils import InputError
+from mfvpr.utils import InputError, recipe_of
+from mfvpr.utils.fingerprints import fingerprint
 from tests import oracles
 from tests.builders import unit
 from tests.shapes import unchecked_shapes
@@ -72,6 +73,15 @@ def test_a_whitened_query_has_the_same_bits_alone_and_in_company():
     for row in range(5):
         alone = search.shortlist(queries[row : row + 1], database, 9)
         np.testing.assert_array_equal(alone.scores[0], together.scores[row])
+
+
+def test_a_fitted_whitening_is_kept_and_told_apart():
+    rng = np.random.default_rng(2)
+    here, there = unit(rng.normal(size=(30, 8))), unit(rng.normal(size=(30, 8)))
+    fitted = WhitenedSearch(3).fit(here)
+    assert fitted.fit(there) is fitted
+    recipes = [recipe_of(search) for search in (fitted, WhitenedSearch(3).fit(there), WhitenedSearch(3))]
+    assert len({fingerprint(recipe) for recipe in recipes}) == 3
 
 
 @given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))
