@@ -1,5 +1,6 @@
 """The confidence of a map: fitted on a drive whose places are known, and kept in the folder of the map."""
 
+import warnings
 from pathlib import Path
 
 from mfvpr.datasets.datasets import Dataset
@@ -33,9 +34,8 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     is_correct = positives.contains(ranked.rows)[:, 0]
     confidence = fit_confidence(confidence_inputs(ranked, by_retrieval), is_correct)
     if not any(confidence.weights) and not is_correct.all():
-        raise InputError(f"{sequence.images.root}: expected scores that tell correct predictions from incorrect ones, "
-                         f"got {is_correct.sum()} correct of {len(is_correct)}, which all would have the same "
-                         "confidence; calibrate on a longer drive")  # fmt: skip
+        warnings.warn(f"{sequence.images.root}: scores do not tell correct predictions ({is_correct.sum()} of "
+                      f"{len(is_correct)}) from incorrect ones; calibrate on a longer drive", stacklevel=3)  # fmt: skip
     return confidence
 
 
