@@ -42,7 +42,7 @@ from .reranking.ranking import balancing_c, combine, rank, rerank, score_candida
 # data sets, what is correct, and recall
 from . import datasets
 from .datasets.positives import frame_positives, radius_positives
-from .evaluation.precision import recall_at_k
+from .evaluation.metrics import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
 from .cli.systems import load_system

@@ -30,7 +30,7 @@ __all__ = [
 
 from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
 from .evaluation import RankedDataset, Recall, rank_dataset
-from .precision import hits, precision_recall, recall_at_k, reliability
+from .metrics import hits, precision_recall, recall_at_k, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.precision import count_correct
+from mfvpr.evaluation.metrics import count_correct
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
 from mfvpr.evaluation.validation import score_warnings

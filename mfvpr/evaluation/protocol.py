@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, threshold_words
-from mfvpr.evaluation.precision import hits
+from mfvpr.evaluation.metrics import hits
 from mfvpr.evaluation.selection import Half, halves, places_along_path
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError

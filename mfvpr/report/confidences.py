@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from mfvpr.evaluation.calibration import fit_confidence, write_confidences
 from mfvpr.evaluation.evaluation import Reason
-from mfvpr.evaluation.precision import chance_calibration_error, reliability
+from mfvpr.evaluation.metrics import chance_calibration_error, reliability
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure

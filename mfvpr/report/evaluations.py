@@ -14,7 +14,7 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Unit, middle, threshold_words
 from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence
 from mfvpr.evaluation.evaluation import KS, RankedDataset, Recall
-from mfvpr.evaluation.precision import PrecisionRecall, precision_recall
+from mfvpr.evaluation.metrics import PrecisionRecall, precision_recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table

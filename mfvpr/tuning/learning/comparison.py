@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.evaluation.precision import hits
+from mfvpr.evaluation.metrics import hits
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.matching.match_set import MatchSet

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.evaluation import precision_recall, reliability
-from mfvpr.evaluation.precision import chance_calibration_error
+from mfvpr.evaluation.metrics import chance_calibration_error
 from mfvpr.utils import InputError
 
 
