@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from mfvpr.cli.console import tell
 from mfvpr.cli.inputs import Inputs
+from mfvpr.datasets.contents import fingerprints
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation import Confidence, System, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
@@ -41,7 +42,7 @@ def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> Co
     if headline not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
                             f"{', '.join(file.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
-    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), inputs.fingerprints))
+    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), fingerprints(inputs.contents)))
     if before & now:
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
     if not any(file.systems[headline].weights):
@@ -75,9 +76,9 @@ def _threshold(inputs: Inputs) -> list[Any] | None:
     return [middle(inputs.thresholds), inputs.ground_truth["unit"]] if inputs.thresholds else None
 
 
-def _query_fingerprints(fingerprints: Any) -> set[str]:
+def _query_fingerprints(by_side: Any) -> set[str]:
     """Fingerprints of the folders with queries; a database may be that of many runs."""
-    sides = fingerprints.items() if isinstance(fingerprints, Mapping) else ()
+    sides = by_side.items() if isinstance(by_side, Mapping) else ()
     return {folder for side, folder in sides if side != "database" and isinstance(folder, str)}
 
 

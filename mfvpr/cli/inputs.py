@@ -34,16 +34,6 @@ class Inputs:
         """Thresholds of a correct prediction, ascending; empty without ground truth."""
         return self.ground_truth.get("thresholds", [])
 
-    @property
-    def fingerprints(self) -> dict[str, str]:
-        """Fingerprints of all folders, by side."""
-        return {side: contents.fingerprint for side, contents in self.contents.items()}
-
-    @property
-    def reading(self) -> dict[str, Any]:
-        """Conversions of the images when they are read, by side."""
-        return {side: contents.summary() for side, contents in self.contents.items()}
-
     def protocol(self, split: Split | None) -> EvaluationProtocol:
         """The protocol of rankings for sweeps and learning."""
         if self.dataset.truth is None:

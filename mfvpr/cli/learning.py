@@ -9,7 +9,7 @@ from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.inputs import prepare
 from mfvpr.cli.overrides import compose_data_sets
-from mfvpr.datasets.contents import Contents, own_rows
+from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.scoring import Scorer
@@ -96,7 +96,7 @@ def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     part = Part(label(settings["dataset"]), protocol, matches, candidates)
     return Prepared(part, inputs.contents, inputs.matches_recipe(), {
         "dataset": inputs.dataset.name, "ground_truth": inputs.ground_truth,
-        "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
+        "data_fingerprint": fingerprints(inputs.contents), "reading": readings(inputs.contents),
     })  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from mfvpr.cli.console import tell
 from mfvpr.datasets import Dataset, QuerySequence
-from mfvpr.datasets.contents import Contents, OwnRows, own_rows
+from mfvpr.datasets.contents import Contents, OwnRows, fingerprints, own_rows, readings
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.sequence_matching import num_candidates
@@ -33,7 +33,7 @@ def tell_peculiarities(
     _note_candidates(settings["candidates"], settings["recall"]["ks"], available)
     weights = {values.get("weight", "fs") for values in assembly.by_scorer(settings["scorer"]).values()}
     for name in sorted(weights | {*((settings.get("grid") or {}).get("weight") or ())}):
-        _warn_of_weight(name, settings, dataset.name, {content.fingerprint for content in contents.values()})
+        _warn_of_weight(name, settings, dataset.name, {*fingerprints(contents).values()})
 
 
 def _warn_of_sequence(sequence: QuerySequence, same_images: OwnRows, thresholds: Sequence[float]) -> None:
@@ -57,13 +57,13 @@ def _warn_of_sequence(sequence: QuerySequence, same_images: OwnRows, thresholds:
 
 def _warn_of_reading(contents: Mapping[str, Contents], bits: int | None) -> None:
     """Note conversions of the images, and warn of 16-bit images whose range does not fit."""
-    readings = {side: content.summary() for side, content in contents.items()}
-    for side, reading in readings.items():
+    by_side = readings(contents)
+    for side, reading in by_side.items():
         if reading["turned"]:
             tell(f"note: {reading['turned']} {side} images are turned as their EXIF orientation says")
         if reading["scaled_16bit"]:
             tell(f"note: {reading['scaled_16bit']} 16-bit {side} images are scaled to 8 bits")
-    largest = max(reading["largest_16bit"] or 0 for reading in readings.values())
+    largest = max(reading["largest_16bit"] or 0 for reading in by_side.values())
     used = max(largest.bit_length(), 8)
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"

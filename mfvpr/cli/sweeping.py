@@ -7,6 +7,7 @@ from typing import Any
 from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare
+from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
@@ -70,9 +71,9 @@ def _heading(settings: dict[str, Any], inputs: Inputs, outcome: Outcome) -> str:
 
 def _results(settings: dict[str, Any], inputs: Inputs, outcome: Outcome, seconds: dict[str, float]) -> dict[str, Any]:
     return {
-        "dataset": inputs.dataset.name, "data_fingerprint": inputs.fingerprints, "reading": inputs.reading,
-        "scorer": settings["scorer"], "features": settings["features"], "retrieval": settings["retrieval"],
-        "matching": settings["matching"], "candidates": settings["candidates"], "fusion": settings["fusion"],
-        "final": settings["final"], "ground_truth": inputs.ground_truth,
+        "dataset": inputs.dataset.name, "data_fingerprint": fingerprints(inputs.contents),
+        "reading": readings(inputs.contents), "scorer": settings["scorer"], "features": settings["features"],
+        "retrieval": settings["retrieval"], "matching": settings["matching"], "candidates": settings["candidates"],
+        "fusion": settings["fusion"], "final": settings["final"], "ground_truth": inputs.ground_truth,
         **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

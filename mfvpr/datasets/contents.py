@@ -99,6 +99,16 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     return Contents(folder, tuple(files[name] for name in folder.names))
 
 
+def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
+    """Fingerprints of all folders, by side."""
+    return {side: folder.fingerprint for side, folder in contents.items()}
+
+
+def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
+    """Conversions of the images when they are read, by side."""
+    return {side: folder.summary() for side, folder in contents.items()}
+
+
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
     """For each query, the database rows of files with the same content."""
     rows = defaultdict(list)

@@ -118,7 +118,8 @@ class RankedDataset:
                 [count_correct(ranking.rows, positives[sequence], ks) for positives in by_threshold]
                 for sequence, ranking in enumerate(rankings)
             ]
-            return Recall(np.array(correct), np.array([len(ranking.rows) for ranking in rankings]))
+            shape = len(rankings), len(by_threshold), len(ks)
+            return Recall(np.array(correct, int).reshape(shape), np.array([len(ranking.rows) for ranking in rankings]))
 
         return {name: count(rankings) for name, rankings in self.systems.items()}
 

@@ -107,7 +107,7 @@ def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mappin
 def stored_matches(
     store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
 ) -> tuple[MatchSet, Shortlist]:
-    """Read matches and their shortlist from a store, NumPy; more than `memory` GB of them are read at every use."""
+    """Matches and shortlist from a store, NumPy; more than `memory` GB (None: a third of what is free) stay on disk."""
     rows = range(len(store.done)) if rows is None else rows
     if not (done := store.done[[*rows]]).all():
         raise InputError(

@@ -129,7 +129,7 @@ class SsmCells(_WhitenedWindows):
         InputError: images of this size have no cells.
     """
 
-    vector_size, stage = 0, 2  # no global descriptor
+    vector_size, stage = 0, 2  # no global descriptor; the second stage's map
     model: SsmVgg
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"

@@ -30,7 +30,7 @@ class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
 
     extractor: Extractor  # of local features of one scale
-    describer: Extractor | Aggregation  # of global descriptors: the same extractor, another, or of local features
+    describer: Extractor | Aggregation  # of global descriptors; may be the same extractor
 
     @property
     def recipe(self) -> dict[str, Any]:

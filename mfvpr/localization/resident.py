@@ -30,7 +30,7 @@ class Resident:
     def __init__(self, rows: MapRows, *, typical: int, candidates: int, memory: float | None) -> None:
         """Read nothing yet; there will be at least two slots for each of a query's candidates.
 
-        `typical` is the number of keypoints of an image, at most if the detector limits it; `memory` is in GB.
+        `typical` is the usual number of keypoints of an image, or the detector's limit; `memory` is in GB.
         """
         self._rows, self._typical = rows, round_up(typical, STEP)
         self._least, self._device = max(_LEAST, 2 * candidates), device_of(())

@@ -114,7 +114,7 @@ def motion(advance: float, spread: float) -> Float[np.ndarray, " steps"]:
 
 
 def shares(scores: Float[np.ndarray, " candidates"], sharpness: float) -> Float[np.ndarray, " candidates"]:
-    """Shares of a query's candidates: (score - mean)^sharpness, 0 below the mean or if not finite; by their sum."""
+    """Shares of a query's candidates, of sum 1: (score - mean)^sharpness; 0 below the mean, or if not finite."""
     finite = np.isfinite(scores)
     if not finite.any():
         return np.zeros(len(scores))

@@ -1,5 +1,6 @@
-"""Networks as Flax NNX modules: arrays in, arrays out. Images are `[B, H, W, 3]` float32. `precision` is that of
-products on hardware with less than float32; a lower one than "highest" moves keypoints.
+"""Networks as Flax NNX modules: arrays in, arrays out.
+
+Images are `[B, H, W, 3]` float32. With a lower `precision` of products than "highest", keypoints move.
 
 Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, convolution, sampling, imagenet.
 """

@@ -94,9 +94,8 @@ class Block(nnx.Module):
 class VisionTransformer(nnx.Module):
     """Transformer with a class token, optional registers, and tokens of patches of 14 x 14 px.
 
-    DINOv2's small, base and large networks have widths 384, 768, 1024, depths 12, 12, 24 and heads 6, 12, 16.
-
-    `registers` are additional tokens, which are not returned; 4 or none are published.
+    DINOv2's small, base and large networks have `width` (numbers of a token) 384, 768, 1024, `depth` (blocks) 12, 12,
+    24 and `heads` 6, 12, 16. `registers` are additional tokens, which are not returned; 4 or none are published.
     """
 
     def __init__(

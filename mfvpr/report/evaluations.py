@@ -47,12 +47,13 @@ class EvaluationReport:
 
     @classmethod
     def of(
-        cls, ranked: RankedDataset, thresholds: Sequence[float] | None = None, ks: Sequence[int] = KS, **options: Any
-    ) -> "EvaluationReport":
+        cls, ranked: RankedDataset, thresholds: Sequence[float] | None = None, ks: Sequence[int] = KS, *,
+        confidences: Mapping[str, Confidence] | None = None, least_confidence: float | None = None,
+    ) -> "EvaluationReport":  # fmt: skip
         """The report with criteria in any order; without thresholds, those that the programs have by default."""
         truth = ranked.dataset.sequences[0].truth
         known = [] if truth is None else truth.thresholds() if thresholds is None else thresholds
-        return cls(ranked, sorted({*known}), sorted({*ks}), **options)
+        return cls(ranked, sorted({*known}), sorted({*ks}), confidences, least_confidence)
 
     @property
     def headline(self) -> str:

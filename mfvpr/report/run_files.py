@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.contents import Contents
+from mfvpr.datasets.contents import Contents, fingerprints, readings
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import middle
 from mfvpr.evaluation.sequence_matching import num_candidates
@@ -46,11 +46,6 @@ class RunDescription:
     contents: Mapping[str, Contents]
     settings: Mapping[str, Any]
     command: str | None = None
-
-    @property
-    def fingerprints(self) -> dict[str, str]:
-        """Fingerprints of all folders, by side."""
-        return {side: contents.fingerprint for side, contents in self.contents.items()}
 
 
 def parameters(
@@ -147,9 +142,9 @@ def result_rows(report: EvaluationReport, description: RunDescription) -> list[d
         "database": len(dataset.database),
         "dataset": dataset.name,
         "incomplete": list(published_differences(dataset)),
-        "data_fingerprint": description.fingerprints,
+        "data_fingerprint": fingerprints(description.contents),
         "ground_truth": ground_truth(report, description),
-        "reading": {side: contents.summary() for side, contents in description.contents.items()},
+        "reading": readings(description.contents),
         "bytes_per_image": _bytes_per_image(report),
         "seconds": report.ranked.seconds,
         "versions": versions(),
@@ -171,7 +166,7 @@ def _provenance(report: EvaluationReport, description: RunDescription) -> dict[s
     truth = report.sequences[0].truth
     return {
         "dataset": report.ranked.dataset.name,
-        "data_fingerprint": description.fingerprints,
+        "data_fingerprint": fingerprints(description.contents),
         "queries": report.num_queries,
         "correct_within": [middle(report.thresholds), truth.unit] if truth else None,
         "candidates": _num_candidates(report),

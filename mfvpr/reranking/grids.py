@@ -114,7 +114,7 @@ def score_settings(
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
     so that other values cost no compilation. A histogram needs a capacity that suffices for every `bin_size`.
-    Weightings are values of `max_distance` and of `weight`, the index of the scorer's `ChosenWeight`. None: G or W = 1.
+    Weightings: `max_distance`, and `weight` (index of the scorer's `ChosenWeight`). Without any, G or W is 1.
     """
     scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
     require_real("scorer", scores)

@@ -144,7 +144,7 @@ def fuse_scales(
     *,
     normalize: Literal["zscore", "none"] = "zscore",
 ) -> Float[jax.Array, "*batch candidates"]:
-    """Weighted sum of the scores of S scales or scorers; NaN without a candidate. None as `weights` is 1 each.
+    """Weighted sum of the scores of S scales or scorers; NaN without a candidate. `weights` are 1 by default.
 
     Patch-NetVLAD fuses patch sizes in this way. "zscore" first gives each scale mean 0 and standard deviation 1 over
     the query's candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation,

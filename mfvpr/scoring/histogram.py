@@ -44,7 +44,8 @@ class HistogramOfShifts:
         s_ij = sum_k w_k exp(-((x_k - x_ij)^2 + (y_k - y_ij)^2) / (2 sigma^2)),
 
     where (x_k, y_k) is the shift of match k, w_k its weight, and (x_ij, y_ij) the center of the bin. The score does not
-    change if all points of one image move by a multiple of `bin_size` while the peak stays in range.
+    change if all points of one image move by a multiple of `bin_size` while the peak stays in range. Numbers may be
+    traced, batched and learned; `max_bins` and the choices are static.
 
     Attributes:
         bin_size: width of the square bins, px.
@@ -208,7 +209,7 @@ class HistogramOfShifts:
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
     def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Scores `[B, B]` (y, x) of the scale with the tallest bin, -inf out of range; bins; are they usable; scale."""
+        """Scores `[B, B]` (y, x) of the scale with the tallest bin, -inf out of range; bins; whether usable; scale."""
         lattice, capacity = self._lattice(matches), self._capacity(matches)
         shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
         scores = map_rows(lambda shifts: bin_scores(*votes(shifts, lattice, capacity), weights), shifts)

@@ -150,14 +150,13 @@ class _Search(NamedTuple):
                 has_samples=num_samples > 0,
             )
 
-        zero = jnp.zeros((), dtype)
-        start = jnp.zeros((), jnp.int32)
+        zero, start = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
         state = _State(start, start, zero, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
         state = jax.lax.while_loop(is_searching, search_round, state)
         return state.model, state.samples
 
     def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
-        """Quality, sum of the inliers' counts, and number of inliers, of each model; few matches fit into the cache."""
+        """Quality, sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
         padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
         points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
         counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)

@@ -46,7 +46,7 @@ def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, 
         for other in taken:
             number = number + (number >= other).astype(jnp.int32)
         numbers.append(number)
-        for index, other in enumerate(taken):
+        for index, other in enumerate(taken):  # insert the number; what is larger moves on
             taken[index], number = jnp.minimum(other, number), jnp.maximum(other, number)
         taken.append(number)
     return jnp.stack(numbers)

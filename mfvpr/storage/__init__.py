@@ -1,7 +1,7 @@
 """The cache of features and matches on disk, and its file formats.
 
 Read first: feature_cache (what is cached for a folder of images), rows (a store: one file per image), features,
-vectors, matches, map_entries and maps (formats of rows), manifest (what a store belongs to).
+matches, map_entries and maps (formats of rows), manifest (what a store belongs to).
 """
 
 import lazy_loader

@@ -10,6 +10,7 @@ from PIL import Image
 
 from mfvpr.cli.evaluation import evaluate
 from mfvpr.cli.inputs import prepare
+from mfvpr.datasets.contents import readings
 from mfvpr.utils import Stopwatch
 from tests.programs import composed, csv_rows, folder
 
@@ -110,7 +111,7 @@ def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
     Image.fromarray(np.full((120, 160), 65535, np.uint16)).save(tmp_path / "queries" / "0.png")
     data = folder(tmp_path)[:3]
     inputs = prepare(composed(*QUICK, *data, "dataset.ground_truth=order"), Stopwatch())
-    assert inputs.reading == {
+    assert readings(inputs.contents) == {
         "database": {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
         "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 1, "largest_16bit": 65535},
     }  # fmt: skip

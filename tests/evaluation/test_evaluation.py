@@ -14,6 +14,7 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence
+from mfvpr.evaluation.evaluation import KS
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
@@ -61,6 +62,7 @@ def test_systems_and_their_recall(dataset, result):
     expected = [[mfvpr.recall_at_k(ranked.rows, dataset.truth.positives(t), [k])[0] for k in (1, 5)] for t in (0, 1)]
     np.testing.assert_allclose(recall.by_sequence, [expected])
     np.testing.assert_array_equal(recall.mean, recall.pooled)
+    assert result.recall([])["histogram"].by_sequence.shape == (1, 0, len(KS))
 
 
 def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):

@@ -135,10 +135,12 @@ class _HalfComparison:
         """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
         axes = self.axes if fused else self.axes.without(FUSION)
         grid, queries, protocol = axes.grid(), self.split.half.tune, self.split.protocol
-        own = {FUSION: self.options.c} if fused and FUSION not in axes.values else {}
-        settings = [{**axes.setting(plain), **own} for plain in grid]
-        for setting in settings if FUSION in axes.values else ():  # a c in units of the scores
-            setting[FUSION] = None if (c := setting[FUSION]) is None else c * self.split.balance(deviation)
+        settings = [{**axes.setting(plain)} for plain in grid]
+        for setting in settings:
+            if fused and FUSION not in setting:
+                setting[FUSION] = self.options.c
+            elif setting.get(FUSION) is not None:
+                setting[FUSION] *= self.split.balance(deviation)  # in units of the scores
         rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
         recall = hits(rows, protocol.positives[protocol.main].take(queries)).mean(axis=-1)
         best = best_setting(recall, axes.values)

@@ -75,7 +75,7 @@ class Work:
 
     match_set: MatchSet | Scales  # of all queries
     queries: range  # the part: candidates and views are of these queries
-    settings: float  # mean number of a program, for the size of the batches
+    settings: float  # that a program scores, on average: batches are smaller with more
     candidates: Shortlist
     views: Sequence[np.ndarray]
     options: SweepOptions
