@@ -129,7 +129,8 @@ def evaluate_all(
             chosen = runs.settings_of(names[0], place, settings)
             dataset = dataset_of(chosen["dataset"])
             description = truth.describe(chosen["dataset"], chosen["recall"], dataset)
-            cache = build.cache(chosen)
+            runtime = build.runtime(chosen["devices"], chosen["memory"], chosen.get("cluster"))
+            cache = build.cache(chosen["cache"], runtime, on_bad_image=chosen["on_bad_image"])
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}

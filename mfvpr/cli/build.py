@@ -59,32 +59,31 @@ def _ground_truth(settings: Mapping[str, Any]) -> IndexFile | LabelFiles | str:
     return kind
 
 
-def cache(settings: Mapping[str, Any]) -> FeatureCache:
+def cache(folder: str | None, runtime: Runtime, *, on_bad_image: str, wait: bool = False) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
-    root = None if settings["cache"] is None else expand_user(settings["cache"])
-    skip_bad, wait = settings["on_bad_image"] == "skip", bool(settings.get("multirun"))
-    return FeatureCache(root, skip_bad=skip_bad, wait=wait, runtime=runtime(settings))
+    root = None if folder is None else expand_user(folder)
+    return FeatureCache(root, skip_bad=on_bad_image == "skip", wait=wait, runtime=runtime)
 
 
 @contextmanager
-def cluster(settings: Mapping[str, Any]) -> Iterator[Cluster | None]:
+def cluster(settings: Mapping[str, Any] | None) -> Iterator[Cluster | None]:
     """Connect to the cluster that the settings name, or start it, until the block ends."""
-    if (chosen := settings.get("cluster")) is None:
+    if settings is None:
         yield None
         return
     starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
-    options = {name: value for name, value in chosen.items() if name != "name"}
-    with starts[chosen["name"]](**options) as started:
+    options = {name: value for name, value in settings.items() if name != "name"}
+    with starts[settings["name"]](**options) as started:
         console.tell(f"cluster: {started}")
         yield started
 
 
-def runtime(settings: Mapping[str, Any]) -> Runtime:
-    """Devices, memory, progress, messages, and the cluster that `command_line` started."""
+def runtime(number: int | str, memory: float | None, cluster: Cluster | None) -> Runtime:
+    """Number of devices, memory, progress, messages, and the cluster that `command_line` started."""
     import jax
 
-    devices, number = jax.local_devices(), settings["devices"]
-    if number != "all" and number > len(devices):
+    devices = jax.local_devices()
+    if not isinstance(number, str) and number > len(devices):
         raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
-    devices = devices if number == "all" else devices[:number]
-    return Runtime(devices, settings["memory"], console.track, console.tell, settings.get("cluster"))
+    devices = devices if isinstance(number, str) else devices[:number]
+    return Runtime(devices, memory, console.track, console.tell, cluster)

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mfvpr.cli.console import tell
-from mfvpr.cli.groups import PROGRAMS, check_choice, choices_with, groups
+from mfvpr.cli.groups import PROGRAMS, check_choice, choices, choices_with, groups
 from mfvpr.cli.launch import import_job, on_interrupt, one_line
 from mfvpr.cli.overrides import PATHS, compose_program, quote, split_first
 from mfvpr.cli.wording import in_settings
@@ -63,8 +63,9 @@ def run(config: str) -> None:
                 "multirun": hydra_settings.sweep.dir, "number": hydra_settings.job.num,
                 "overrides": dict(override.split("=", 1) for override in hydra_settings.overrides.task),
             }  # fmt: skip
-            with interruptible, in_settings(settings), _frozen_imports(), build.cluster(settings) as cluster:
-                job(settings | {"multirun": multirun_job, "command": command, "cluster": cluster})
+            words, cluster = in_settings(settings.get("retrieval", {})), build.cluster(settings.get("cluster"))
+            with interruptible, words, _frozen_imports(), cluster as started:
+                job(settings | {"multirun": multirun_job, "command": command, "cluster": started})
 
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
@@ -141,7 +142,8 @@ def _check_form(argument: str, config: str) -> None:
         raise SettingsError(f"{argument}: expected name=value; put quotes around values with spaces")
     if re.search(rf"\d{{{_MAX_DIGITS},}}", value):
         raise SettingsError(f"{name}={value[:20]}...: expected a number of fewer than {_MAX_DIGITS} digits")
-    check_choice(name, value, config)
+    if choices(name):
+        check_choice(name, value, config)
 
 
 @contextmanager

@@ -54,15 +54,15 @@ def choices_with(group: str, name: str) -> list[str]:
 
 
 def check_choice(name: str, value: str, config: str) -> None:
-    """Raise a SettingsError if a setting is a group that the program does not have, or a value is no choice of it."""
+    """Raise a SettingsError if the program does not have this group of settings, or a value is no choice of it."""
     known, program_groups = choices(name), groups(config)
-    if known and name not in program_groups:
+    if name not in program_groups:
         if name in _read(CONF / f"{config}.yaml"):
             raise SettingsError(f"{name}={value}: this is a group of settings; set one of its members (see --help)")
         commands = [command for other, (command, _) in PROGRAMS.items() if name in groups(other)]
         typed = " or ".join(f"{command} {name}={value}" for command in commands)
         raise SettingsError(f"{name}={value}: {PROGRAMS[config][0]} has no group {name}; type {typed}")
-    for choice in value.split(",") if known else []:
+    for choice in value.split(","):
         if choice not in known:
             nearest = difflib.get_close_matches(choice, known, n=1)
             hint = f"; the nearest is {nearest[0]}" if nearest else ""

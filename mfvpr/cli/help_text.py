@@ -16,8 +16,8 @@ _SECTIONS = {"launcher": "hydra"}  # the section of a group's settings, if it ha
 def help_text(config: str, arguments: Sequence[str]) -> str:
     """Usage of a program, its groups, and its settings with the choices among the arguments."""
     typed = dict(argument.split("=", 1) for argument in arguments if "=" in argument)
-    for name, value in typed.items():
-        check_choice(name, value, config)
+    for name in filter(choices, typed):
+        check_choice(name, typed[name], config)
     chosen = groups(config)
     typed = {group: choice for group, choice in typed.items() if group in chosen}
     chosen |= {group: typed[group] for group in _WHOLE if group in typed}

@@ -50,8 +50,9 @@ def learn(settings: dict[str, Any]) -> None:
             data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes.scorer, data, teach + report)
+            runtime = build.runtime(settings["devices"], settings["memory"], settings.get("cluster"))
             comparison = compare(axes, data.protocol, data.match_set, data.candidates, options,
-                                 checkpoints=checkpoints, runtime=build.runtime(settings))  # fmt: skip
+                                 checkpoints=checkpoints, runtime=runtime)  # fmt: skip
         heading = _heading(settings, data, teach, report)
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "multirun", "command", "cluster")

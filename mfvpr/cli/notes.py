@@ -1,39 +1,29 @@
 """Notes and warnings about the data of a program, before it begins."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
-from typing import Any
+from typing import Any, Literal
 
 from mfvpr.cli.console import tell
-from mfvpr.datasets import Dataset, QuerySequence
+from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, OwnRows, fingerprints, own_rows, readings
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.scoring.weight_registry import provenance
-from mfvpr.systems import assembly
 
 # A learned match weight depends on these settings.
 _LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}
 
 
-def tell_peculiarities(
-    settings: Mapping[str, Any], dataset: Dataset, contents: Mapping[str, Contents], thresholds: Sequence[float]
-) -> None:
-    """Tell what is peculiar about the images, the ground truth, the candidates and learned weights."""
+def tell_peculiarities(dataset: Dataset, contents: Mapping[str, Contents], thresholds: Sequence[float]) -> None:
+    """Tell what is peculiar about the images and the ground truth."""
     for difference in published_differences(dataset):
         tell(f"warning: {dataset.name}: {difference}; its numbers are not comparable")
     database, *queries = contents.values()
     for sequence, images in zip(dataset.sequences, queries, strict=True):
         _warn_of_sequence(sequence, own_rows(images, database), thresholds)
     _warn_of_reading(contents, dataset.database.bits)
-    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
-        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
-    available = num_candidates(settings["candidates"], dataset.database)
-    _note_candidates(settings["candidates"], settings["recall"]["ks"], available)
-    weights = {values.get("weight", "fs") for values in assembly.by_scorer(settings["scorer"]).values()}
-    for name in sorted(weights | {*((settings.get("grid") or {}).get("weight") or ())}):
-        _warn_of_weight(name, settings, dataset.name, {*fingerprints(contents).values()})
 
 
 def _warn_of_sequence(sequence: QuerySequence, same_images: OwnRows, thresholds: Sequence[float]) -> None:
@@ -71,13 +61,24 @@ def _warn_of_reading(contents: Mapping[str, Contents], bits: int | None) -> None
               f"dataset.bits={used} would use their range")  # fmt: skip
 
 
-def _note_candidates(candidates: int | str, ks: Sequence[int], available: int) -> None:
+def note_candidates(candidates: int | Literal["all"], ks: Sequence[int], database: ImageFolder) -> None:
     """Note that fewer candidates are available than `candidates` or `recall.ks` expect."""
+    available = num_candidates(candidates, database)
     if isinstance(candidates, int) and candidates > available:
         tell(f"note: candidates={candidates}, but the database has {available} images; all of them are re-ranked")
     if deeper := [f"R@{k}" for k in ks if k > available]:
         verb = "is" if len(deeper) == 1 else "are"
         tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of retrieval too: no more candidates are looked at")
+
+
+def warn_of_matching(
+    settings: Mapping[str, Any], weights: Iterable[str], dataset: str, contents: Mapping[str, Contents]
+) -> None:
+    """Warn of features that LightGlue may not know, and of match weights that do not fit."""
+    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
+        tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
+    for name in weights:
+        _warn_of_weight(name, settings, dataset, {*fingerprints(contents).values()})
 
 
 def _warn_of_weight(name: str, settings: Mapping[str, Any], dataset: str, images: set[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from mfvpr.cli.command_line import hydra_errors
-from mfvpr.cli.groups import check_choice
+from mfvpr.cli.groups import check_choice, choices
 from mfvpr.cli.overrides import compose_program, quote
 from mfvpr.evaluation import System
 from mfvpr.systems import assembly
@@ -49,8 +49,8 @@ def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     for setting, value in nodes(settings):
         if not isinstance(value, Mapping):
             overrides[setting] = value if isinstance(value, str) else json.dumps(value, default=np.generic.item)
-    for setting, value in overrides.items():
-        check_choice(setting, value, _PROGRAM)
+    for group in filter(choices, overrides):
+        check_choice(group, overrides[group], _PROGRAM)
     arguments = [quote(f"{setting}={value}") for setting, value in overrides.items()]
     with hydra_errors(_PROGRAM, arguments):
         config = compose_program(_PROGRAM, arguments)

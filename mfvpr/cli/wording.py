@@ -27,14 +27,14 @@ _WORDS = {
 
 
 @contextmanager
-def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
-    """Raise errors of the library again, in words of the settings."""
+def in_settings(retrieval: Mapping[str, Any]) -> Iterator[None]:
+    """Raise errors of the library again, in words of the settings; those of the retrieval may name its files."""
     from mfvpr.utils import InputError
 
     try:
         yield
     except InputError as error:
-        text, group = str(error), _group(str(error), settings)
+        text, group = str(error), _group(str(error), retrieval)
         for pattern, words in _WORDS.items():
             text = re.sub(pattern, words.replace("GROUP", group), text)
         if text == str(error):
@@ -42,11 +42,10 @@ def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
         raise SettingsError(text) from error
 
 
-def _group(text: str, settings: Mapping[str, Any]) -> str:
+def _group(text: str, retrieval: Mapping[str, Any]) -> str:
     """The group of settings with the file that a message begins with."""
     from mfvpr.cli.build import expand_user
 
-    retrieval = settings.get("retrieval", {})
     queries = retrieval.get("queries", [])
     files = [retrieval.get("database"), *(queries if isinstance(queries, list) else [queries])]
     return "retrieval" if any(file and text.startswith(f"{expand_user(file)}:") for file in files) else "features"

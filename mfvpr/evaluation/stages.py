@@ -70,9 +70,9 @@ def match(
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
-        here = runtime.memory, runtime.devices
-        shared = *sides, matcher, *(here if runtime.cluster is None else (runtime.memory or WORKER_MEMORY, None)), store
-        for block, counts in runtime.map(match_rows, shared, missing, "matching", batched.QUERIES):
+        here, at_workers = (runtime.memory, runtime.devices), (runtime.memory or WORKER_MEMORY, None)
+        shared = sides, matcher, here if runtime.cluster is None else at_workers, store
+        for block, counts in runtime.map(_match_rows, shared, missing, "matching", batched.QUERIES):
             store.counts[block] = counts
     match_set, shortlist = stored_matches(store, rows, memory=runtime.memory)
     if not missing:
@@ -80,14 +80,14 @@ def match(
     return match_set
 
 
-def match_rows(
-    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher, memory: float | None,
-    devices: Sequence[Device] | None, store: MatchStore, rows: Sequence[int], track: Track = no_progress,
+def _match_rows(
+    sides: tuple[FeatureSet, FeatureSet, Shortlist], matcher: Matcher,
+    limits: tuple[float | None, Sequence[Device] | None], store: MatchStore, rows: Sequence[int],
+    track: Track = no_progress,
 ) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
-    """Write the matches of queries to a store; returns their rows, and the numbers of their matches."""
-    missing = [row for row in rows if not store.done[row]]
-    options = {"memory": memory, "devices": devices or [device_of(())]}
-    matched = batched.match_queries(queries, database, candidates, missing, matcher, **options)
+    """Write the matches of queries to a store within limits of memory and devices; returns rows and numbers."""
+    missing, (memory, devices) = [row for row in rows if not store.done[row]], limits
+    matched = batched.match_queries(*sides, missing, matcher, memory=memory, devices=devices or [device_of(())])
     tracked = iter(track(matched, len(missing)))
     while batch := dict(itertools.islice(tracked, STORE_BATCH)):
         store.write(batch)

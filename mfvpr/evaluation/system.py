@@ -111,7 +111,7 @@ class System:
     @cached_property
     def final_scores(self) -> dict[str, FinalScore]:
         """Scores that candidates are ranked by, by name: of retrieval, of each scorer, and combined ones."""
-        return final_scores(self.scorers, self.cohort, self.fused, self.correlated)
+        return final_scores(tuple(self.scorers), self.cohort, self.fused, self.correlated)
 
     @property
     def headline(self) -> str:

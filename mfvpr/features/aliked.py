@@ -37,7 +37,7 @@ class AlikedFeatures(NetworkExtractor):
     """
 
     vector_size = 0  # no global descriptor
-    model: Aliked
+    model: Aliked = field(repr=False)
     image_size: tuple[int, int] = (320, 320)
     interpolation: Interpolation = "pil_bilinear"
     threshold: float = 0.1

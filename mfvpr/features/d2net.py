@@ -34,7 +34,7 @@ class D2NetFeatures(NetworkExtractor):
     """
 
     vector_size = 0  # no global descriptor
-    model: D2Net
+    model: D2Net = field(repr=False)
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "caffe"

@@ -24,7 +24,7 @@ class MixVprDescriptor(NetworkExtractor):
     """
 
     image_size = IMAGE_SIZE
-    model: MixVPR  # 4096, 512 or 128 numbers with published weights
+    model: MixVPR = field(repr=False)  # 4096, 512 or 128 numbers with published weights
     interpolation: Interpolation = "pil_bicubic"
     batch_size: int = field(default=8, metadata={"recipe": False})
 
@@ -58,7 +58,7 @@ class GlobalDescriptor(NetworkExtractor):
         InputError: the network cannot take images of this size, or has fewer principal components.
     """
 
-    model: DescriptorNetwork
+    model: DescriptorNetwork = field(repr=False)
     image_size: tuple[int, int] = (640, 480)
     interpolation: Interpolation = "pil_bilinear"
     components: int | None = None

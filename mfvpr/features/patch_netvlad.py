@@ -33,7 +33,7 @@ class PatchNetVladFeatures(NetworkExtractor):
             of weights than of patch sizes.
     """
 
-    model: VggNetVlad
+    model: VggNetVlad = field(repr=False)
     image_size: tuple[int, int] = (640, 480)
     interpolation: Interpolation = "pil_bilinear"
     patch_sizes: tuple[int, ...] = (5,)

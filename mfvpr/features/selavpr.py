@@ -30,7 +30,7 @@ class SelaVprFeatures(NetworkExtractor):
         InputError: another network, or an image size that is no multiple of 14.
     """
 
-    model: SelaVpr
+    model: SelaVpr = field(repr=False)
     image_size: tuple[int, int] = (224, 224)
     interpolation: Interpolation = "torch_no_antialias"
     batch_size: int = field(default=8, metadata={"recipe": False})

@@ -34,7 +34,7 @@ class SsmMaps(NetworkExtractor):
         preprocessing: "torch" as the public code, or "caffe", which the weights are for.
     """
 
-    model: SsmVgg
+    model: SsmVgg = field(repr=False)
     stage: Literal[1, 2]
     image_size: tuple[int, int]
     interpolation: Interpolation = "pil_bilinear"
@@ -96,7 +96,7 @@ class SsmWindows(_WhitenedWindows):
     """
 
     image_size, stage = STAGE1_SIZE, 1
-    model: SsmVgg
+    model: SsmVgg = field(repr=False)
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "torch"
     whitening: WindowFitting | Whitening = STAGE1_FITTING
@@ -130,7 +130,7 @@ class SsmCells(_WhitenedWindows):
     """
 
     vector_size, stage = 0, 2  # no global descriptor; the second stage's map
-    model: SsmVgg
+    model: SsmVgg = field(repr=False)
     image_size: tuple[int, int] = (336, 336)
     interpolation: Interpolation = "pil_bilinear"
     preprocessing: Preprocessing = "torch"

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 from jaxtyping import Float
-from scipy.special import softmax
 
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.types import Features
@@ -112,7 +112,7 @@ def _mixture_centers(
         for chunk in _chunks(sample, num_words):
             # Squared distances, up to a term that is the same for all centers.
             distances = (centers**2).sum(1) - 2 * chunk @ centers.T
-            shares = softmax(-distances / (2 * _VARIANCE), axis=1)
+            shares = scipy.special.softmax(-distances / (2 * _VARIANCE), axis=1)
             members += shares.sum(axis=0)[:, None]
             sums += shares.T @ chunk
         centers = np.where(members > 0, sums / np.where(members > 0, members, 1), centers)

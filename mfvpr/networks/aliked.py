@@ -17,6 +17,7 @@ from mfvpr.networks.imagenet import Images
 from mfvpr.networks.sampling import sample, upsample
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import over_batch
 
 STRIDE = 32  # px, of the coarsest map
 _POOLING = (1, 2, 4, 4)  # factors before the blocks
@@ -54,7 +55,7 @@ class DeformableConv(nnx.Module):
 
         def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
             points, kernel = tap
-            return total + jnp.matmul(jax.vmap(sample)(x, points), kernel, precision=self.precision), None
+            return total + jnp.matmul(over_batch(sample)(x, points), kernel, precision=self.precision), None
 
         kernels = self.kernel[...].reshape(9, inputs, -1)
         total = jnp.zeros((*x.shape[:3], kernels.shape[-1]), x.dtype)
@@ -138,7 +139,7 @@ class Aliked(nnx.Module):
             detections = detect(scores, threshold, capacity)
             return detections, self.desc_head(field(levels, *_inside(images)), detections.keypoints, detections.count)
 
-        return jax.vmap(extract_one)(levels, scores)
+        return over_batch(extract_one)(levels, scores)
 
     def _scores(self, levels: list[Array]) -> Float[Array, "batch height width"]:
         """Scores of the padded images."""

@@ -146,7 +146,7 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """All of a system but its pipeline: the main scorer is fused with the retrieval, also its scores with a cohort."""
     chosen, fusing, cohort = scorers(settings["scorer"]), fusion(settings), settings["cohort"]
     main = main_scorer(chosen)
-    fusing.check(main, chosen)
+    fusing.check(main, tuple(chosen))
     fused = {main: fusing}
     if cohort is not None and fusing.members(main) == [main]:
         fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
@@ -181,6 +181,12 @@ def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
 def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """Settings of the chosen scorer, or of several, by name."""
     return {settings["method"]: settings} if "method" in settings else settings
+
+
+def weights(settings: Mapping[str, Any]) -> list[str]:
+    """Names of the match weights of the scorers, and of those that a sweep tries."""
+    names = {values.get("weight", "fs") for values in by_scorer(settings["scorer"]).values()}
+    return sorted(names | {*((settings.get("grid") or {}).get("weight") or ())})
 
 
 def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

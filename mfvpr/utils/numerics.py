@@ -142,6 +142,17 @@ def masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> F
     return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
 
 
+def over_batch(function: Callable[..., Tree]) -> Callable[..., Tree]:
+    """`jax.vmap(function)`; a batch of one goes without it, which takes a third of the time to trace."""
+
+    def call(*batch: Any) -> Tree:
+        if len(jax.tree.leaves(batch)[0]) != 1:
+            return jax.vmap(function)(*batch)
+        return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], batch)))
+
+    return call
+
+
 def compiled(function: Function, **options: Any) -> Function:
     """`jax.jit` for functions of many pairs; the classes of all nodes of the arguments choose the program as well.
 

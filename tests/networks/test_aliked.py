@@ -97,6 +97,7 @@ def test_with_random_weights_too_and_images_of_a_batch_do_not_mix(drawn, golden)
 @pytest.mark.optimized
 def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, golden, compilations):
     extractor = AlikedFeatures(drawn, (DRAWN.width, DRAWN.height), threshold=DRAWN.threshold)
+    assert len(repr(extractor)) < 200
     image = picture(DRAWN, IMAGES)[None]
     features = extractor(image)[0].features
     compilations.reset()
