@@ -5,7 +5,7 @@ from typing import Any
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.matching.match_set import block_bytes, scales
 from mfvpr.scoring import SCORERS
-from mfvpr.scoring.fields import parameters_of
+from mfvpr.scoring.parameters import parameters_of
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.models import can_learn
@@ -62,11 +62,11 @@ def search_axes(settings: dict[str, Any]) -> Axes:
     if settings["search"] == "grid":
         _require_bytes(f"grid: {grid_axes.size:,} settings", grid_axes.size * _BYTES_PER_SETTING,
                        "use fewer values, or search=optuna")  # fmt: skip
-        return grid_axes
-    try:
-        require_optuna()
-    except InputError as error:
-        raise SettingsError(f"search=optuna: {error}, or search=grid") from error
+    else:
+        try:
+            require_optuna()
+        except InputError as error:
+            raise SettingsError(f"search=optuna: {error}, or search=grid") from error
     return grid_axes
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import yaml
 
-from mfvpr.scoring import ALONE, PAPER, SCORERS, fields
+from mfvpr.scoring import ALONE, PAPER, SCORERS
+from mfvpr.scoring.parameters import parameters_of, summary
 from mfvpr.systems.settings import CONF
 from mfvpr.utils.files import write_text
 
@@ -42,12 +43,12 @@ def files() -> dict[str, str]:
         "ratio": ("Anchor points and histogram of shifts, matches weighted by the ratio of distances (not the "
                   "paper's).", ["anchor_ratio@anchor", "histogram_ratio@histogram"]),
     }  # fmt: skip
-    for name, (summary, members) in groups.items():
+    for name, (about, members) in groups.items():
         entries = (f"  - {member}" if "@" in member else f"  - {member}@{member}" for member in members)
-        texts[f"scorer/{name}.yaml"] = "\n".join([f"# {summary}", "defaults:", *entries])
+        texts[f"scorer/{name}.yaml"] = "\n".join([f"# {about}", "defaults:", *entries])
     texts["axes.yaml"] = "\n".join(_axes())
     limits = {
-        name: {field: parameter.limits for field, parameter in fields.parameters_of(scorer).items()}
+        name: {field: parameter.limits for field, parameter in parameters_of(scorer).items()}
         for name, scorer in SCORERS.items()
     }
     texts["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
@@ -64,15 +65,15 @@ def write_declared_files(conf: Path) -> None:
 
 
 def _scorer(method: str) -> Iterator[str]:
-    yield f"# {fields.summary(SCORERS[method])}"
+    yield f"# {summary(SCORERS[method])}"
     yield f"method: {method}"
-    yield from _values(method, {name: field.default for name, field in fields.parameters_of(SCORERS[method]).items()})
+    yield from _values(method, {name: field.default for name, field in parameters_of(SCORERS[method]).items()})
 
 
 def _values(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     """Lines of some of a scorer's parameters."""
     for name, value in values.items():
-        field = fields.parameters_of(SCORERS[method])[name]
+        field = parameters_of(SCORERS[method])[name]
         yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, field.words))))
 
 
@@ -80,7 +81,7 @@ def _axes() -> Iterator[str]:
     """Lines of the parameters that can be swept: of one scorer each, then those that several scorers share."""
     owners: dict[str, dict[str, str]] = {}
     for name, scorer in SCORERS.items():
-        for field, parameter in fields.parameters_of(scorer).items():
+        for field, parameter in parameters_of(scorer).items():
             if parameter.swept:
                 owners.setdefault(field, {})[name] = parameter.unit or parameter.words
     yield "grid:  # lists of values of the scorer's parameters; null = its own value"

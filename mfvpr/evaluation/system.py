@@ -21,7 +21,7 @@ from mfvpr.reranking.fusion import FinalScore, FrameCorrelation, Fusion, final_s
 from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval.retriever import Retriever
-from mfvpr.scoring.fields import check_bounds
+from mfvpr.scoring.parameters import check_bounds
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Shortlist

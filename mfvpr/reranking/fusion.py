@@ -19,7 +19,7 @@ from mfvpr.reranking.ranking import (
     retrieval_scores,
 )  # fmt: skip
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Ranked
-from mfvpr.scoring.fields import POSITIVE
+from mfvpr.scoring.parameters import POSITIVE
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError, require_word
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.fields import check_choices, choice, flag, number, table_value
+from mfvpr.scoring.parameters import check_choices, choice, flag, number, table_value
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_confidence, match_weights

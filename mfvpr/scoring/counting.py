@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.fields import check_choices, choice
+from mfvpr.scoring.parameters import check_choices, choice
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Matches, value
 

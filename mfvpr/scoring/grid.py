@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from mfvpr.scoring.fields import check_choices, choice, flag, integer
+from mfvpr.scoring.parameters import check_choices, choice, flag, integer
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError

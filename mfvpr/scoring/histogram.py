@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.scoring.fields import ANY, SCORE, check_choices, choice, flag, integer, number, numbers, table_value
 from mfvpr.scoring.lattice import Lattice, bin_scores, climb, map_rows, pool_bins, smooth_tallest, tallest, votes
+from mfvpr.scoring.parameters import ANY, SCORE, check_choices, choice, flag, integer, number, numbers, table_value
 from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, require_sizes, where_usable
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring import planes
-from mfvpr.scoring.fields import check_choices, choice, flag, integer, number
+from mfvpr.scoring.parameters import check_choices, choice, flag, integer, number
 from mfvpr.scoring.shifts import query_features, require_sizes
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value

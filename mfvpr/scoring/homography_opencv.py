@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.scoring.fields import check_bounds, check_choices, choice, number
+from mfvpr.scoring.parameters import check_bounds, check_choices, choice, number
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, is_concrete

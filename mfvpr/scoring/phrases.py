@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.scoring.fields import check_choices, choice, integer, number
+from mfvpr.scoring.parameters import check_choices, choice, integer, number
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value

@@ -23,7 +23,7 @@ SCORERS: dict[str, type] = {
     "homography": Homography,
     "homography_opencv": OpenCvHomography,
 }
-"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.scoring.fields`)."""
+"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.scoring.parameters`)."""
 
 PAPER = ("count", "sum", "anchor", "histogram")
 """Scorers that are compared by default."""

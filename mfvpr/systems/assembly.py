@@ -17,7 +17,7 @@ from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever,
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
 from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.scoring.fields import from_values
+from mfvpr.scoring.parameters import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.systems.settings import SettingsError

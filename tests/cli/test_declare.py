@@ -9,7 +9,7 @@ import pytest
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.cli import axes, command_line, declare, groups, help_text, overrides
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
-from mfvpr.scoring.fields import (
+from mfvpr.scoring.parameters import (
     check_choices,
     choice,
     flag,

@@ -12,8 +12,8 @@ import pytest
 
 import mfvpr
 from mfvpr import HistogramOfShifts
-from mfvpr.scoring.fields import from_values
 from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.scoring.parameters import from_values
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, provenance, read_weight, write_weight
 from mfvpr.scoring.weights import WEIGHTS
 from tests.builders import random_matches

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.reranking.ranking import combine, score_candidates
-from mfvpr.scoring.fields import SCORE, parameters_of
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.learned_weight import LearnedWeight
+from mfvpr.scoring.parameters import SCORE, parameters_of
 from mfvpr.tuning.learning import losses
 from mfvpr.tuning.learning.losses import Loss
 from mfvpr.tuning.learning.splits import Batch

@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.scoring.fields import Parameter, check_bounds, parameters_of
-from mfvpr.scoring.parameters import numbers_by_name, static_names, with_capacity, with_parameters
+from mfvpr.scoring import parameters
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, named_weight
@@ -32,7 +31,7 @@ class Axes:
         scorer: its other parameters stay.
         values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
-            (`mfvpr.scoring.fields`: a weight is the word `fs`, no limit is None). Words stand for weights in every
+            (`mfvpr.scoring.parameters`: a weight is the word `fs`, no limit is None). Words stand for weights in every
             scorer.
         own: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
 
@@ -46,7 +45,7 @@ class Axes:
 
     def __post_init__(self) -> None:
         scorer = self.scorer
-        known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
+        known = sorted({*parameters.numbers_by_name(scorer), *parameters.static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}
         for name, axis in self.values.items():
@@ -64,12 +63,12 @@ class Axes:
             for value in axis:
                 setting = self.setting({name: value})
                 if name in self.parameters and type(scorer) in SCORERS.values():
-                    check_bounds(with_parameters(scorer, setting))
+                    parameters.check_bounds(parameters.with_parameters(scorer, setting))
 
     @property
-    def parameters(self) -> Mapping[str, Parameter]:
+    def parameters(self) -> Mapping[str, parameters.Parameter]:
         """Declared parameters of the scorer."""
-        return parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
+        return parameters.parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
 
     @property
     def size(self) -> int:
@@ -91,7 +90,7 @@ class Axes:
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
         """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
-            with_capacity(with_parameters(self.scorer, setting), *image_sizes)
+            parameters.with_capacity(parameters.with_parameters(self.scorer, setting), *image_sizes)
 
     def _own(self, name: str) -> Any:
         """The plain value without a sweep."""

@@ -11,7 +11,6 @@ from jaxtyping import Int, Shaped
 from mfvpr.reranking import grids
 from mfvpr.reranking.grids import WEIGHTINGS
 from mfvpr.scoring import parameters
-from mfvpr.scoring.parameters import with_parameters
 from mfvpr.scoring.weights import ChosenWeight
 from mfvpr.utils.numerics import with_static_functions
 
@@ -59,7 +58,7 @@ def group_by_program(
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
     for choices, members in by_choices:
-        chosen = with_parameters(scorer, choices)
+        chosen = parameters.with_parameters(scorer, choices)
         if weights:
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = with_static_functions(chosen)
