@@ -47,7 +47,8 @@ def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> Co
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
     if not any(file.systems[headline].weights):
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
-    recall = [] if _threshold(inputs) in (None, file.origin.get("correct_within")) else ["recall"]
+    threshold = inputs.thresholds and [middle(inputs.thresholds), inputs.ground_truth["unit"]]
+    recall = ["recall"] if threshold and threshold != file.origin.get("correct_within") else []
     candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
     scores = system.final_scores
     other = {name: other_settings(file.origin, scores[name].scorers, settings, candidates) + recall
@@ -69,11 +70,6 @@ def other_settings(
     now = _settings_of(scorers, {**settings, "scorer": assembly.describe_settings(settings["scorer"])})
     names = [name for name in _NAMES if name in now and name != "candidates" and before.get(name) != now[name]]
     return names + ["candidates"] * (origin.get("candidates") != candidates)
-
-
-def _threshold(inputs: Inputs) -> list[Any] | None:
-    """The middle threshold of a correct prediction, and its unit; None without ground truth."""
-    return [middle(inputs.thresholds), inputs.ground_truth["unit"]] if inputs.thresholds else None
 
 
 def _query_fingerprints(by_side: Any) -> set[str]:

@@ -173,9 +173,8 @@ def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | Non
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
-    if other := confidences.other_settings(
-        file.origin, system.final_scores[name].scorers, map_settings, map_settings["candidates"]
-    ):
+    scorers = system.final_scores[name].scorers
+    if other := confidences.other_settings(file.origin, scorers, map_settings, map_settings["candidates"]):
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "
              "it may mean nothing here")  # fmt: skip
     return file.systems[name]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
@@ -46,10 +46,7 @@ class Sift:
         scores = np.array([keypoint.response for keypoint in detections], np.float32)
         strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
         keypoints = np.array([keypoint.pt for keypoint in detections], np.float32).reshape(-1, 2)
-        descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
-        return local_features(keypoints[strongest], _root(descriptors[strongest]), gray.shape[::-1], scores[strongest])
-
-
-def _root(descriptors: Float[np.ndarray, "keypoints 128"]) -> Float[np.ndarray, "keypoints 128"]:
-    """RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length."""
-    return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
+        sift = np.zeros((0, 128), np.float32) if descriptors is None else descriptors[strongest]
+        # RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length.
+        root = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-12))
+        return local_features(keypoints[strongest], root, gray.shape[::-1], scores[strongest])

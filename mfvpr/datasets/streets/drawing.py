@@ -52,30 +52,19 @@ def draw_streets(
 ) -> None:
     """Draw the synthetic street into `folder`.
 
-    The folder gets
-
-    * database/0000.png ...: a summer day,
-    * queries/0000.png ...: the same places with another lane, other headings and other cars; the first half of the
-      frames at night, the second half in snow,
-    * ground_truth.csv: columns query, database (file names), shift_x and shift_y: candidate minus query position in px
-      of the image, x to the right, y down. The shift is the median, per axis, over facade points that are visible in
-      both images (trees, signs and cars disregarded); see `image_shift`.
-
-    With `seasons`, a folder per condition replaces the queries. Each has its own drive, between the frames of the
-    database, and its own ground_truth.csv.
-
-    The files depend on the arguments only, to the bit.
+    `database/` is a summer day. `queries/` are the same places with another lane, other headings and other cars, the
+    first half at night, the second half in snow. `ground_truth.csv` has query and database (file names), and shift_x
+    and shift_y: candidate minus query position in px, see `image_shift`. With `seasons`, a folder per condition
+    replaces the queries. Each has its own drive, between the frames of the database, and its own ground_truth.csv. The
+    files depend on the arguments only, to the bit.
 
     Args:
-        folder: must not exist yet.
+        folder: must not exist yet (`FileExistsError`).
         seasons: whether the queries are drives in seven conditions.
         seed: of the street, its cars and the drives.
         num_frames: number of places, 1.75 m apart; there are twice as many images, with `seasons` eight times.
         image_size: (width, height) in px.
         progress: `progress(done, total)` is called in the caller's thread after every image.
-
-    Raises:
-        FileExistsError: the folder exists.
     """
     folder = Path(folder)
     database, queries = plan_drives(seed, num_frames, image_size)
