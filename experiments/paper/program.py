@@ -109,11 +109,9 @@ def _evaluate_and_report(
 
 
 def evaluate_all(
-    rows: Sequence[Row],
-    places: Sequence[Place],
-    settings: Mapping[str, Any],
+    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any],
     write_tables: Callable[[Mapping[str, Dataset]], None],
-) -> tuple[dict[str, Dataset], list[str]]:
+) -> tuple[dict[str, Dataset], list[str]]:  # fmt: skip
     """Evaluate, writing tables after each data set; return readable data sets, and a line per failed evaluation."""
     names = _names(rows)
     total, finished = len(places) * len(names), 0
