@@ -23,10 +23,6 @@ def test_links_and_pictures_exist():
     assert all((PAGE.parent / picture).stat().st_size < 100_000 for picture in pictures)
 
 
-def test_the_page_is_short():
-    assert len(TEXT.split()) <= 7000
-
-
 def test_tables_have_rows_of_one_length():
     blocks = re.findall(r"(?:^\|.*\|\n)+", TEXT, flags=re.MULTILINE)
     assert len(blocks) > 20
