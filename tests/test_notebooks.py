@@ -16,7 +16,7 @@ from tests.test_layering import imported_modules
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 PATHS = sorted(FOLDER.glob("*.ipynb"))
-LIBRARIES = {"mfvpr", "numpy", "jax", "matplotlib", "optax"}
+LIBRARIES = {"mfvpr", "numpy", "jax", "matplotlib", "optax", "cv2"}
 
 
 def code(notebook):
@@ -41,8 +41,8 @@ def executed(tmp_path_factory):
     return dict(zip(PATHS, results, strict=True)), folder
 
 
-def test_there_are_four():
-    assert [path.name[0] for path in PATHS] == ["1", "2", "3", "4"]
+def test_there_are_six():
+    assert [path.name[0] for path in PATHS] == ["1", "2", "3", "4", "5", "6"]
 
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
