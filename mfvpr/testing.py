@@ -103,7 +103,7 @@ def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
             "matches.mask) before any arithmetic"
         )
     if count == 0 and score != 0:
-        raise AssertionError(f"a pair without matches scores {score}, expected exactly 0")
+        raise AssertionError(f"a pair without matches scores {score}, expected exactly 0; mask every term")
     return np.asarray(score)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Num, UInt8
 from PIL import Image, ImageFile
 
 from mfvpr.io.containers import reading
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import require_file
 
 MAX_PIXELS = 64_000_000
@@ -119,6 +119,7 @@ def resize(
 
     Networks take both types; SIFT refuses floats.
     """
+    require_word("interpolation", interpolation, Interpolation)
     if interpolation == "torch_bilinear":  # Pillow's kernel is torch's, and its float images are not rounded
         channels = (Image.fromarray(channel) for channel in np.moveaxis(image.astype(np.float32), -1, 0))
         return np.stack([np.asarray(channel.resize(size, Image.Resampling.BILINEAR)) for channel in channels], axis=-1)

@@ -33,9 +33,10 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     [positives] = result.positives(threshold)
     is_correct = positives.contains(ranked.rows)[:, 0]
     confidence = fit_confidence(confidence_inputs(ranked, by_retrieval), is_correct)
-    if not any(confidence.weights) and not is_correct.all():
+    if not any(confidence.weights):
         warnings.warn(f"{sequence.images.root}: scores do not tell correct predictions ({is_correct.sum()} of "
-                      f"{len(is_correct)}) from incorrect ones; calibrate on a longer drive", stacklevel=3)  # fmt: skip
+                      f"{len(is_correct)}) from incorrect ones, so that every image gets the same confidence, also one "
+                      "of another place; calibrate on a longer drive, which leaves the map", stacklevel=3)  # fmt: skip
     return confidence
 
 

@@ -15,7 +15,7 @@ from mfvpr.matching.match_set import QueryMatches, split_pairs
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.types import Features, Matches, Shortlist, per_match
 from mfvpr.utils import ragged
-from mfvpr.utils.numerics import Device
+from mfvpr.utils.numerics import Device, with_static_functions
 from mfvpr.utils.ragged import Row
 from mfvpr.utils.threads import ordered_map
 
@@ -85,6 +85,7 @@ def match_queries(
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
+    matcher = with_static_functions(matcher)  # or a plain function would be compiled for every batch
     # Shapes follow from all queries, not from `todo`: a run that is continued must have the bits of a single run.
     database_rows, budget = np.unique(indices), memory_budget(memory, devices)
     database_rows = database_rows[database_rows >= 0]

@@ -112,9 +112,9 @@ def where_finite(score: Float[Array, "*batch"], *inputs: Num[Array, "..."]) -> F
 
 
 def safe_sqrt(squared: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
-    """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite."""
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite; NaN of NaN."""
+    is_zero = squared <= 0
+    return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
 
 def without_gradient(why: str, values: Tree) -> Tree:

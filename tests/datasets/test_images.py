@@ -86,6 +86,8 @@ def test_resize_is_the_librarys(photo, size):
     for kind, flag in (("cv2_area", cv2.INTER_AREA), ("cv2_linear", cv2.INTER_LINEAR), ("cv2_cubic", cv2.INTER_CUBIC)):
         np.testing.assert_array_equal(resize(photo, size, kind), cv2.resize(photo, size, interpolation=flag))
     np.testing.assert_array_equal(resize(photo, size), resize(photo, size, "pil_bilinear"))
+    with pytest.raises(InputError, match=r"^interpolation='linear': expected one of pil_bilinear, "):
+        resize(photo, size, "linear")
 
 
 @pytest.mark.parametrize(("interpolation", "tolerance"), [

@@ -30,6 +30,10 @@ def check_error(name, root, words, **options):
         published_dataset(name, root, **options)
 
 
+def test_an_unknown_name_lists_the_known_ones(tmp_path):
+    check_error("gardens_pont", tmp_path, "gardens_pont: expected a published data set, of ")
+
+
 # SSM-VPR
 
 

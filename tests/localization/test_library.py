@@ -115,6 +115,8 @@ def test_a_confidence_that_tells_nothing_is_a_warning(street, small_street, tmp_
     truth = mfvpr.datasets.IndexFile(tmp_path / "far.csv")
     with pytest.warns(UserWarning, match=r"scores do not tell correct predictions \(0 of 10\) from"):
         street.calibrate(small_street / "database", small_street / "queries", ground_truth=truth)
+    with pytest.warns(UserWarning, match=r"scores do not tell correct predictions \(10 of 10\) from .* leaves the map"):
+        street.calibrate(small_street / "database", small_street / "database")
 
 
 def test_a_confidence_belongs_to_its_system(small_street, tmp_path):

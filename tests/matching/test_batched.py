@@ -201,6 +201,21 @@ def test_another_data_set_of_the_same_capacities_compiles_nothing(compilations):
     assert compilations.count == 0
 
 
+def test_a_plain_function_is_compiled_once_for_all_queries(compilations):
+    def near(query, candidate):
+        return mfvpr.filter_matches(mfvpr.match(query, candidate), max_distance=0.9)
+
+    for count in (batched.QUERIES, 3 * batched.QUERIES):
+        queries, database = (FeatureSet.of(images_of([20] * number, number)) for number in (count, 40))
+        candidates = shortlist_of(0, count, 40)
+        compilations.reset()
+        match_set = stages.match(queries, database, candidates, near)
+        compiled = compilations.count
+        value = stages.match(queries, database, candidates, NearestNeighborMatcher(max_distance=0.9))
+        np.testing.assert_array_equal(match_set.counts, value.counts)
+    assert compiled == 1  # all else was compiled for the first queries
+
+
 # Several devices
 
 

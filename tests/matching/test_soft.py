@@ -132,7 +132,9 @@ def test_degenerate_images_have_finite_gradients(kind):
 def test_a_temperature_not_above_zero_gives_no_number():
     features = make_features(np.random.default_rng(6), 4)
     for temperature in (0.0, -0.1):
-        assert np.isnan(soft(features, features, temperature=temperature).confidence).all()
+        matches = soft(features, features, temperature=temperature)
+        assert np.isnan(matches.confidence).all()
+        assert np.isnan(matches.distance).all()
 
 
 @given(feature_pairs(), st.sampled_from(["mutual", "opencv_legacy", "none"]))

@@ -84,6 +84,8 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
     Raises:
         InputError: no such folder, or files and images in it that are missing, damaged, or of another layout.
     """
+    if name not in PUBLISHED:
+        raise InputError(f"{name}: expected a published data set, of {', '.join(PUBLISHED)}")
     entry, root = PUBLISHED[name], Path(root)
     if not root.is_dir():
         got = "a file" if root.exists() else "nothing"
