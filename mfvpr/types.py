@@ -27,7 +27,7 @@ Class = TypeVar("Class", bound=type)
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def value(cls: Class) -> Class:
-    """Make a class a frozen dataclass and a pytree, with fields that JAX may transform.
+    """Make the class `cls` a frozen dataclass and a pytree, with fields that JAX may transform.
 
         @value
         class Threshold:
@@ -38,8 +38,7 @@ def value(cls: Class) -> Class:
     program: they are compared, and must be hashable. An integer in a field with a `float` default becomes a float.
     Unflattening calls no `__init__`.
 
-    A compiled program keeps the code of its methods and the values of globals: after a change of those in a running
-    process, define the class again.
+    A compiled program keeps the code of its methods and the values of globals: define the class again to change them.
 
     `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 at least compares its
     nodes without their class. The programs of this library tell the classes apart. With such classes, a `jit` of your
@@ -145,10 +144,13 @@ def per_keypoint(features: Features) -> dict[str, Array]:
 class Matches:
     """Putative matches between a query image (0) and a candidate (1).
 
+        matches = mfvpr.match(features0, features1)  # points0[matches.mask], points1[matches.mask] are real
+
     Attributes:
         points0, points1: `[..., K, 2]` (x, y), px.
         distance: `[..., K]` Euclidean distance of the descriptors, in [0, 2] for unit length.
         scores0, scores1: `[..., K]` detection scores.
+        mask: `[..., K]`, False on padding.
         image_size0, image_size1: `[..., 2]` (width, height), px; None = unknown.
         ratio: `[..., K]` distance to the nearest descriptor of the candidate over the distance to the second nearest,
             in [0, 1]; None unless the matcher was asked for it (`with_ratio=True`).
@@ -200,6 +202,8 @@ def _present(matches: Matches, predicate: Callable[[Field[Any]], bool]) -> dict[
 class Shortlist:
     """Best candidates of the retrieval for each query.
 
+        shortlist = mfvpr.retrieve(query_descriptors, database_descriptors, num_candidates=50)
+
     Attributes:
         indices: database rows, int32, best first, -1 = none.
         scores: retrieval scores (cosine similarity).
@@ -216,6 +220,8 @@ class Shortlist:
 @value
 class Ranking:
     """A re-ranked shortlist.
+
+        np.take_along_axis(shortlist.indices, mfvpr.rerank(scores, shortlist.mask).order, axis=1)  # [Q, C] rows
 
     `order` are positions into the shortlist, int32, best first; `scores` stay in the shortlist's order (not sorted).
     """

@@ -44,7 +44,6 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
 
 
 def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a named system with other values."""
     overrides = {"system": name}
     for setting, value in nodes(settings):
         if not isinstance(value, Mapping):
@@ -58,7 +57,6 @@ def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read_run(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run of `mfvpr evaluate`."""
     if settings:
         raise SettingsError(f"{path}: expected no other settings, got {', '.join(settings)}; load a system by name")
     try:

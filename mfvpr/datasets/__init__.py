@@ -1,5 +1,7 @@
 """Data sets: images, sequences of queries, and the ground truth.
 
+    data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
+
 Read first: datasets (folders of images), truth and positives (what is correct), images (decoding and resizing),
 contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic street).
 """

@@ -55,7 +55,6 @@ class Contents:
         return [hashlib.sha256(self._pixels(file)).hexdigest()[:32] for file in self.files]
 
     def _pixels(self, file: Content) -> bytes:
-        """Everything that determines the pixels of an image."""
         content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
         turned = b"\0turned" if self.folder.orient and file.orientation != 1 else b""
         return content + turned + (b"" if file.largest is None else f"\0bits={self.folder.bits}".encode())
@@ -80,8 +79,9 @@ class Contents:
 def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     """The contents of the files of `folder`.
 
+        contents(mfvpr.datasets.image_folder("day/")).fingerprint
+
     Args:
-        folder: images.
         cache: folder of the record files; None = all files are read. A record file that is damaged, or that another
             process replaces meanwhile, costs time only.
     """
@@ -100,17 +100,19 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
 
 
 def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
-    """Fingerprints of all folders, by side."""
     return {side: folder.fingerprint for side, folder in contents.items()}
 
 
 def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
-    """Conversions of the images when they are read, by side."""
     return {side: folder.summary() for side, folder in contents.items()}
 
 
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each query, the database rows of files with the same content."""
+    """For each of the `queries`, the rows of files in the `database` with the same content.
+
+    Example:
+        own_rows(contents(data.queries), contents(data.database))
+    """
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         if file.sha256:

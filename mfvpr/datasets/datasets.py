@@ -25,6 +25,8 @@ MEANS = ("mean", "pooled")  # names in results of the means over sequences, and 
 class IndexFile:
     """Ground truth of a file of pairs or positions, see `mfvpr.datasets.truth_files.truth_from_file`.
 
+        data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
+
     Attributes:
         path: of the file; for several sequences, in the folder of each.
         is_widened: whether database images within a tolerance in frames are correct as well.
@@ -36,7 +38,11 @@ class IndexFile:
 
 @dataclass(frozen=True)
 class LabelFiles:
-    """Ground truth of two files of labels, see `mfvpr.datasets.truth_files.truth_from_labels`."""
+    """Ground truth of two files of labels, see `mfvpr.datasets.truth_files.truth_from_labels`.
+
+    Example:
+        labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")  # for folder(ground_truth=labels)
+    """
 
     queries: Path | str
     database: Path | str
@@ -47,7 +53,9 @@ GroundTruth = IndexFile | LabelFiles | Truth
 
 @dataclass(frozen=True, repr=False)
 class ImageFolder:
-    """Images below `root`, by relative POSIX path in natural order (image2 before image10).
+    """Images below `root`: `names` are relative POSIX paths in natural order (image2 before image10).
+
+        mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
 
     `orient` and `bits` are those of `mfvpr.datasets.images.read_image`.
     """
@@ -80,6 +88,8 @@ class ImageFolder:
 class QuerySequence:
     """Query images of one drive or walk, with their ground truth; `name` stands in results.
 
+        sequence = mfvpr.datasets.QuerySequence("night", mfvpr.datasets.image_folder("night/"), truth=None)
+
     Attributes:
         truth: which database images are correct; None = no ground truth, rankings only.
         excluded: the database images that are no candidates of each query; None = all images are candidates.
@@ -98,10 +108,8 @@ class QuerySequence:
         """Exclude each query and its neighbors within `neighbors` frames from its candidates; 0 = the query alone.
 
         Excluded images are not correct either: a query without other correct images counts as a failure. `query_rows`
-        are the rows of each query in the database, which is a sequence of `num_database` images.
-
-        Raises:
-            InputError: no query is among the database images, so that their frame numbers are unknown.
+        are the rows of each query in the database, which is a sequence of `num_database` images; an `InputError` if no
+        query is among them.
         """
         if not any(query_rows):
             raise InputError(
@@ -115,7 +123,11 @@ class QuerySequence:
 
 @dataclass(frozen=True, repr=False)
 class Dataset:
-    """One database and at least one sequence of queries; `name` stands in results."""
+    """One database, and `sequences` of queries, at least one; `name` stands in results.
+
+    Example:
+        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth="order")
+    """
 
     name: str
     database: ImageFolder
@@ -156,8 +168,9 @@ class Dataset:
 def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
     """All images below `root`, in subfolders and linked folders as well; hidden files and folders are skipped.
 
+        images = mfvpr.datasets.image_folder("day/")
+
     Args:
-        root: folder.
         orient, bits: see `mfvpr.datasets.images.read_image`.
 
     Raises:
@@ -188,7 +201,7 @@ def folder(
     """Folders of images as a data set: one of database images, and one or several of queries.
 
         data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
-        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth=IndexFile("pairs.csv"))
+        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
 
     Args:
         database: folder of database images.
@@ -221,7 +234,6 @@ def folder(
 def _sequence(
     name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path = Path()
 ) -> QuerySequence:
-    """The queries of a folder with their ground truth; files of a ground truth are below `root`."""
     images = image_folder(queries, orient=database.orient, bits=database.bits)
     names = images.names, database.names
     match ground_truth:

@@ -44,10 +44,11 @@ warnings.filterwarnings("ignore", message="Palette images with Transparency")
 
 
 def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image file as RGB.
+    """Read the image file `path` as RGB.
+
+        image = mfvpr.datasets.read_image("query.jpg")  # [H, W, 3] uint8
 
     Args:
-        path: image file.
         orient: turn the image by its EXIF orientation.
         bits: number of bits in use in 16-bit gray and color files (12-bit cameras write 16 bits as well). The upper 8
             of them are kept: 2^bits - 1 becomes 255, 256 v and 257 v become v. It is the same for all images, so that
@@ -108,6 +109,8 @@ def resize(
 ) -> Num[np.ndarray, "height width 3"]:
     """Resize an image to `size` (width, height) without crop; the aspect ratio changes.
 
+        mfvpr.datasets.resize(image, (640, 480), "cv2_area")  # [H, W, 3]
+
     Pixel centers are at half pixels.
 
     | interpolation | as | result |
@@ -131,11 +134,7 @@ def resize(
 
 
 def read_frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.ndarray]]:
-    """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame.
-
-    Raises:
-        InputError: no video, or a video without readable frames.
-    """
+    """Read (number from 0, image `[H, W, 3]` uint8 RGB) of every `every`-th frame; an InputError if there are none."""
     path = Path(path)
     require_file(path, "a video file")
     video, number = cv2.VideoCapture(str(path)), 0

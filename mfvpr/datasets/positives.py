@@ -18,15 +18,15 @@ _QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 class Positives:
     """Ragged lists of database rows, one per query; memory grows with the number of rows, not with Q x N.
 
-    Create it with `from_rows` or `from_matrix`. `first | second` and `first - second` go query by query.
+        positives = mfvpr.datasets.Positives.from_rows([[0, 1], [], [2]], num_database=4)  # or from_matrix
+        positives.of(0)  # [0, 1]
+
+    `first | second` and `first - second` go query by query. Rows or offsets of another form raise an `InputError`.
 
     Attributes:
         rows: of all queries one after the other; ascending and distinct for each query. int32.
         offsets: `[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`.
         num_database: N.
-
-    Raises:
-        InputError: rows or offsets of another form.
     """
 
     rows: Int[np.ndarray, " _"]
@@ -46,11 +46,7 @@ class Positives:
 
     @classmethod
     def from_rows(cls, rows: Iterable[Sequence[int] | np.ndarray], num_database: int) -> "Positives":
-        """Create from the rows of each query, in any order.
-
-        Raises:
-            InputError: rows outside the database, or no whole numbers.
-        """
+        """Create from the rows of each query, in any order; an `InputError` unless they are rows of the database."""
         per_query = [np.asarray(query_rows) for query_rows in rows]
         flat = np.concatenate([query_rows for query_rows in per_query if len(query_rows)] or [np.zeros(0, np.int32)])
         if flat.dtype.kind not in "iu":
@@ -64,7 +60,7 @@ class Positives:
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
-        """Create from a matrix `[Q, N]` bool."""
+        """Create from a matrix `[Q, N]` bool; another shape raises an `InputError`."""
         matrix = np.asarray(matrix, bool)
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
@@ -168,6 +164,8 @@ def frame_positives(
 ) -> Bool[np.ndarray, "queries database"]:
     """Positives by frame: |database_index - query_index| <= tolerance.
 
+        mfvpr.frame_positives(np.arange(100), np.arange(100), tolerance=2)  # [Q, N]
+
     Args:
         query_index: frame number of each query's place; negative = unknown, no positives.
         database_index: frame number of each database image.
@@ -183,5 +181,10 @@ def frame_positives(
 def radius_positives(
     query_xy: Num[np.ndarray, "queries 2"], database_xy: Num[np.ndarray, "database 2"], *, radius: float = 25.0
 ) -> Bool[np.ndarray, "queries database"]:
-    """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64."""
+    """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64.
+
+    Example:
+        query_xy, database_xy = np.array([[0.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 40.0]])
+        mfvpr.radius_positives(query_xy, database_xy, radius=25.0)  # [[True, False]]
+    """
     return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()

@@ -31,7 +31,11 @@ FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 
 
 class Truth(ABC):
-    """The correct database images of each query."""
+    """The correct database images of each query, as a base class for ground truth of your own.
+
+    Example:
+        data.truth.positives(2).of(5)  # database rows within 2 frames of query 5
+    """
 
     @property
     @abstractmethod
@@ -74,6 +78,8 @@ def threshold_words(unit: Unit, threshold: float) -> str:
 @dataclass(frozen=True)
 class FrameTruth(Truth):
     """The database rows that show each query's place; neighbors within a tolerance in frames count as well.
+
+        mfvpr.datasets.FrameTruth(((0,), (2, 3), ()), num_database=5).positives(1).of(0)  # [0, 1]
 
     Attributes:
         rows: per query; empty = unknown place, which counts as a failure.
@@ -120,7 +126,12 @@ class FrameTruth(Truth):
 
 @dataclass(frozen=True)
 class RadiusTruth(Truth):
-    """Positions in meters; database images within a radius of the query are correct."""
+    """Positions in meters; database images within a radius of the query are correct.
+
+    Example:
+        xy = np.stack([2.0 * np.arange(10), np.zeros(10)], axis=1)  # a position every 2 m
+        mfvpr.datasets.RadiusTruth(query_xy=xy[5:6], database_xy=xy).positives(4.0).of(0)  # [3, 4, 5, 6, 7]
+    """
 
     unit: ClassVar[Unit] = "m"
     query_xy: Num[np.ndarray, "queries 2"]
@@ -137,7 +148,12 @@ class RadiusTruth(Truth):
 
 @dataclass(frozen=True)
 class LabelTruth(Truth):
-    """Labels of floors or rooms as numbers; database images with the query's label are correct. -1 = no label."""
+    """Labels of floors or rooms as numbers; database images with the query's label are correct. -1 = no label.
+
+    Example:
+        truth = mfvpr.datasets.LabelTruth(query_labels=np.array([1, -1]), database_labels=np.array([0, 1, 1]))
+        truth.positives().of(0)  # [1, 2]
+    """
 
     unit: ClassVar[Unit] = "exact"
     query_labels: Int[np.ndarray, " queries"]
@@ -158,7 +174,11 @@ class LabelTruth(Truth):
 
 @dataclass(frozen=True)
 class AllowedTruth(Truth):
-    """Ground truth without the database images that are `excluded` from the candidates of each query."""
+    """Ground `truth` without the database images that are `excluded` from the candidates of each query.
+
+    Example:
+        mfvpr.datasets.AllowedTruth(data.truth, excluded=data.truth.positives(0)).positives(1).of(0)  # [1]
+    """
 
     truth: Truth
     excluded: Positives
@@ -184,7 +204,6 @@ class AllowedTruth(Truth):
 
 
 def require_positions(where: str, xy: np.ndarray, count: int) -> None:
-    """Raise an InputError unless there is a position in meters for each of `count` images."""
     if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
         got = f"shape {list(xy.shape)}" if xy.shape != (count, 2) else f"{np.abs(xy).max():g} m"
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")

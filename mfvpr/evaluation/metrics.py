@@ -35,6 +35,8 @@ def recall_at_k(
 ) -> Float[np.ndarray, " ks"]:
     """Fraction of ALL queries with a positive among their first k.
 
+        mfvpr.recall_at_k([[0, 1], [2, 1]], np.eye(2, 3, dtype=bool), ks=[1, 2])  # [0.5, 1.0]
+
     Args:
         order: `[Q, C]` database rows, best first; -1 = none.
         positives: a query without positives counts as a failure.

@@ -72,6 +72,8 @@ class Pipeline:
 class System:
     """Matches -> scores -> rankings: by the retrieval, by each scorer, and by combined scores.
 
+        system = mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()})
+
     Attributes:
         pipeline: finds and matches candidates.
         scorers: by name.
@@ -121,10 +123,8 @@ class System:
     def warm_up(self, image_size: tuple[int, int]) -> None:
         """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.
 
-        Programs depend on the number of features in steps, so that other images may compile a few more. A map compiles
-        programs of its own: see `Map.warm_up`.
-
-        `image_size` is (width, height) px, before images are resized to the size of the extractor. An extractor that
+        `image_size` is (width, height) px, before images are resized to the size of the extractor. Images with other
+        numbers of features may compile a few more programs, and so does a map: see `Map.warm_up`. An extractor that
         reads features raises an `InputError`.
         """
         extractor, candidates = self.pipeline.extractor, self.pipeline.candidates

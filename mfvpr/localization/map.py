@@ -39,15 +39,14 @@ from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 class Map(MapImages):
     """Images with their places in a folder, in which one image at a time is localized.
 
-        street = Map.create("map", "day/", mfvpr.load_system("mfvpr"))
+        street = Map.create("map", "day/", mfvpr.load_system("steering"))
         street.calibrate("day/", "night/", ground_truth="order")
         street.localize("query.jpg").place
         street = Map.open("map")  # later, and in other processes
 
     Any number of processes read the same folder while one adds to it; they see complete rows only. Any number of
-    threads use the same `Map`, which serves one at a time; open another one to localize while `build` runs.
-
-    Compiled programs stay on disk, see `mfvpr.utils.compiled_programs`: the next process starts fast.
+    threads use the same `Map`, which serves one at a time; open another one to localize while `build` runs. Compiled
+    programs stay on disk, see `mfvpr.utils.compiled_programs`: the next process starts fast.
     """
 
     def __init__(
@@ -90,8 +89,7 @@ class Map(MapImages):
     def open(cls, folder: Path | str, *, threshold: float | None = None, runtime: Runtime = DEFAULT_RUNTIME) -> "Map":
         """Open a map that `create` or `mfvpr map build` made, with the system and the confidence in its folder.
 
-        Raises:
-            InputError: there is no map, or it was made with a system of your own: `Map(folder, system)` opens it.
+        An `InputError` says that there is no map, or one with a system of your own: `Map(folder, system)` opens it.
         """
         return cls(folder, read_system(Path(folder)), threshold=threshold, runtime=runtime)
 
@@ -139,7 +137,7 @@ class Map(MapImages):
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0) -> Prediction:
-        """Find where an image was taken; see `localize_with_evidence`."""
+        """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
         return self.localize_with_evidence(image, recent=recent).prediction
 
     @exclusive
@@ -166,10 +164,7 @@ class Map(MapImages):
 
     @exclusive
     def warm_up(self) -> None:
-        """Compile what the first `localize` needs, so that no image of a drive waits for it; the map stays as it is.
-
-        An empty map raises an `InputError`.
-        """
+        """Compile what the first `localize` needs; the map stays as it is. An empty map raises an `InputError`."""
         described = self._refresh_images()
         _, vector = described.describing.image(noise_image())
         rows, _ = self._vectors.nearest(vector, 1)
@@ -177,14 +172,12 @@ class Map(MapImages):
             self._localize(described, (features, vector), self._vectors.total)
 
     def _refresh_images(self) -> DescribedMap:
-        """The parts of a map with images."""
         self.refresh()
         if not len(self) or self._described is None:
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
         return self._described
 
     def _localize(self, described: DescribedMap, description: Described, end: int) -> Localization:
-        """Localize an image that has been described, in the rows before `end`."""
         features, vector = description
         if strength(features) < LEAST_STRENGTH * described.strength(end):
             return refusal("too few features", description)
@@ -239,7 +232,6 @@ def _whole_number(name: str, value: Any) -> int:
 
 
 def _extractor(system: System) -> Extractor:
-    """The extractor of a system; an InputError if a map cannot use it."""
     extractor, candidates = system.pipeline.extractor, system.pipeline.candidates
     if isinstance(extractor, Source):
         name = type(extractor).__name__

@@ -16,7 +16,7 @@ from mfvpr.utils.numerics import as_array, compiled, is_concrete
 
 
 class Matcher(Protocol):
-    """Function of the features of a query and of a candidate, one pair, that returns their Matches.
+    """Function of the features `[N0]` of a query and `[N1]` of a candidate that returns their Matches.
 
         def near(features0, features1):
             return mfvpr.filter_matches(mfvpr.match(features0, features1), max_distance=0.7)
@@ -36,6 +36,8 @@ class Matcher(Protocol):
 class NearestNeighborMatcher:
     """Nearest neighbors with their ratio; settings as in `mfvpr.match` and `mfvpr.filter_matches`.
 
+        matcher = mfvpr.NearestNeighborMatcher(cross_check="mutual", max_distance=0.7, max_matches=500)
+
     `chunk_size` is that of `match_candidates`; it changes only memory and the last bits.
     """
 
@@ -47,7 +49,7 @@ class NearestNeighborMatcher:
     chunk_size: int | None = field(default=None, metadata={"static": True})
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Matches of one pair, with the slots of `match`."""
+        """Matches of one pair, with the slots `[K]` of `match`."""
         matches = match(features0, features1, cross_check=self.cross_check, with_ratio=True)
         return filter_matches(matches, max_distance=self.max_distance, max_matches=self.max_matches)
 
@@ -64,12 +66,12 @@ def match_pairs(
 ) -> Matches:
     """Match the first `count` pairs of images; another count needs no new program, and unused pairs cost no time.
 
+        mfvpr.match_pairs(queries, candidates, np.array([[0, 2], [1, 0]], np.int32), count=2)  # [P, K]
+
     Args:
         queries: keypoints `[B, N0, 2]`.
         candidates: keypoints `[S, N1, 2]`.
         pairs: int32 rows of queries and candidates, `[P, 2]`; an `InputError` if there are no such images.
-        count: number of pairs to match.
-        matcher: of one pair.
 
     Returns:
         Matches with leading axis P and the slots of the matcher; pairs beyond `count` have no matches.

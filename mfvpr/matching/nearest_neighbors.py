@@ -27,6 +27,8 @@ def match(
 ) -> Matches:
     """Nearest neighbors of one pair of images (paper, section IV-A).
 
+        matches = mfvpr.match(features0, features1, with_ratio=True)
+
     Slot k of the result belongs to keypoint k of image 0 (K = N0), or of image 1 (K = N1) where cross_check is
     `candidate`; the first index wins a tie.
 
@@ -67,9 +69,11 @@ def match_candidates(
 ) -> Matches:
     """`match` of one query, keypoints `[N0, 2]`, with C candidates, keypoints `[C, N1, 2]`.
 
-    `chunk_size` is the number of candidates with similarity matrices in memory at the same time; by default one on a
-    CPU, where the matrix stays in the cache, and as many as fit a small part of an accelerator's memory. The matches
-    have a leading axis C and the slots of `match`.
+        candidate_matches = mfvpr.match_candidates(query, candidates)  # [C, K]
+
+    `cross_check`, `with_ratio` and the slots are those of `match`; other shapes raise a ValueError. `chunk_size` is the
+    number of candidates with similarity matrices in memory at the same time; by default one on a CPU, where the matrix
+    stays in the cache, and as many as fit a small part of an accelerator's memory.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
@@ -111,7 +115,9 @@ def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features)
 def filter_matches(
     matches: Matches, *, max_distance: float | Float[Array, ""] | None = None, max_matches: int | None = None
 ) -> Matches:
-    """Keep matches of one pair up to `max_distance`, and of these the `max_matches` closest.
+    """Keep matches `[K]` of one pair up to `max_distance`, and of these the `max_matches` closest.
+
+        mfvpr.filter_matches(matches, max_distance=0.8, max_matches=500)
 
     Only the mask changes; among equal distances the first slots are kept.
     """
@@ -125,7 +131,9 @@ def filter_matches(
 
 
 def compact(matches: Matches, capacity: int) -> Matches:
-    """Move the real matches of one pair to the front of `capacity` slots, in their order.
+    """Move the real matches of one pair `[K]` to the front of `capacity` slots, in their order.
+
+        mfvpr.compact(mfvpr.filter_matches(matches, max_matches=500), capacity=512)
 
     The cost of all later steps is proportional to K or K^2, so that few slots are faster. Matches beyond the capacity
     are dropped: compare `matches.mask.sum()` with it.
@@ -175,7 +183,6 @@ def make_matches(
 
 
 def _swap_images(matches: Matches) -> Matches:
-    """The same matches with query and candidate swapped."""
     sides = [(f.name, f"{f.name[:-1]}1") for f in fields(matches) if f.name.endswith("0")]
     query = {name0: getattr(matches, name1) for name0, name1 in sides}
     candidate = {name1: getattr(matches, name0) for name0, name1 in sides}

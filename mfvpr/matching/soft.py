@@ -12,6 +12,8 @@ from mfvpr.utils.numerics import as_float, masked, positive, safe_sqrt
 def soft_match(features0: Features, features1: Features, *, temperature: float | Float[Array, ""]) -> Matches:
     """Smooth version of `match`: a dual softmax over the similarities s_ij.
 
+        matches = mfvpr.soft_match(features0, features1, temperature=0.1)
+
     See Rocco et al., NeurIPS 2018. Let R be the softmax of s / T over the candidate's keypoints j, and C the softmax
     over the query's keypoints i. Slot i holds the means of points, scores and squared distances 2 - 2 s_ij under R,
     with confidence sum_j R_ij C_ij. For T -> 0 this is `match`: the nearest neighbor, with confidence 1 if it is

@@ -1,10 +1,5 @@
 """Evaluation in one call, and its result: tables, predictions, run folders and a page.
 
-    data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
-    result = mfvpr.evaluate(data, mfvpr.load_system("mfvpr"))
-    print(result.table())
-    result.write_report("report.html")
-
 `mfvpr.evaluation.rank_dataset` ranks; this module reports.
 """
 
@@ -84,6 +79,10 @@ def evaluate(
 class Result:
     """Rankings of data sets by systems, the result of `mfvpr.evaluate`.
 
+        print(result.table())
+        result.save("run")
+        result.write_report("report.html")
+
     `thresholds` are largest distances of a correct prediction in the unit of the ground truth, `ks` depths of recall.
     The defaults are those of the programs: 1, 2 and 5 frames or 25 m, and 1, 5 and 10.
 
@@ -159,10 +158,8 @@ class Result:
     def save(self, folder: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> list[Path]:
         """Write the files of `mfvpr evaluate` but its figures, for `mfvpr report`, and return the run folders.
 
-        Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table.
-
-        Raises:
-            InputError: the folder is not empty.
+        Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table. A folder
+        that is not empty raises an `InputError`.
         """
         from mfvpr.report.run_files import save_run  # here, since SciPy's statistics take 0.3 s
 
@@ -188,7 +185,6 @@ class Result:
                 one_run.write_report(folders[0], Path(path))
 
     def _names(self, place: Literal[0, 1]) -> list[str]:
-        """Names of the data sets, or of the systems."""
         return list(dict.fromkeys(names[place] for names in self.parts))
 
     def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> list[tuple[tuple[str, str], EvaluationReport]]:

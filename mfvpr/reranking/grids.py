@@ -34,15 +34,17 @@ WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a matc
 
 
 def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> Float[jax.Array, "*grid candidates"]:
-    """Scores of every combination of parameter values, `[len(axis1), len(axis2), ..., C]`, from matches `[C, K, ...]`.
+    """Scores of every combination of parameter values, `[len(axis1), ..., C]`, from matches `[C, K, ...]`.
+
+        scorer = mfvpr.HistogramOfShifts()
+        mfvpr.score_grid(scorer, candidate_matches, sigma=[10.0, 22.5], weight=["ratio", "fs"])  # [sigma, weight, C]
 
     Each capacity of bins is one traced computation, so that fine bins do not slow coarse bins down. Other values within
     the same capacities cost no compilation, other lengths do. With a plain function, every call compiles. An axis that
     is empty, not one-dimensional, or names no numeric parameter of the scorer raises a `ValueError`.
 
-    The axes are values of the scorer's numbers, e.g. `sigma=[10., 22.5], bin_size=[10., 15.]`; of numbers of its parts,
-    `**{"inner.sigma": [10., 22.5]}`; of `max_distance`, beyond which matches do not count; and of `weight`, e.g.
-    `weight=["ratio", UnitWeight(), ...]`.
+    The `axes` are values of the scorer's numbers; of numbers of its parts, `**{"inner.sigma": [10., 22.5]}`; of
+    `max_distance`, beyond which matches do not count; and of `weight`, by name or a value such as `UnitWeight()`.
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
@@ -150,7 +152,6 @@ def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weight
 
 
 def _apply_weighting(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
-    """The scorer with the weight, and the matches within the distance, of one weighting."""
     near = filter_matches(matches, max_distance=weighting.get("max_distance"))
     if "weight" not in weighting:
         return scorer, near
@@ -160,7 +161,6 @@ def _apply_weighting(scorer: Any, matches: Matches, weighting: Mapping[str, Arra
 def _weights_of_pair(
     scorer: Any, weightings: Mapping[str, Array], matches: Matches
 ) -> Float[jax.Array, "weightings slots"]:
-    """Weights of one pair's matches."""
 
     def weigh(weighting: dict[str, Array]) -> Array:
         varied, near = _apply_weighting(scorer, matches, weighting)
@@ -170,7 +170,6 @@ def _weights_of_pair(
 
 
 def _score_weightings(scorer: Any, weightings: Mapping[str, Array], matches: Matches) -> Array:
-    """Scores `[W]` of one pair."""
 
     def score_weighting(weighting: dict[str, Array]) -> Array:
         varied, near = _apply_weighting(scorer, matches, weighting)
@@ -217,7 +216,6 @@ def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Arr
 
 
 def _weights(scorer: Any, axes: Mapping[str, Any]) -> tuple[Weight, ...]:
-    """Weights of the `weight` axis; none without the axis."""
     if "weight" not in axes or not hasattr(scorer, "weight"):
         return ()
     weights = tuple(map(named_weight, axes["weight"]))

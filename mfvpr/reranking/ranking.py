@@ -32,7 +32,9 @@ BIN_STEP = 8  # capacities of histograms are multiples of it
 
 
 def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " candidates"]:
-    """Scores of matches `[C, K, ...]`.
+    """Scores of matches `[C, K, ...]`; other shapes raise a ValueError.
+
+        mfvpr.score_candidates(mfvpr.HistogramOfShifts(), candidate_matches)  # [C]
 
     The program is compiled once per shape, and reused for other numbers in the scorer. A scorer that is or holds a
     plain function runs operation by operation. Capacities (`max_bins` of the histogram) are fitted to the image sizes;
@@ -51,7 +53,6 @@ def _score_candidates(scorer: Scorer, matches: Matches) -> jax.Array:
 
 
 def check_candidates(matches: Matches) -> None:
-    """Raise a ValueError unless the matches are `[C, K, ...]`."""
     if np.ndim(matches.mask) != 2:
         shape = np.shape(matches.mask)
         raise ValueError(f"expected matches [C, K, ...] of candidates, got a mask of shape {shape}; of one pair "
@@ -76,6 +77,8 @@ def combine(
 ) -> Num[Array, "*batch candidates"]:
     """Combined score s = c s_f + s_r of retrieval and re-ranking scores, equation 4 (paper, section IV-E).
 
+        mfvpr.combine(filter_scores=shortlist.scores, rerank_scores=scores, c=1e6)  # [Q, C]
+
     c has units of the re-ranking score; the paper's 1e6 suits the scores of D2-Net's features.
     """
     filter_scores, rerank_scores = map(_wide, (filter_scores, rerank_scores))
@@ -93,7 +96,12 @@ def balancing_c(
     rerank_scores: Num[Array, " candidates"],
     mask: Bool[Array, " candidates"],
 ) -> Float[jax.Array, ""]:
-    """The c with which both scores of one query's candidates have the same standard deviation, in any unit."""
+    """The c with which both scores of one query's candidates have the same standard deviation, in any unit.
+
+        mfvpr.balancing_c(shortlist.scores[0], scores[0], shortlist.mask[0])
+
+    `retrieval_scores` and `rerank_scores` count where they are finite and `mask` is True.
+    """
 
     def deviation(scores: Array) -> Array:
         return masked_std(_wide(scores), mask & jnp.isfinite(scores))
@@ -182,7 +190,6 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
 
 
 def breaks_ties_by_row(ties: Ties) -> bool:
-    """Whether ties are broken by the database row."""
     require_word("ties", ties, Ties)
     return ties == "index"
 
@@ -203,8 +210,10 @@ def rank(
 ) -> Int[jax.Array, "*batch candidates"]:
     """Positions, int32, in descending order of `scores`.
 
+        mfvpr.rank(np.array([0.2, 0.9, 0.5]))  # [1, 2, 0]
+
     Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break`, such as the database
-    index. NaN comes after all numbers, masked entries last.
+    index. NaN comes after all numbers, and entries where `mask` is False come last.
     """
     return _rank(_in_32_bits(as_array(scores)), mask, _in_32_bits(as_array(tie_break)))
 
@@ -232,5 +241,9 @@ def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
 def rerank(
     scores: Float[Array, "*queries candidates"], mask: Bool[Array, "*queries candidates"] | None = None
 ) -> Ranking:
-    """Ranking of a shortlist by the re-ranking scores of its candidates."""
+    """Ranking of a shortlist by the re-ranking `scores` of its candidates; False in `mask` = no candidate.
+
+    Example:
+        ranking = mfvpr.rerank(scores, shortlist.mask)
+    """
     return Ranking(order=rank(scores, mask), scores=scores)

@@ -180,11 +180,13 @@ def retrieve(
 ) -> Shortlist:
     """Find the database images that are most similar to each query.
 
+        shortlist = mfvpr.retrieve(query_descriptors, database_descriptors, num_candidates=50)
+
     Args:
         query_descriptors: unit length.
         database_descriptors: unit length.
         num_candidates: if there are fewer database images, the shortlist ends in -1.
-        mask: False for database images that must not appear (for that query).
+        mask: False for database images that must not appear (for that query); another shape raises an `InputError`.
 
     Returns:
         Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor

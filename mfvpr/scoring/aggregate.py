@@ -16,6 +16,8 @@ from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, s
 class AggregatedScore:
     """Weighted sum over matches of the closeness of their shift to the mean shift, equation 3.
 
+        mfvpr.AggregatedScore(mean="median", clamp=True)(matches)
+
     The score, in units of the weight times px^2, is
 
         s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2),
@@ -40,7 +42,7 @@ class AggregatedScore:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         weights = match_weights(self.weight, matches)
         shifts = match_shifts(matches)
         confidence = match_confidence(matches)

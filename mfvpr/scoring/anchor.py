@@ -24,6 +24,8 @@ _LEAST_SHARE = 1e-12  # smallest share of the winner's votes: keeps the gradient
 class AnchorPoints:
     """Agreement of the displacements of neighboring cells, equation 2.
 
+        mfvpr.AnchorPoints(num_bins=15, tolerance=3.0)(matches)
+
     The score is summed over all anchors a (the paper's (i, j)) and all cells b in the window N around a (its (k, l)):
 
         s = sum_a w_a sum_{b in N} max(t - |d_a - d_b|, 0),
@@ -33,8 +35,8 @@ class AnchorPoints:
     weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side. Memory grows with the square of the number of cells, or of matches if there are
-            fewer; the memory of the soft form grows with the fourth power of num_bins.
+        num_bins: cells per side, from 1 to 215 (else a ValueError). Memory grows with the square of the number of
+            cells, or of matches if there are fewer; that of the soft form with the fourth power of num_bins.
         window: width of N, the square window around an anchor, cells.
         tolerance: t, distance of two displacements from which on they do not agree, cells.
         weight: match weight, FS by default as in the paper.
@@ -73,7 +75,7 @@ class AnchorPoints:
             raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         cells = self._cells if self.temperature is None else self._soft_cells
         index, rows, columns, occupancy, weights = cells(matches)
         # Two [cells, cells] planes, not one array with a trailing axis of 2, which costs nine times as much on a CPU.

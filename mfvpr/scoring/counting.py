@@ -13,7 +13,7 @@ from mfvpr.types import Matches, value
 class MatchCount:
     """Number of matches, each counted with its confidence.
 
-    The score is smooth for matches of `mfvpr.soft_match`.
+        mfvpr.MatchCount()(mfvpr.soft_match(features0, features1, temperature=0.1))  # a smooth score
 
     Attributes:
         single: score of a pair with exactly one match: `count` it, or `zero`, as SelaVPR's code does by accident.
@@ -24,7 +24,7 @@ class MatchCount:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         confidence = match_confidence(matches)
         score = jnp.sum(confidence)
         return score if self.single == "count" else jnp.where(jnp.sum(confidence != 0) == 1, 0.0 * score, score)

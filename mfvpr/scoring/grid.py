@@ -23,6 +23,8 @@ _OUTSIDE = {"unequal": -1000, "zero": 0}
 class GridAnchors:
     """Number of pairs (anchor, cell of its patch) that agree, the anchors themselves included.
 
+        mfvpr.GridAnchors(side=26)(mfvpr.match(cells0, cells1, cross_check="candidate"))  # of 26 x 26 cells
+
     The score counts as the public code does. That code compares flat cell numbers, so that an expected cell may lie at
     the other end of a row (`wrap`), and the padding around the grid takes part (`outside`). With `wrap` False neither
     happens. A cell without a match never agrees, not even with itself. If a cell has several matches, the match with
@@ -30,7 +32,7 @@ class GridAnchors:
 
     Attributes:
         side: cells per side of both images; every cell is a keypoint: 40 at 336 px, 26 at 224, 54 at 448.
-        patch: n, odd; None = three quarters of the side, rounded down to an odd number.
+        patch: n, odd and up to the side (else an InputError); None = 3/4 of the side, rounded down to an odd number.
         wrap: compare flat cell numbers, as published; False: displacements in rows and columns.
         outside: value of the padding: "unequal" (-1000) as in the public code on a CPU, which equals no expected cell
             up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
@@ -59,7 +61,7 @@ class GridAnchors:
         return max(1, size - (size % 2 == 0))
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32; NaN if the number of keypoints is not side^2, or an index is out of range.
+        """Score of one pair `[K]`, float32; NaN if there are not side^2 keypoints, or an index is out of range.
 
         Matches without `index0` or `index1` raise an `InputError`.
         """

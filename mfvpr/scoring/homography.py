@@ -34,6 +34,8 @@ class Estimate(NamedTuple):
 class Homography:
     """Number of inliers of the best homography that RANSAC finds.
 
+        mfvpr.Homography(threshold=24.0)(matches)
+
     An inlier is a match with its candidate point mapped to within `threshold` of its query point. The samples of a pair
     depend on its matches alone. Each match counts with its confidence. There is no gradient.
 
@@ -63,7 +65,7 @@ class Homography:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         return self.estimate(matches).score
 
     def estimate(self, matches: Matches) -> Estimate:

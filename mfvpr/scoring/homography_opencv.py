@@ -16,6 +16,8 @@ from mfvpr.utils.numerics import available_cpus, is_concrete
 class OpenCvHomography:
     """s = number of inliers of cv2.findHomography, from the candidate's points to the query's.
 
+        mfvpr.score_candidates(mfvpr.OpenCvHomography(), candidate_matches)  # [C]
+
     The score runs on the host: all functions of the library accept it, but `jit`, `vmap` and gradients do not. (JAX's
     callbacks may deadlock.) OpenCV's samples depend on the order of the matches, so that matches are sorted by
     `index0`, or by their coordinates without it. A match of confidence 0 is ignored, all others count fully. OpenCV 4
@@ -38,7 +40,7 @@ class OpenCvHomography:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
-        """Score of one pair, float32; an `InputError` if anything is traced, or a number is out of bounds."""
+        """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""
         if not is_concrete((self, matches)):
             raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
                              "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip

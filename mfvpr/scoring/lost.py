@@ -19,14 +19,16 @@ _SMALLEST = 1e-12  # below what float32 resolves of a cosine distance, and below
 class LostScore:
     """Score s = log(1 + 1 / L): LoST's best candidate has the smallest L; 0 without matches.
 
+        mfvpr.LostScore(mirrored=True)(matches)
+
     L = (1 - cos(v x0, v x1)) / (n |v|) over the n matches. x0 and x1 are the positions along x in both images, px.
     v = max d - d, where d are the cosine distances of the descriptors, distance^2 / 2, divided by their sum. A match
     counts with its confidence in all sums. L can be restored as 1 / (e^s - 1). LoST also multiplies L by the distance
     of the images' global descriptors, which matches do not hold, and matches by channels and semantic labels.
 
     If all distances are equal, for instance of a single match, v is 0 and L infinite, so that s = 0. Two matches are
-    always perfect: with few matches the score says little.
-    1 - cos and the `described` L are at least 1e-12; 1 - cos is 1 if all positions with a weight are 0.
+    always perfect: with few matches the score says little. 1 - cos and the `described` L are at least 1e-12; 1 - cos is
+    1 if all positions with a weight are 0.
 
     Attributes:
         form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, LoST's program without descriptors of
@@ -40,7 +42,7 @@ class LostScore:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         confidence = match_confidence(matches)
         x0, x1 = (masked(at_least_single(points), matches.mask)[:, 0] for points in (matches.points0, matches.points1))
         if self.mirrored:
@@ -65,12 +67,10 @@ def _weighted_terms(x0: _Values, x1: _Values, distance: _Values, confidence: _Va
 
 
 def _unweighted_terms(x0: _Values, x1: _Values, _: _Values, confidence: _Values) -> _Terms:
-    """n, and the cosine distance of x0 and x1."""
     return jnp.sum(confidence), _cosine_distance(x0, x1, confidence)
 
 
 def _described_terms(x0: _Values, x1: _Values, distance: _Values, confidence: _Values) -> _Terms:
-    """1 if there are matches, else 0; and the sum of |x1 - x0| distance^2 / 2."""
     has_matches = jnp.any(confidence > 0).astype(confidence.dtype)
     return has_matches, jnp.sum(confidence * jnp.abs(x1 - x0) * distance**2 / 2)
 

@@ -17,15 +17,15 @@ MAX_LENGTH = 8  # the number of phrases of 100,000 matches still fits into float
 class VisualPhrases:
     """Number of phrases: groups of `length` matches with shifts in the same cell.
 
+        mfvpr.VisualPhrases(length=2, cell_size=15.0)(matches)
+
     s = sum over cells of C(m, length), where m matches have a shift in the cell. The plane of shifts, points1 -
     points0, is divided into square cells. Length 1 counts matches, length 2 pairs of matches that agree. A phrase
     counts the product of its matches' confidences, so that matches of confidence 0 do not count. The score is 0 if no
-    cell has `length` matches.
-
-    The score is smooth in the confidences, and constant in the points within a cell (gradient 0).
+    cell has `length` matches. It is smooth in the confidences, and constant in the points within a cell (gradient 0).
 
     Attributes:
-        length: matches per phrase.
+        length: matches per phrase, from 1 to 8 (else a ValueError).
         cell_size: width of the cells, px; not above 0 scores NaN.
         align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the upper cell.
     """
@@ -40,7 +40,7 @@ class VisualPhrases:
             raise ValueError(f"VisualPhrases(length={self.length}): expected from 1 to {MAX_LENGTH} matches")
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32."""
+        """Score of one pair `[K]`, float32."""
         confidence, cells = match_confidence(matches), self._cells(matches)
         rows, columns, votes = jax.lax.sort((cells[:, 1], cells[:, 0], confidence), num_keys=2)
         differs = (rows != jnp.roll(rows, 1)) | (columns != jnp.roll(columns, 1))

@@ -15,6 +15,8 @@ from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_fin
 class RapidSpatialScore:
     """s = sum_k ((X - |x_k - mean x|)^2 + (Y - |y_k - mean y|)^2) over the shifts, in px^2.
 
+        mfvpr.RapidSpatialScore()(matches)
+
     A match counts with its confidence, in the means and in the sum. A shift further than X from the mean counts more
     again. If X and Y are the image size, the score is `AggregatedScore` with weight 1.
 
@@ -35,7 +37,7 @@ class RapidSpatialScore:
     __post_init__ = check_choices
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Score of one pair, float32; an InputError if `per_feature` is set and the matches have no `count0`."""
+        """Score of one pair `[K]`, float32; an InputError if `per_feature` is set and the matches have no `count0`."""
         confidence, shifts = match_confidence(matches), match_shifts(matches)
         residuals = jnp.abs(shifts - masked_mean(shifts, matches.mask, confidence)[None])
         closeness = self._reach(matches, shifts, confidence > 0)[None] - residuals

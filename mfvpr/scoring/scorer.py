@@ -16,11 +16,11 @@ class Scorer(Protocol):
 
         def near(matches):
             distances = jnp.linalg.norm(mfvpr.match_shifts(matches), axis=-1)
-            return jnp.sum(mfvpr.masked(distances < 20.0, matches.mask)).astype(jnp.float32)
+            return jnp.sum((distances < 20.0) & matches.mask).astype(jnp.float32)
 
-        near(matches)                           # [] of one pair [K, ...]
-        mfvpr.score_candidates(near, matches)   # [C] of pairs [C, K, ...]
-        mfvpr.System(pipeline, {"near": near})  # of a data set, or in a map
+        near(matches)                                    # [] of one pair [K, ...]
+        mfvpr.score_candidates(near, candidate_matches)  # [C] of pairs [C, K, ...]
+        mfvpr.System(pipeline, {"near": near})           # of a data set, or in a map
 
     A larger score means that both images more likely show the same place. The score is exactly 0 without matches. It
     does not depend on the order of the matches, nor on the amount and content of padding.
@@ -55,13 +55,11 @@ def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
 
 
 def require_scores(name: str, scores: Array, pairs: int) -> None:
-    """Raise an InputError unless the scores are a real number for each pair."""
     if scores.shape != (pairs,):
         raise InputError(f"{name}: expected a number for each of {pairs} pairs, got an array {list(scores.shape)}")
     require_real(name, scores)
 
 
 def require_real(name: str, scores: Array) -> None:
-    """Raise an InputError unless the scores are real numbers."""
     if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
         raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")

@@ -13,7 +13,11 @@ from mfvpr.utils.numerics import at_least_single, masked
 
 
 def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
-    """points1 - points0 of one pair, px; 0 on padding."""
+    """Shifts points1 - points0 of one pair's `matches`, slots `[K]`, in px; 0 on padding.
+
+    Example:
+        mfvpr.match_shifts(matches)  # [K, 2], (x, y)
+    """
     start, end = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
     return end - start
 
@@ -39,14 +43,18 @@ def _scale_about_center(points: Array, image_size: Array, factor: float) -> Floa
 
 
 def require_sizes(*image_sizes: Array | None) -> None:
-    """Raise an InputError if the sizes of images are not known."""
     if any(size is None for size in image_sizes):
         raise InputError("image_size: expected the sizes of both images, which this score needs, got None; give "
                          "Features.of(..., image_size=(width, height))")  # fmt: skip
 
 
 def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
-    """Sizes (width, height) of query and candidate, px; invalid ones are 1 without matches, unknown ones an error."""
+    """Sizes (width, height) of query and candidate, px, of one pair's `matches`, slots `[K]`.
+
+        (width0, height0), (width1, height1) = mfvpr.image_sizes(matches)
+
+    Without matches, invalid sizes are 1. Sizes that are None raise an `InputError`.
+    """
     require_sizes(matches.image_size0, matches.image_size1)
     has_matches = jnp.any(matches.mask)
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
@@ -75,5 +83,4 @@ def where_usable(
 
 
 def are_finite(shifts: Float[Array, "..."], weights: Float[Array, "weightings slots"]) -> Bool[Array, " weightings"]:
-    """Whether all shifts and the weights are finite."""
     return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

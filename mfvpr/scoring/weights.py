@@ -29,7 +29,11 @@ class Weight(Protocol):
 
 @value
 class FeatureScoreWeight:
-    """FS-weight: w = scores0 + scores1, in units of the detector's scores."""
+    """FS-weight: weights `[K]` w = scores0 + scores1, in units of the detector's scores.
+
+    Example:
+        mfvpr.HistogramOfShifts(weight=mfvpr.FeatureScoreWeight())  # or "fs" in grids and settings
+    """
 
     def __call__(self, matches: Matches) -> Float[jax.Array, "*batch slots"]:
         return as_float(matches.scores0) + as_float(matches.scores1)
@@ -37,7 +41,11 @@ class FeatureScoreWeight:
 
 @value
 class DescriptorDistanceWeight:
-    """DMF-weight: w = 2 - distance, in [0, 2]."""
+    """DMF-weight: weights `[K]` w = 2 - distance, in [0, 2] for descriptors of unit length.
+
+    Example:
+        mfvpr.HistogramOfShifts(weight=mfvpr.DescriptorDistanceWeight())  # "dmf" in grids and settings
+    """
 
     def __call__(self, matches: Matches) -> Float[Array, "*batch slots"]:
         return 2.0 - matches.distance
@@ -45,7 +53,9 @@ class DescriptorDistanceWeight:
 
 @value
 class RatioWeight:
-    """w = (1 - ratio)^exponent, in [0, 1], from the ratio of descriptor distances.
+    """Weights `[K]` w = (1 - ratio)^exponent, in [0, 1], from the ratio of descriptor distances.
+
+        mfvpr.HistogramOfShifts(weight=mfvpr.RatioWeight())(mfvpr.match(features0, features1, with_ratio=True))
 
     A keypoint that resembles two keypoints of the candidate equally has weight 0 (Lowe, IJCV 2004, section 7.1). This
     weight is not from the paper. Matches without a ratio raise an InputError. A larger exponent emphasizes unambiguous
@@ -62,7 +72,11 @@ class RatioWeight:
 
 @value
 class UnitWeight:
-    """w = 1: every match counts the same."""
+    """Weights `[K]` w = 1: every match counts the same.
+
+    Example:
+        mfvpr.HistogramOfShifts(weight=mfvpr.UnitWeight())  # "unit" in grids and settings
+    """
 
     def __call__(self, matches: Matches) -> Num[jax.Array, "*batch slots"]:
         return jnp.ones_like(matches.distance)
@@ -88,7 +102,11 @@ WEIGHTS: dict[str, Weight] = {
 
 
 def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"]:
-    """Weights times the matches' confidence, 0 on padding."""
+    """Weights `[K]` of one pair's `matches` by a `weight`, times their confidence, 0 on padding.
+
+    Example:
+        mfvpr.match_weights(mfvpr.DescriptorDistanceWeight(), matches)  # [K]
+    """
     # Padding is set to 1 before the weight's arithmetic: its NaN would reappear in the gradients.
     clean = {
         name: masked(values if name in INDICES else at_least_single(values), matches.mask, 1)
@@ -99,7 +117,6 @@ def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"
 
 
 def match_ratio(matches: Matches) -> Float[jax.Array, "*batch slots"]:
-    """The matches' ratio; an InputError if they have none."""
     if matches.ratio is None:
         raise InputError("expected matches with a ratio, got none; match them with_ratio=True")
     return as_float(matches.ratio)

@@ -42,7 +42,7 @@ class Cluster:
     """
 
     def __init__(self, client: Any) -> None:
-        """Use the workers of a `distributed.Client`, whatever started them; they need one thread each."""
+        """Use the workers of `client`, a `distributed.Client`, whatever started them; they need one thread each."""
         self._client = client
 
     def __str__(self) -> str:
@@ -52,7 +52,7 @@ class Cluster:
     @classmethod
     @contextmanager
     def connect(cls, address: str) -> Iterator["Cluster"]:
-        """The workers of the scheduler at `tcp://HOST:PORT`."""
+        """The workers of the scheduler at `tcp://HOST:PORT`; an `InputError` if nothing answers there."""
         try:
             client = _distributed().Client(address, set_as_default=False)
         except OSError:
@@ -82,10 +82,7 @@ class Cluster:
     @classmethod
     @contextmanager
     def slurm(cls, workers: int, options: str = "") -> Iterator["Cluster"]:
-        """Start an array of Slurm jobs with one worker each, until the block ends.
-
-        `options` are those of `sbatch`, such as `--partition=gpu --gpus=1`.
-        """
+        """Start Slurm jobs of one worker each until the block ends; `options` of `sbatch`, such as `--gpus=1`."""
         with cls.local(0, host="tcp://") as cluster:
             worker = [sys.executable, "-m", "distributed.cli.dask_worker", cluster._client.scheduler.address,
                       "--nthreads=1", "--memory-limit=0", "--no-dashboard", "--death-timeout=60"]  # fmt: skip
@@ -100,7 +97,7 @@ class Cluster:
     def map(
         self, function: Callable[..., Result], shared: tuple[Any, ...], rows: Sequence[int], track: Track, multiple: int
     ) -> list[Result]:
-        """Results of `function(*shared, block)` in workers, see `Runtime.map`, in the order in which blocks finish."""
+        """Results of `Runtime.map` from workers, in the order in which blocks finish; an InputError if workers die."""
         size = round_up(min(BLOCK, len(rows) // _BLOCKS), multiple)
         blocks = [rows[start : start + size] for start in range(0, len(rows), size)]
         client, distributed, results = self._client, _distributed(), list[Result]()
@@ -156,7 +153,6 @@ def _distributed() -> Any:
 
 
 def _run_slurm(*command: str) -> str:
-    """Output of a command of Slurm."""
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise InputError(f"cluster: {shlex.join(command[:2])}: {' '.join(done.stderr.split())}; check cluster.options")

@@ -35,6 +35,8 @@ Tree = TypeVar("Tree")
 def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLike = 0.0) -> Shaped[jax.Array, "..."]:
     """`values` where `mask`, `fill` elsewhere; trailing axes of `values` that `mask` lacks are broadcast.
 
+        jnp.sum(mfvpr.masked(2.0 - matches.distance, matches.mask))
+
     Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
     """
     extra = values.ndim - mask.ndim
@@ -42,7 +44,6 @@ def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLi
 
 
 def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
-    """`values` where `mask`, NaN elsewhere."""
     if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
         return jax.device_put(np.where(mask, values, np.nan))
     return jnp.where(mask, values, jnp.nan)
@@ -89,7 +90,11 @@ def masked_mean(
     mask: Bool[Array, " entries"],
     weights: Num[Array, " entries"] | None = None,
 ) -> Float[jax.Array, "*rest"]:
-    """(Weighted) mean over axis 0 of the real entries; 0 where there are none."""
+    """(Weighted) mean of `values` over axis 0 where `mask` is True; 0 if there are none.
+
+    Example:
+        mfvpr.masked_mean(mfvpr.match_shifts(matches), matches.mask, weights=2.0 - matches.distance)  # (x, y)
+    """
     weights = masked(jnp.ones(mask.shape, values.dtype) if weights is None else weights, mask)
     total = jnp.sum(weights)
     weighted = masked(values, mask) * weights.reshape(weights.shape + (1,) * (values.ndim - 1))
@@ -97,7 +102,11 @@ def masked_mean(
 
 
 def masked_median(values: Float[Array, " entries *rest"], mask: Bool[Array, " entries"]) -> Float[jax.Array, "*rest"]:
-    """Median over axis 0 of the real entries (mean of the middle two when even); 0 where there are none."""
+    """Median of `values` over axis 0 where `mask` is True (mean of the middle two when even); 0 if there are none.
+
+    Example:
+        mfvpr.masked_median(jnp.array([1.0, 9.0, 2.0, 7.0]), jnp.array([True, False, True, True]))  # 2.0
+    """
     if len(mask) == 0:
         return jnp.zeros(values.shape[1:], values.dtype)
     ordered = jnp.sort(masked(values, mask, jnp.inf), axis=0)
@@ -112,7 +121,11 @@ def where_finite(score: Float[Array, "*batch"], *inputs: Num[Array, "..."]) -> F
 
 
 def safe_sqrt(squared: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
-    """Square root of max(x, 0) whose gradient at 0 is 0 instead of infinite; NaN of NaN."""
+    """Square root of max(x, 0), where x is `squared`; its gradient at 0 is 0 instead of infinite; NaN of NaN.
+
+    Example:
+        mfvpr.safe_sqrt(jnp.sum(mfvpr.match_shifts(matches) ** 2, axis=-1))  # [K] lengths, px
+    """
     is_zero = squared <= 0
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
@@ -157,8 +170,7 @@ def compiled(function: Function, **options: Any) -> Function:
     """`jax.jit` for functions of many pairs; the classes of all nodes of the arguments choose the program as well.
 
     With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
-    the values of the function's closure from the first call. For many calls in a row, `with_static_functions` allows
-    compilation.
+    the values of the closure from the first call. `with_static_functions` allows compilation for many calls in a row.
     """
     programs: dict[tuple[type, ...], Any] = {}
 
@@ -188,7 +200,6 @@ def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
 
 
 def holds_function(tree: Any) -> bool:
-    """Whether a leaf is a plain function, such as a user's scorer."""
     return any(map(callable, jax.tree.leaves(tree)))
 
 

@@ -13,12 +13,14 @@ from mfvpr.utils.progress import Track, no_progress
 
 @dataclass(frozen=True)
 class Runtime:
-    """Settings of a call that change no result: `mfvpr.evaluate(data, system, runtime=Runtime(log=print))`.
+    """Settings of a call that change no result.
+
+        mfvpr.evaluate(data, system, runtime=mfvpr.Runtime(log=print, memory=2.0))
 
     Attributes:
         devices: that share the work; None = the default device of JAX.
         memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what
-            is free, or 2 GB in each worker of a cluster.
+            is free, or 2 GB in each worker of a cluster. Not above 0 raises an `InputError`.
         progress: label -> progress bar of the next loop.
         log: called with one line: the work to be done and the disk space it takes, or a warning.
         cluster: describes images and matches queries; None = this process. Retrieval and scores stay in this process.

@@ -11,8 +11,6 @@ from mfvpr.utils.errors import InputError
 
 @dataclass(frozen=True)
 class Published:
-    """A published data set."""
-
     name: str  # of the choice `dataset=`
     title: str
     layout: str  # contents of its folder, in lines
@@ -81,8 +79,9 @@ PUBLISHED = {
 def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
     """The data set `name` of `PUBLISHED`, from its folder `root`; `seasons` of Nordland are (database, queries).
 
-    Raises:
-        InputError: no such folder, or files and images in it that are missing, damaged, or of another layout.
+        data = published_dataset("gardens_point", "DIR")  # DIR has Reference/, Live/ and GroundTruth.csv
+
+    An `InputError` says which files and images are missing, damaged, or of another layout.
     """
     if name not in PUBLISHED:
         raise InputError(f"{name}: expected a published data set, of {', '.join(PUBLISHED)}")

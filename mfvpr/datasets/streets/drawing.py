@@ -52,6 +52,8 @@ def draw_streets(
 ) -> None:
     """Draw the synthetic street into `folder`.
 
+        draw_streets("street", seed=3, num_frames=4, image_size=(160, 120))
+
     `database/` is a summer day. `queries/` are the same places with another lane, other headings and other cars, the
     first half at night, the second half in snow. `ground_truth.csv` has query and database (file names), and shift_x
     and shift_y: candidate minus query position in px, see `image_shift`. With `seasons`, a folder per condition
@@ -131,7 +133,6 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Pro
 
 
 def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
-    """Draw one image of a drive and write it."""
     rng, camera, weather = np.random.default_rng((*drive.seed, row)), drive.cameras[row], WEATHERS[drive.weathers[row]]
     cars = scene.cars[1::2] if drive.ground_truth is None else scene.cars[::2]  # no query meets a car of the database
     # Objects on the street are never behind a house, hence houses are painted first.

@@ -1,0 +1,242 @@
+"""`help()` of public names: a sentence, all arguments, shapes of arrays, errors, and examples that run."""
+
+import ast
+import inspect
+import json
+import re
+import shutil
+import textwrap
+from dataclasses import replace
+from importlib import import_module
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.retrieval import Retrieval
+from tests.builders import fill, make_features, stack, unit
+from tests.programs import ROOT, composed
+
+PAGES = [ROOT / "README.md", ROOT / "mfvpr" / "datasets" / "README.md"]
+SLOW = ["mfvpr.Cluster", "mfvpr.LightGlueMatcher", "mfvpr.Map", "mfvpr.load_system", "mfvpr.sweep"]
+PLAIN = re.compile(r"(?<!float \| )\b(Array|ndarray|Features|Matches|Image)\b")  # an annotation without a shape
+SHAPED = re.compile(r"\b(Bool|Float|Int|Integer|Num|Shaped|UInt8)\[")
+SHAPE = re.compile(r"`\[.*?\]`")  # in a docstring
+BLOCK = re.compile(r"\n\n(?:Example:\n)?((?: {4}.*(?:\n|$)|\n(?= {4}))+)")
+
+IMPORTS = """
+from dataclasses import field
+
+import jax.numpy as jnp
+import numpy as np
+
+import mfvpr
+from mfvpr import *
+from mfvpr.checkpoints import load_model
+from mfvpr.datasets.contents import contents, own_rows
+from mfvpr.datasets.published import published_dataset
+from mfvpr.datasets.streets import draw_streets
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
+"""  # of the examples
+
+
+def public_objects():
+    """Names of `mfvpr` and `mfvpr.datasets`, and names in modules of `mfvpr.datasets` that the pages use."""
+    paths = [f"{module.__name__}.{name}" for module in (mfvpr, mfvpr.datasets) for name in module.__all__]
+    for text in (page.read_text() for page in PAGES):
+        for module, names in re.findall(r"^from (mfvpr\.datasets\.[\w.]+) import (.+)$", text, flags=re.MULTILINE):
+            paths += [f"{module}.{name}" for name in names.split(", ")]
+        paths += re.findall(r"`(mfvpr\.datasets\.\w+\.\w+)\(", text)
+    objects = {}
+    for module, _, name in (path.rpartition(".") for path in paths):
+        value = getattr(import_module(module), name)
+        if not any(value is other for other in objects.values()):
+            objects[f"{module}.{name}"] = value
+    return objects
+
+
+OBJECTS = public_objects()
+# An error has no arguments of its own, and is not called.
+WITH_EXAMPLE = [
+    path for path, value in OBJECTS.items() if not (inspect.isclass(value) and issubclass(value, Exception))
+]
+DEFINED = [path for path in WITH_EXAMPLE if not isinstance(OBJECTS[path], ModuleType)]
+
+
+def definition(path):
+    """The node of a class or function: at run time, `tests.shapes` has removed annotations."""
+    return ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(OBJECTS[path])))).body[0]
+
+
+def functions(node):
+    """A function, or the public and special methods of a class, by name."""
+    nodes = node.body if isinstance(node, ast.ClassDef) else [node]
+    nodes = [each for each in nodes if isinstance(each, ast.FunctionDef)]
+    return {each.name: each for each in nodes if re.match(r"__\w+__$|[^_]", each.name)}
+
+
+def fields(node):
+    """Annotations of the fields of a class, by name."""
+    nodes = node.body if isinstance(node, ast.ClassDef) else []
+    annotations = {
+        ast.unparse(each.target): ast.unparse(each.annotation) for each in nodes if isinstance(each, ast.AnnAssign)
+    }
+    return {name: text for name, text in annotations.items() if not text.startswith("ClassVar")}
+
+
+def arguments(node):
+    """Names of the arguments of a function, of `__init__` or the fields of a class, or of the call of a protocol."""
+    is_protocol = isinstance(node, ast.ClassDef) and "Protocol" in map(ast.unparse, node.bases)
+    name = node.name if isinstance(node, ast.FunctionDef) else "__call__" if is_protocol else "__init__"
+    if name not in functions(node):
+        return [*fields(node)]
+    names = [each.arg for each in ast.walk(functions(node)[name].args) if isinstance(each, ast.arg)]
+    return [each for each in names if each != "self"]
+
+
+def annotations(node):
+    """Annotations that `help()` shows, as text."""
+    nodes = [each for function in functions(node).values() for each in (*ast.walk(function.args), function)]
+    shown = [getattr(each, "annotation", getattr(each, "returns", None)) for each in nodes]
+    return [*fields(node).values(), *(ast.unparse(each) for each in shown if each)]
+
+
+def docstrings(node, *methods):
+    """The docstring of a function, or of a class and some of its methods, as one text."""
+    nodes = [functions(node)[name] for name in methods if name in functions(node)]
+    return "\n\n".join(filter(None, map(ast.get_docstring, (node, *nodes))))
+
+
+def examples(path):
+    """The indented blocks of a docstring as `help()` shows it, without equations, which have sums."""
+    blocks = BLOCK.findall(inspect.getdoc(OBJECTS[path]) or "")
+    return [textwrap.dedent(block) for block in blocks if "sum_" not in block]
+
+
+@pytest.mark.parametrize("path", OBJECTS)
+def test_the_first_paragraph_is_a_sentence(path):
+    assert (inspect.getdoc(OBJECTS[path]) or "").partition("\n\n")[0].endswith(".")
+
+
+@pytest.mark.parametrize("path", WITH_EXAMPLE)
+def test_there_is_an_example(path):
+    assert examples(path)
+
+
+@pytest.mark.parametrize("path", DEFINED)
+def test_arguments_are_named(path):
+    text = docstrings(definition(path), "__init__")
+    assert [name for name in arguments(definition(path)) if not re.search(rf"\b{name}\b", text)] == []
+
+
+@pytest.mark.parametrize("path", DEFINED)
+def test_shapes_of_arrays_are_stated(path):
+    """In the annotations of all arrays, or in the docstring of the function, or of the class and its methods."""
+    node = definition(path)
+    plain = [text for text in annotations(node) if PLAIN.search(text) and not SHAPED.search(text)]
+    assert not plain or SHAPE.search(docstrings(node, *functions(node))), plain
+
+
+@pytest.mark.parametrize("path", DEFINED)
+def test_methods_have_docstrings(path):
+    assert [name for name, method in functions(definition(path)).items() if not
+            (name.startswith("__") or ast.get_docstring(method))] == []  # fmt: skip
+
+
+@pytest.mark.parametrize("path", DEFINED)
+def test_errors_are_named(path):
+    """Errors that the code of a function raises itself, in its docstring or in that of its class."""
+    node = definition(path)
+    for name, function in functions(node).items():
+        calls = [each.exc for each in ast.walk(function) if isinstance(each, ast.Raise)]
+        errors = {ast.unparse(call.func) for call in calls if isinstance(call, ast.Call)}
+        text = docstrings(node, name) if name.startswith("__") else ast.get_docstring(function)
+        assert [error for error in errors if error not in text] == [], name
+
+
+@pytest.fixture(scope="module")
+def names(small_street):
+    """Values that examples use without making them; `data` is long enough to choose on one half."""
+    sides = (mfvpr.datasets.image_folder(small_street / side) for side in ("database", "queries"))
+    database, images = (replace(side, names=3 * side.names) for side in sides)
+    truth = mfvpr.datasets.FrameTruth(tuple((row,) for row in range(len(images))), len(database))
+    data = mfvpr.datasets.Dataset("street", database, (mfvpr.datasets.QuerySequence("street", images, truth),))
+    rng = np.random.default_rng(0)
+    sift = Sift(image_size=(160, 120), max_keypoints=40)
+    retriever = Retrieval(Aggregated(sift, VladFitting(num_words=4)))
+    pipeline = mfvpr.Pipeline(sift, retriever, candidates=5)
+    system = mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts()})
+    features = [make_features(rng, 30, capacity=32) for _ in range(4)]
+    cells = [make_features(rng, 26 * 26) for _ in range(2)]
+    queries, candidates = stack(features[:2]), stack(features[1:])
+    descriptors = unit(rng.normal(size=(8, 16)))
+    shortlist = mfvpr.retrieve(descriptors[:3], descriptors, num_candidates=5)
+    values = {"__name__": "example"}
+    exec(IMPORTS, values)
+    return values | {
+        "data": data, "dataset": data, "night": data, "snow": data, "sift": sift, "extractor": sift,
+        "retriever": retriever, "pipeline": pipeline, "system": system, "mine": system, "paper": system,
+        "result": mfvpr.evaluate(data, system), "MyScorer": mfvpr.HistogramOfShifts,
+        "keypoints": features[0].keypoints, "descriptors": features[0].descriptors, "query": features[0],
+        "features0": features[0], "features1": features[1], "cells0": cells[0], "cells1": cells[1],
+        "queries": queries, "candidates": candidates, "query_descriptors": descriptors[:3],
+        "database_descriptors": descriptors, "shortlist": shortlist, "scores": rng.random((3, 5), np.float32),
+        "matches": mfvpr.match(features[0], features[1], with_ratio=True),
+        "candidate_matches": mfvpr.match_candidates(features[0], candidates, with_ratio=True),
+        "image": rng.integers(0, 256, (60, 80, 3), np.uint8),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def files(small_street, tmp_path_factory):
+    """Folders and files that examples use."""
+    root = tmp_path_factory.mktemp("files")
+    for name, side in (("day", "database"), ("night", "queries"), ("snow", "queries")):
+        shutil.copytree(small_street / side, root / name)
+        (root / name / "pairs.csv").write_text("query,database\n" + "".join(f"{row},{row}\n" for row in range(10)))
+        (root / f"{name}.csv").write_text("name,label\n" + "".join(f"{row:04d}.png,{row // 5}\n" for row in range(10)))
+    shutil.copy(root / "night" / "pairs.csv", root)
+    shutil.copy(root / "night" / "0004.png", root / "query.jpg")
+    fill(root / "DIR", [f"{side}/image0.png" for side in ("Reference", "Live")])
+    (root / "DIR" / "GroundTruth.csv").write_text("Reference,Live\n0,0\n")
+    run = root / "runs" / "streets" / "2026-01-31_12-00-00" / "run.json"
+    run.parent.mkdir(parents=True)
+    run.write_text(json.dumps({"settings": composed("system=steering")}))
+    return root
+
+
+def check_comment(value, comment):
+    """Check the value of a statement if its comment is a value, or begins with the axes of an array."""
+    try:
+        expected = None if comment == "[]" else ast.literal_eval(comment)
+    except (SyntaxError, ValueError):
+        expected = None
+    if expected is not None:
+        np.testing.assert_array_equal(value, expected)
+    elif axes := re.match(r"\[([\w, ]*)\]", comment):
+        assert np.ndim(getattr(value, "mask", value)) == len(re.findall(r"\w+", axes[1]))
+
+
+@pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore:.*calibrate on a longer drive")
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, marks=[pytest.mark.slow] if path in SLOW else []) for path in WITH_EXAMPLE]
+)
+def test_examples_run(path, names, files, tmp_path, monkeypatch, request):
+    if path in SLOW:
+        monkeypatch.setenv("MFVPR_WEIGHTS", str(request.getfixturevalue("weights")))
+    shutil.copytree(files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    for example in examples(path):
+        values, lines = dict(names), example.splitlines()
+        for statement in ast.parse(example).body:
+            comment = lines[statement.end_lineno - 1][statement.end_col_offset :].strip(" #")
+            if isinstance(statement, ast.Expr):
+                statement = ast.Assign([ast.Name("_")], statement.value, lineno=1)
+            exec(ast.unparse(statement), values)
+            if comment and isinstance(statement, ast.Assign):
+                check_comment(values[ast.unparse(statement.targets[0])], comment)
