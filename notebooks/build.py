@@ -6,6 +6,7 @@ A notebook keeps a hash of the code that its output is of.
 import base64
 import hashlib
 import io
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -97,14 +98,19 @@ def show(panel: plt.Axes, image: np.ndarray, title: str, color: str = "black") -
 
 
 def draw_run() -> None:
-    """A figure of `mfvpr evaluate`."""
+    """A figure of `mfvpr evaluate`, and its report page if there is a browser."""
     with tempfile.TemporaryDirectory() as folder:
-        settings = ["scorer=histogram", "figures=[14]", f"out={folder}/run"]
+        settings = ["scorer=demo", "figures=[14]", f"out={folder}/run"]
         subprocess.run(
             [sys.executable, "-c", "from mfvpr.cli.programs import main; main()", "evaluate", *settings], check=True
         )
         [figure] = Path(folder, "run", "figures").glob("*correct*.png")
         (PICTURES / "run.png").write_bytes(small(Image.open(figure)))
+        if browser := shutil.which("chromium"):
+            page, shot = f"file://{folder}/run/report.html", f"{folder}/page.png"
+            options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1200,1120"]
+            subprocess.run([browser, *options, f"--screenshot={shot}", page], check=True, capture_output=True)
+            (PICTURES / "report.png").write_bytes(small(Image.open(shot)))
 
 
 if __name__ == "__main__":

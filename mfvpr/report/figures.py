@@ -113,8 +113,8 @@ def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explan
     axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
     for points in (start, end):
         axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
-    agree = f"blue agree with the peak ({explanation.agrees[heaviest].sum()}; of all {explanation.agrees.sum()})"
-    return f"query | candidate: {len(heaviest)} heaviest of {count} matches; {agree}"
+    drawn, agree = explanation.agrees[heaviest].sum(), explanation.agrees.sum()
+    return f"query | candidate; blue matches agree with the peak: {drawn} of {len(heaviest)} drawn, {agree} of {count}"
 
 
 def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesImage:
