@@ -34,8 +34,8 @@ def _parts(config: str, chosen: dict[str, str | None]) -> Iterator[str]:
     if chosen:
         yield "\nGroups, each with the choice whose settings follow, and other choices:\n"
     for group, choice in chosen.items():
-        label, others = f"  {group}={choice or 'null'}".ljust(26), [name for name in choices(group) if name != choice]
-        yield textwrap.fill(", ".join(others), 110, initial_indent=label, subsequent_indent=" " * 26) or label
+        label, rest = f"  {group}={choice or 'null'}".ljust(26), [name for name in choices(group) if name != choice]
+        yield textwrap.fill(", ".join(rest), 110, initial_indent=label, subsequent_indent=" " * 26) or label
     yield "\nSettings:\n"
     for group, choice in chosen.items():
         if choice and group not in _WHOLE:

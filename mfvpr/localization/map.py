@@ -126,7 +126,7 @@ class Map(MapImages):
         It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m.
 
         Args:
-            database: folder of images along a path, best another than that of the map.
+            database: folder of images along a path, preferably another than that of the map.
             queries: folder of images of the drive along this path.
             ground_truth: see `mfvpr.datasets.folder`.
             cache: keeps features.
