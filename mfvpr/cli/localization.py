@@ -84,7 +84,9 @@ class _Drive:
 
     def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
         self._map, self._settings = robot_map, settings
-        self._route = None if settings["route"] is None else Route(Drive(advance=settings["route"]))
+        advance = None if settings["route"] == "auto" else settings["route"]
+        warn = lambda text: tell(f"warning: route={advance}: {text} (route=auto)")  # noqa: E731
+        self._route = None if settings["route"] is None else Route(Drive(advance), warn=warn)
 
     def localize(
         self, name: str, pixels: UInt8[np.ndarray, "height width channels"]
@@ -115,7 +117,8 @@ class _Drive:
         rows = self._map.there[:row]
         rows = rows[: max(0, len(rows) - self._settings["recent"])]
         position = self._route(prediction, rows)
-        return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4)}}
+        return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4),
+                                       "advance": round(position.advance, 2)}}  # fmt: skip
 
 
 class _LocalizationFigures:

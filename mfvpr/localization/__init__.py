@@ -2,7 +2,7 @@
 
     known = Map.create("map", folder, system)  # then Map.open("map"); image by image: known.add(image, place)
     prediction = known.localize("query.jpg")   # place, alternatives, confidence, and the shift for steering
-    route = Route(Drive(advance=1))        # if the map and the queries are in the order of a drive:
+    route = Route(Drive())                 # if the map and the queries are in the order of a drive:
     located = route(prediction, known.there)   # the row that is most probable given all images so far and the motion
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.

@@ -246,12 +246,15 @@ def test_a_route_goes_on_where_an_image_is_wrong_or_says_nothing(folder, small_s
     (drive / "0004.png").write_text("no image")
     shutil.copy(drive / "0000.png", drive / "0006.png")
     write_gray(drive / "0008.png")
-    lines, _ = localize(drive, "route=1", code=2)
+    lines, _ = localize(drive, "route=auto", code=2)
     places = [line.get("place") for line in lines]
     assert places == [*NAMES[:4], None, NAMES[5], NAMES[0], NAMES[7], None, NAMES[9]]
     assert "error" in lines[4]
     assert [line["route"]["place"] for line in lines] == NAMES
     assert all(0 < line["route"]["p"] <= 1 for line in lines)
+    assert lines[-1]["route"]["advance"] == pytest.approx(1, abs=0.3)
+    _, stderr = localize(small_street / "database", "route=9")
+    assert stderr.startswith("warning: route=9: the images fit ")
     plain, _ = localize(drive, code=2)
     assert [line.get("place") for line in plain] == places
     assert all("route" not in line and "added" not in line for line in plain)
