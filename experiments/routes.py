@@ -40,7 +40,7 @@ def read_predictions(path: Path) -> Iterator[list[Prediction]]:
 
 
 def recall(predictions: list[Prediction], images: np.ndarray, speed: float | None) -> Mapping[str, float]:
-    """Share of the images whose row is by_route, alone and on routes."""
+    """Share of the images whose row is predicted, alone and on routes."""
     there = np.ones(1 + max(each.row for prediction in predictions for each in prediction.alternatives), bool)
     by_route = {"alone": [predictions[image].alternatives[0].row for image in images]}
     for name, drive in {"learned": Drive(), "given": Drive(speed), "given 1": Drive(1)}.items():
