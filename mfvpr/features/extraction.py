@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Num
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import resize
+from mfvpr.datasets.images import Interpolation, resize
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import check_features, without_padding
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.threads import ordered_map
@@ -87,6 +87,7 @@ def _readable_images(
         except InputError as error:
             return error
 
+    require_word("interpolation", extractor.interpolation, Interpolation)  # `load` would take it for a bad image
     images = ordered_map(load, rows, workers=available_cpus())
     for row, image in zip(rows, track(images, len(rows)), strict=True):
         if not isinstance(image, InputError):

@@ -1,7 +1,10 @@
 """The confidence of a map: fitted on a drive whose places are known, and kept in the folder of the map."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.truth import middle
@@ -20,23 +23,39 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 _FILE = "confidence.json"
+_LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
+_AROUND = 5  # times the distance of a correct prediction: what is nearer shows the place, or is not known to be another
 
 
 def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> Confidence:
-    """Evaluate a system on a data set, and fit the confidence of the ranking that decides."""
+    """Evaluate a system on a data set, and fit the confidence of the ranking that decides.
+
+    Each query counts twice: as it is, and without the images of its place, as an image of a place that the map does not
+    show. Nothing that is predicted then is correct.
+    """
     sequence = dataset.only
     if sequence.truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
-    result = rank_dataset(dataset, system, cache=cache)
     threshold = middle(sequence.truth.thresholds())
-    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-    [positives] = result.positives(threshold)
-    is_correct = positives.contains(ranked.rows)[:, 0]
-    confidence = fit_confidence(confidence_inputs(ranked, by_retrieval), is_correct)
-    if not any(confidence.weights):
-        warnings.warn(f"{sequence.images.root}: scores do not tell correct predictions ({is_correct.sum()} of "
-                      f"{len(is_correct)}) from incorrect ones, so that every image gets the same confidence, also one "
-                      "of another place; calibrate on a longer drive, which leaves the map", stacklevel=3)  # fmt: skip
+    around = sequence.truth.positives(_AROUND * threshold)
+    absent = replace(dataset, sequences=(replace(sequence, truth=None, excluded=around),))
+    values, are_correct = [], []
+    for each in (dataset, absent):
+        result = rank_dataset(each, system, cache=cache)
+        [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
+        values.append(confidence_inputs(ranked, by_retrieval))
+        is_correct = sequence.truth.positives(threshold).contains(ranked.rows)[:, 0]
+        are_correct.append(is_correct & (each is dataset))
+    if not np.isfinite(values[1]).any():
+        warnings.warn(f"{sequence.images.root}: without the images of a query's place there are no candidates, so that "
+                      "places that the map does not show get too high a confidence; calibrate on a longer drive",
+                      stacklevel=3)  # fmt: skip
+    confidence = fit_confidence(np.concatenate(values), np.concatenate(are_correct))
+    probabilities = confidence.probability(values[0])
+    if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
+        warnings.warn(f"{sequence.images.root}: scores do not tell correct predictions ({are_correct[0].sum()} of "
+                      f"{len(sequence.images)}) from incorrect ones, so that every image gets the same confidence; "
+                      "calibrate on a longer drive", stacklevel=3)  # fmt: skip
     return confidence
 
 

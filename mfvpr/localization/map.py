@@ -123,7 +123,8 @@ class Map(MapImages):
     ) -> Confidence:
         """Fit the confidence on a drive, and keep it in the folder of the map.
 
-        It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m.
+        It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m. Each query counts once more
+        without the images of its place, as one of a place that the map does not show.
 
         Args:
             database: folder of images along a path, preferably another than that of the map.

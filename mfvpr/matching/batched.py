@@ -2,8 +2,9 @@
 
 import itertools
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from mfvpr.matching.match_set import QueryMatches, split_pairs
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.types import Features, Matches, Shortlist, per_match
 from mfvpr.utils import ragged
-from mfvpr.utils.numerics import Device, with_static_functions
+from mfvpr.utils.numerics import Device, holds_function
 from mfvpr.utils.ragged import Row
 from mfvpr.utils.threads import ordered_map
 
@@ -52,7 +53,7 @@ class Sides:
         """Read the features that are not on the device."""
         return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
 
-    def begin(self, staged: tuple[Staged, Staged], matcher: Matcher) -> Calls:
+    def begin(self, staged: tuple[Staged, Staged], match: Callable[..., Matches]) -> Calls:
         """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
         arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
         capacities, slots = (
@@ -65,7 +66,7 @@ class Sides:
             for start in range(0, len(members), PAIRS):
                 positions = members[start : start + PAIRS]
                 pairs = ragged.repeat_last(slots[positions], PAIRS)
-                calls.append((positions, match_pairs(*sides, pairs, np.int32(len(positions)), matcher)))
+                calls.append((positions, match(*sides, pairs, np.int32(len(positions)))))
         return calls
 
 
@@ -85,7 +86,9 @@ def match_queries(
     """
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
     counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
-    matcher = with_static_functions(matcher)  # or a plain function would be compiled for every batch
+    match = partial(match_pairs, matcher=matcher)
+    if holds_function(matcher):  # or it would be compiled for every call; the program goes with the last query
+        match = jax.jit(match)
     # Shapes follow from all queries, not from `todo`: a run that is continued must have the bits of a single run.
     database_rows, budget = np.unique(indices), memory_budget(memory, devices)
     database_rows = database_rows[database_rows >= 0]
@@ -102,7 +105,7 @@ def match_queries(
     staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
     for step in itertools.chain(staged, [None]):
         if step is not None:
-            begun.append((step[0], sides[step[0].device].begin(step[1], matcher)))
+            begun.append((step[0], sides[step[0].device].begin(step[1], match)))
         while len(begun) > (0 if step is None else len(devices)):
             part, calls = begun.popleft()
             for call in calls:

@@ -197,9 +197,9 @@ def retrieve(
     if mask is not None and mask.shape not in shapes:
         raise InputError(f"mask: expected shape {shapes[0]} or {shapes[1]}, got {mask.shape}")
     queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
-    if queries.shape[1:] != database.shape[1:]:
-        raise InputError(f"descriptors: expected as many dimensions on both sides, got {queries.shape} and "
-                         f"{database.shape} (database)")  # fmt: skip
+    if queries.ndim != 2 or database.ndim != 2 or queries.shape[1] != database.shape[1]:
+        raise InputError(f"descriptors: expected [Q, D] and [M, D] of the database, got {queries.shape} and "
+                         f"{database.shape}")  # fmt: skip
     similarity = jnp.matmul(_at_least_two(queries), _at_least_two(database).T, precision=jax.lax.Precision.HIGHEST)
     similarity = similarity[: len(queries), : len(database)]
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask.astype(bool))

@@ -35,7 +35,7 @@ Tree = TypeVar("Tree")
 def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLike = 0.0) -> Shaped[jax.Array, "..."]:
     """`values` where `mask`, `fill` elsewhere; trailing axes of `values` that `mask` lacks are broadcast.
 
-        jnp.sum(mfvpr.masked(2.0 - matches.distance, matches.mask))
+        jnp.sum(2.0 - mfvpr.masked(matches.distance, matches.mask, 2.0))
 
     Padding may hold NaN: apply this before any arithmetic, or gradients turn NaN as well.
     """
@@ -93,7 +93,7 @@ def masked_mean(
     """(Weighted) mean of `values` over axis 0 where `mask` is True; 0 if there are none.
 
     Example:
-        mfvpr.masked_mean(mfvpr.match_shifts(matches), matches.mask, weights=2.0 - matches.distance)  # (x, y)
+        mfvpr.masked_mean(mfvpr.match_shifts(matches), matches.mask, weights=matches.scores0)  # (x, y)
     """
     weights = masked(jnp.ones(mask.shape, values.dtype) if weights is None else weights, mask)
     total = jnp.sum(weights)

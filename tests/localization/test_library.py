@@ -7,6 +7,7 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, Map
+from mfvpr.datasets.streets import streets_folder
 from mfvpr.features import VladFitting
 from mfvpr.storage import FeatureCache
 from tests.builders import map_system
@@ -101,7 +102,8 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
         Map.open(tmp_path, threshold=0.5)
     with pytest.raises(InputError, match=r"threshold=1\.5: expected a number from 0 to 1"):
         Map.open(tmp_path, threshold=1.5)
-    confidence = known.calibrate(small_street / "database", small_street / "queries")
+    with pytest.warns(UserWarning, match="there are no candidates, so that places that the map does not show"):
+        confidence = known.calibrate(small_street / "database", small_street / "queries")
     assert known.confidence == confidence
     prediction = Map.open(tmp_path).localize(query)
     assert prediction == known.localize(query)
@@ -115,13 +117,24 @@ def test_a_confidence_that_tells_nothing_is_a_warning(street, small_street, tmp_
     truth = mfvpr.datasets.IndexFile(tmp_path / "far.csv")
     with pytest.warns(UserWarning, match=r"scores do not tell correct predictions \(0 of 10\) from"):
         street.calibrate(small_street / "database", small_street / "queries", ground_truth=truth)
-    with pytest.warns(UserWarning, match=r"scores do not tell correct predictions \(10 of 10\) from .* leaves the map"):
-        street.calibrate(small_street / "database", small_street / "database")
+
+
+def test_noise_gets_no_place_though_all_predictions_of_the_drive_are_correct(tmp_path):
+    street = streets_folder(tmp_path, num_frames=40, image_size=(160, 120))
+    Map.create(tmp_path / "map", street / "database", small("steering", candidates=20)).calibrate(
+        street / "database", street / "database"
+    )
+    known = Map.open(tmp_path / "map", threshold=0.8)
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
+    assert known.localize(image).reason == "low confidence"
+    for row in (2, 20):
+        assert known.localize(street / f"database/{row:04d}.png").place == f"{row:04d}.png"
 
 
 def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
-    known.calibrate(small_street / "database", small_street / "queries")
+    with pytest.warns(UserWarning, match="calibrate on a longer drive"):
+        known.calibrate(small_street / "database", small_street / "queries")
     settings = json.loads((tmp_path / "settings.json").read_text())
     settings["scorer"]["sigma"] = 30.0
     (tmp_path / "settings.json").write_text(json.dumps(settings))

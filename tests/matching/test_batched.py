@@ -1,9 +1,11 @@
 """Matching of whole shortlists: every pair as it is matched alone, bit for bit, whatever the way it went."""
 
+import gc
 import json
 import os
 import subprocess
 import sys
+import weakref
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -214,6 +216,9 @@ def test_a_plain_function_is_compiled_once_for_all_queries(compilations):
         value = stages.match(queries, database, candidates, NearestNeighborMatcher(max_distance=0.9))
         np.testing.assert_array_equal(match_set.counts, value.counts)
     assert compiled == 1  # all else was compiled for the first queries
+    near, alive = None, weakref.ref(near)
+    gc.collect()
+    assert alive() is None
 
 
 # Several devices
