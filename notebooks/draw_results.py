@@ -41,8 +41,15 @@ def query_times(page: str) -> dict[str, list[list[float]]]:
     return {name: [[float(cell.replace(",", "")) for cell in pair] for pair in pairs] for name, pairs in cells.items()}
 
 
+def candidate_times(page: str) -> dict[str, list[list[float]]]:
+    """Curve -> pairs of the number of candidates and the milliseconds of a query."""
+    rows = [[float(cell) for cell in row] for row in read_table(page, "candidates", "ALIKED: matching, ms")]
+    names = ("ALIKED, matching", "ALIKED, scores", "SIFT, matching", "SIFT, scores")
+    return {name: [[row[0], row[place]] for row in rows] for place, name in enumerate(names, start=1)}
+
+
 def draw(page: str, folder: Path) -> None:
-    """Write both pictures into a folder."""
+    """Write all pictures into a folder."""
     recall = real_recall(page)
     figure, panels = plt.subplots(1, 2, figsize=(9.6, 5), layout="constrained", sharey=True)
     for place, (panel, title) in enumerate(zip(panels, ("GRIEF", "corridor"), strict=True)):
@@ -55,13 +62,20 @@ def draw(page: str, folder: Path) -> None:
     panels[0].invert_yaxis()
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     _save(figure, folder / "recall.png")
+    draw_times(query_times(page), "images in the database", folder / "database_size.png")
+    draw_times(candidate_times(page), "candidates of a query", folder / "candidates.png")
+
+
+def draw_times(curves: dict[str, list[list[float]]], size: str, path: Path) -> None:
+    """Draw the time of a query against a size, a curve for each name."""
     figure, panel = plt.subplots(figsize=(8, 3.2), layout="constrained")
-    for name, points in query_times(page).items():
+    for name, points in curves.items():
         color = next((color for features, color in COLORS.items() if features in name), "#888888")
-        panel.plot(*zip(*points, strict=True), "o--" if "disk" in name else "o-", color=color, label=name)
-    panel.set(xlabel="images in the database", ylabel="time of a query, ms", ylim=(0, None))
+        dashed = "disk" in name or "scores" in name
+        panel.plot(*zip(*points, strict=True), "o--" if dashed else "o-", color=color, label=name)
+    panel.set(xlabel=size, ylabel="time of a query, ms", ylim=(0, None))
     figure.legend(loc="outside right center", fontsize=9)
-    _save(figure, folder / "database_size.png")
+    _save(figure, path)
 
 
 def _save(figure: plt.Figure, path: Path) -> None:

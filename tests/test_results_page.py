@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from notebooks.draw_results import PAGE, draw, query_times, read_table, real_recall
+from notebooks.draw_results import PAGE, candidate_times, draw, query_times, read_table, real_recall
 
 TEXT = PAGE.read_text()
 
@@ -38,7 +38,8 @@ def test_pictures_are_drawn_from_the_tables(tmp_path):
     assert [len(points) for points in times.values()] == [4, 2, 2, 2, 2]
     assert times["map, SIFT, candidates from memory"] == [[1000.0, 62.6], [10_000.0, 67.6]]
     draw(TEXT, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"recall.png", "database_size.png"}
+    assert all(len(points) == 5 for points in candidate_times(TEXT).values())
+    assert {path.name for path in tmp_path.iterdir()} == {"recall.png", "database_size.png", "candidates.png"}
 
 
 def test_a_missing_table_is_an_error():

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
@@ -37,6 +38,16 @@ def print_map(folder: Path) -> None:
     settings, robot_map = read_declaration(folder), Map.open(folder)
     print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
+
+
+def calibrate(folder: Path, database: Path, queries: Path) -> None:
+    """Fit the confidence of a map, which its folder then keeps."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Map.open(folder).calibrate(database, queries)
+    for warning in caught:
+        tell(f"warning: {warning.message}")
+    print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
 
 
 def add_images(folder: Path, images: list[Path], place: str | None) -> None:
@@ -176,6 +187,8 @@ def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | Non
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
+    tell(f"warning: confidence={file.path} may be too high for places that the map does not show; mfvpr map calibrate "
+         "fits one that knows absent places")  # fmt: skip
     scorers = system.final_scores[name].scorers
     if other := confidences.other_settings(file.origin, scorers, map_settings, map_settings["candidates"]):
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "

@@ -10,7 +10,7 @@ COMMANDS = {
     "evaluate": "two folders of images in, recall, rankings and figures out",
     "sweep": "score a data set by a grid of parameters",
     "learn": "learn match weights and parameters, and compare them with searched ones",
-    "map": "build a map for localization, add images to it",
+    "map": "build a map for localization, calibrate it, add images to it",
     "localize": "localize images in a map",
     "weights": "list, download, add and verify weights of networks",
     "data": "list data sets, and check what a folder holds",
@@ -55,6 +55,13 @@ def _add_map_commands(parser: Parser) -> None:
     command = commands.add_parser("info", help="what a map holds, and what it was made with")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.set_defaults(run="mfvpr.cli.localization:print_map")
+    command = commands.add_parser(
+        "calibrate", help="fit the confidence on a drive whose query i shows database image i"
+    )
+    command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
+    command.add_argument("database", metavar="DATABASE", type=Path, help="folder of images along a path")
+    command.add_argument("queries", metavar="QUERIES", type=Path, help="folder of images of a drive along this path")
+    command.set_defaults(run="mfvpr.cli.localization:calibrate")
     command = commands.add_parser("add", help="add images, one by one; other processes may localize meanwhile")
     command.add_argument("folder", metavar="DIR", type=Path, help="of the map")
     command.add_argument("images", metavar="IMAGE", nargs="+", type=Path, help="a file")

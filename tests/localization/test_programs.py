@@ -357,6 +357,16 @@ def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path,
         [line], stderr = localize(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert 0 <= line["confidence"] <= 1
         assert ("other settings of candidates" in stderr) == (candidates != settings["candidates"])
+        assert "too high for places that the map does not show" in stderr
+
+
+def test_a_map_is_calibrated(folder, small_street, call_program, localize):
+    stdout, stderr = call_program("map", "calibrate", folder, small_street / "database", small_street / "queries")
+    assert stdout.startswith(f"{folder}: calibrated on {small_street}/queries")
+    assert stderr.startswith("warning: ")
+    assert stderr.endswith("calibrate on a longer drive\n")  # ten frames
+    [line], _ = localize(small_street / "database/0001.png", "threshold=0")
+    assert 0 < line["confidence"] < 1
 
 
 @pytest.mark.slow
