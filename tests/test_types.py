@@ -109,6 +109,7 @@ PROGRAMS_OF_THEIR_OWN = {
     "scoring/learned_weight.py",  # of matches alone
     "tuning/learning/teaching.py",  # of a new function, which has one model
     "tuning/learning/training.py",  # of a new function, which has one kind of parameters
+    "matching/batched.py",  # of a new function, which has one matcher
     "matching/lightglue.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",
     "tuning/sweeps/rankings.py",  # of a new function

@@ -1,5 +1,6 @@
 """A scorer is declared once: settings, rules, help and axes follow from its class."""
 
+import re
 import shutil
 
 import hydra
@@ -113,7 +114,7 @@ def test_conf_and_help_follow_from_the_class(near, succeed):
         assert f"\n  {line}\n" in stdout
     assert "Made by" not in stdout
     other_names = ", ".join(sorted({path.stem for path in (near / "scorer").iterdir()} - {"near"}))
-    assert f"\n  scorer=near             {other_names}\n" in stdout
+    assert f"\n  scorer=near             {other_names}\n" in re.sub(r",\n {26}", ", ", stdout)  # lines are wrapped
     assert "\n  radius: null  # near: px\n" in stdout
     assert "\n  norm: null  # near: sum, largest\n" in stdout
     assert f"\n  weight: null  # sum, anchor, histogram, near: {', '.join(NAMED_WEIGHTS)}, FILE.json\n" in stdout
