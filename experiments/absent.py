@@ -16,10 +16,9 @@ from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
-from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
+from mfvpr.evaluation import Confidence, System, fit_confidence
 from mfvpr.evaluation.metrics import reliability
-from mfvpr.localization.calibration import fit_on_drive
-from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.localization.calibration import fit_on_drive, inputs_of
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer
@@ -29,11 +28,8 @@ Ranked = tuple[Float[np.ndarray, "queries inputs"], Bool[np.ndarray, " queries"]
 
 def rank(dataset: Dataset, system: System, cache: FeatureCache) -> Ranked:
     """Inputs of the confidence, and whether the top predictions are correct; none is without a ground truth."""
-    result = rank_dataset(dataset, system, cache=cache)
-    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-    truth = dataset.only.truth
-    correct = np.zeros(len(ranked.rows), bool) if truth is None else truth.positives(2).contains(ranked.rows)[:, 0]
-    return confidence_inputs(ranked, by_retrieval), correct
+    (inputs, rows), truth = inputs_of(dataset, system, cache), dataset.only.truth
+    return inputs, np.zeros(len(rows), bool) if truth is None else truth.positives(2).contains(rows)[:, 0]
 
 
 def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> list[str]:

@@ -56,7 +56,7 @@ def run(runs: list[Path]) -> None:
     print("| :-- | :-- | --: | --: | --: | --: |")
     for path in runs:
         sequences = list(read_predictions(path))
-        for drive in drives(np.arange(100)):
+        for drive in drives(np.arange(len(sequences[0]))):
             results = [recall(each, *drives(np.arange(len(each)))[drive]) for each in sequences]
             cells = [f"{100 * np.mean([result[name] for result in results]):.1f}" if name in results[0] else "-"
                      for name in ("alone", "learned", "given", "given 1")]  # fmt: skip

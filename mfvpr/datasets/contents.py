@@ -100,10 +100,12 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
 
 
 def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
+    """Fingerprints of folders by side, as results store them."""
     return {side: folder.fingerprint for side, folder in contents.items()}
 
 
 def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
+    """How the images of each side were read, as results store it."""
     return {side: folder.summary() for side, folder in contents.items()}
 
 

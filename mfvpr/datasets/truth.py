@@ -204,6 +204,7 @@ class AllowedTruth(Truth):
 
 
 def require_positions(where: str, xy: np.ndarray, count: int) -> None:
+    """Raise an InputError unless there is a position in meters for each of `count` images."""
     if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
         got = f"shape {list(xy.shape)}" if xy.shape != (count, 2) else f"{np.abs(xy).max():g} m"
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")

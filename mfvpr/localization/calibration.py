@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.truth import middle
@@ -41,11 +42,9 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     absent = replace(dataset, sequences=(replace(sequence, truth=None, excluded=around),))
     values, are_correct = [], []
     for each in (dataset, absent):
-        result = rank_dataset(each, system, cache=cache)
-        [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-        values.append(confidence_inputs(ranked, by_retrieval))
-        is_correct = sequence.truth.positives(threshold).contains(ranked.rows)[:, 0]
-        are_correct.append(is_correct & (each is dataset))
+        inputs, rows = inputs_of(each, system, cache)
+        values.append(inputs)
+        are_correct.append(sequence.truth.positives(threshold).contains(rows)[:, 0] & (each is dataset))
     if not np.isfinite(values[1]).any():
         warnings.warn(f"{sequence.images.root}: without the images of a query's place there are no candidates, so that "
                       "places that the map does not show get too high a confidence; calibrate on a longer drive",
@@ -57,6 +56,15 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
                       f"{len(sequence.images)}) from incorrect ones, so that every image gets the same confidence; "
                       "calibrate on a longer drive", stacklevel=3)  # fmt: skip
     return confidence
+
+
+def inputs_of(
+    dataset: Dataset, system: System, cache: FeatureCache | None
+) -> tuple[Float[np.ndarray, "queries inputs"], Int[np.ndarray, "queries candidates"]]:
+    """Inputs of the confidence of the ranking that decides, and its database rows."""
+    result = rank_dataset(dataset, system, cache=cache)
+    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
+    return confidence_inputs(ranked, by_retrieval), ranked.rows
 
 
 def write_confidence(folder: Path, system: System, confidence: Confidence) -> None:

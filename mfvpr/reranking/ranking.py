@@ -53,6 +53,7 @@ def _score_candidates(scorer: Scorer, matches: Matches) -> jax.Array:
 
 
 def check_candidates(matches: Matches) -> None:
+    """Raise a ValueError unless the matches are `[C, K, ...]`."""
     if np.ndim(matches.mask) != 2:
         shape = np.shape(matches.mask)
         raise ValueError(f"expected matches [C, K, ...] of candidates, got a mask of shape {shape}; of one pair "
@@ -190,6 +191,7 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
 
 
 def breaks_ties_by_row(ties: Ties) -> bool:
+    """Whether ties are broken by the database row."""
     require_word("ties", ties, Ties)
     return ties == "index"
 

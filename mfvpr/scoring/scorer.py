@@ -55,11 +55,13 @@ def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
 
 
 def require_scores(name: str, scores: Array, pairs: int) -> None:
+    """Raise an InputError unless the scores are a real number for each pair."""
     if scores.shape != (pairs,):
         raise InputError(f"{name}: expected a number for each of {pairs} pairs, got an array {list(scores.shape)}")
     require_real(name, scores)
 
 
 def require_real(name: str, scores: Array) -> None:
+    """Raise an InputError unless the scores are real numbers."""
     if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
         raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")

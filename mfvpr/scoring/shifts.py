@@ -43,6 +43,7 @@ def _scale_about_center(points: Array, image_size: Array, factor: float) -> Floa
 
 
 def require_sizes(*image_sizes: Array | None) -> None:
+    """Raise an InputError if the sizes of images are not known."""
     if any(size is None for size in image_sizes):
         raise InputError("image_size: expected the sizes of both images, which this score needs, got None; give "
                          "Features.of(..., image_size=(width, height))")  # fmt: skip
@@ -83,4 +84,5 @@ def where_usable(
 
 
 def are_finite(shifts: Float[Array, "..."], weights: Float[Array, "weightings slots"]) -> Bool[Array, " weightings"]:
+    """Whether all shifts and the weights are finite."""
     return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

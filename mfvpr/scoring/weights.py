@@ -117,6 +117,7 @@ def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"
 
 
 def match_ratio(matches: Matches) -> Float[jax.Array, "*batch slots"]:
+    """The matches' ratio; an InputError if they have none."""
     if matches.ratio is None:
         raise InputError("expected matches with a ratio, got none; match them with_ratio=True")
     return as_float(matches.ratio)

@@ -44,6 +44,7 @@ def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLi
 
 
 def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
+    """`values` where `mask`, NaN elsewhere."""
     if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
         return jax.device_put(np.where(mask, values, np.nan))
     return jnp.where(mask, values, jnp.nan)
@@ -200,6 +201,7 @@ def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
 
 
 def holds_function(tree: Any) -> bool:
+    """Whether a leaf is a plain function, such as a user's scorer."""
     return any(map(callable, jax.tree.leaves(tree)))
 
 

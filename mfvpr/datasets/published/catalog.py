@@ -11,6 +11,8 @@ from mfvpr.utils.errors import InputError
 
 @dataclass(frozen=True)
 class Published:
+    """A published data set."""
+
     name: str  # of the choice `dataset=`
     title: str
     layout: str  # contents of its folder, in lines

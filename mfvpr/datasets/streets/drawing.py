@@ -133,6 +133,7 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Pro
 
 
 def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
+    """Draw one image of a drive and write it."""
     rng, camera, weather = np.random.default_rng((*drive.seed, row)), drive.cameras[row], WEATHERS[drive.weathers[row]]
     cars = scene.cars[1::2] if drive.ground_truth is None else scene.cars[::2]  # no query meets a car of the database
     # Objects on the street are never behind a house, hence houses are painted first.
