@@ -105,7 +105,7 @@ def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
 
 
 def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
-    """How the images of each side were read, as results store it."""
+    """Summaries of how the images of each side were read, as results store them."""
     return {side: folder.summary() for side, folder in contents.items()}
 
 
