@@ -154,7 +154,8 @@ def rank_dataset(
         strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
     scored = [_score(dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
     ways = system.final_scores.values(), system.ties
-    ranked = [rank_by_scores(matched.candidates, scores, *ways, hubness=strengths) for matched, scores in scored]
+    options = {"hubness": strengths, "num_rows": size}
+    ranked = [rank_by_scores(matched.candidates, scores, *ways, **options) for matched, scores in scored]
     matched = [sequence for sequence, _ in scored]
     for line in score_warnings(matched, ranked, system.scorers):
         cache.warn(line)

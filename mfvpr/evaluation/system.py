@@ -1,6 +1,6 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -20,6 +20,7 @@ from mfvpr.matching.nearest_neighbors import CrossCheck
 from mfvpr.reranking.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.retrieval.retriever import Retriever
 from mfvpr.scoring.parameters import check_bounds
 from mfvpr.scoring.registry import SCORERS
@@ -81,6 +82,8 @@ class System:
             other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
             before (`name + frames`).
+        sequences: by name of a scorer or a fused ranking, how the queries of a drive are ranked with the help of each
+            other (`name + causal sequence`); the database must be in the order of a drive as well.
         cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
             sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
@@ -92,6 +95,7 @@ class System:
     scorers: Mapping[str, Scorer]
     fused: Mapping[str, Fusion] = field(default_factory=dict)
     correlated: Mapping[str, FrameCorrelation] = field(default_factory=dict)
+    sequences: Mapping[str, Sequence[DriveFilter]] = field(default_factory=dict)
     cohort: int | None = None
     ties: Ties = "retrieval"
     final: str | None = None
@@ -113,7 +117,7 @@ class System:
     @cached_property
     def final_scores(self) -> dict[str, FinalScore]:
         """Scores that candidates are ranked by, by name: of retrieval, of each scorer, and combined ones."""
-        return final_scores(tuple(self.scorers), self.cohort, self.fused, self.correlated)
+        return final_scores(tuple(self.scorers), self.cohort, self.fused, self.correlated, self.sequences)
 
     @property
     def headline(self) -> str:

@@ -9,15 +9,10 @@ from jaxtyping import Float, Int
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.truth import middle
-from mfvpr.evaluation.calibration import (
-    Confidence,
-    confidence_inputs,
-    fit_confidence,
-    read_confidences,
-    write_confidences,
-)
+from mfvpr.evaluation.calibration import fit_confidence, read_confidences, write_confidences
 from mfvpr.evaluation.evaluation import rank_dataset
 from mfvpr.evaluation.system import System
+from mfvpr.reranking.confidence import Confidence, confidence_inputs
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError

@@ -12,7 +12,6 @@ import numpy as np
 
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
-from mfvpr.evaluation.calibration import Confidence
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
@@ -23,6 +22,7 @@ from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
+from mfvpr.reranking.confidence import Confidence
 from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
@@ -242,8 +242,9 @@ def _extractor(system: System) -> Extractor:
                          f"got {len(extractor.scales)}")  # fmt: skip
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
-    if system.cohort is not None or system.correlated:
-        raise InputError("a map ranks single images: expected a system without cohort and frame correlation")
+    if system.cohort is not None or system.correlated or system.sequences:
+        raise InputError("a map ranks single images: expected a system without cohort, frame correlation and "
+                         "sequences; mfvpr.localization.Route follows a drive")  # fmt: skip
     return extractor
 
 

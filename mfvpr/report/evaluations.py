@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float, Shaped
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Unit, middle, threshold_words
-from mfvpr.evaluation.calibration import Confidence, confidence_inputs, fit_confidence
+from mfvpr.evaluation.calibration import fit_confidence
 from mfvpr.evaluation.evaluation import KS, RankedDataset, Recall
 from mfvpr.evaluation.metrics import PrecisionRecall, precision_recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
+from mfvpr.reranking.confidence import Confidence, confidence_inputs
 from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError

@@ -1,7 +1,7 @@
 """Final scores of a system, which candidates are ranked by: of retrieval, of each scorer, and combined ones."""
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from mfvpr.reranking.ranking import (
     retrieval_scores,
 )  # fmt: skip
 from mfvpr.reranking.results import COHORT, FRAMES, RETRIEVAL, Ranked
+from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.scoring.parameters import POSITIVE
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError, require_word
@@ -147,12 +148,12 @@ class FinalScore:
     name: str
     scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
     base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
-    step: Cohort | Fusion | FrameCorrelation | None = None
+    step: Cohort | Fusion | FrameCorrelation | DriveFilter | None = None
 
 
 def final_scores(
     scorers: Iterable[str], cohort: int | None, fused: Mapping[str, Fusion],
-    correlated: Mapping[str, FrameCorrelation],
+    correlated: Mapping[str, FrameCorrelation], sequences: Mapping[str, Sequence[DriveFilter]],
 ) -> dict[str, FinalScore]:  # fmt: skip
     """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
     known = {RETRIEVAL: FinalScore(RETRIEVAL)}
@@ -173,23 +174,32 @@ def final_scores(
         members = [scorer for member in fusion.members(name) for scorer in known[member].scorers]
         add(fusion.system(name), tuple(members), name, fusion)
     several = [*known][1:]
-    for name, correlation in correlated.items():
+
+    def add_step(field: str, name: str, words: str, step: FrameCorrelation | DriveFilter) -> None:
         if name not in several:
-            raise InputError(f"correlated: expected names of scorers ({', '.join(several) or 'there are none'}), "
-                             f"got {name}")  # fmt: skip
-        add(f"{name} + {FRAMES}", known[name].scorers, name, correlation)
+            raise InputError(f"{field}: expected names of scorers ({', '.join(several) or 'there are none'}), got "
+                             f"{name}")  # fmt: skip
+        add(f"{name} + {words}", known[name].scorers, name, step)
+
+    for name, correlation in correlated.items():
+        add_step("correlated", name, FRAMES, correlation)
+    for name, filters in sequences.items():
+        for each in filters:
+            add_step("sequences", name, each.name, each)
     return known
 
 
 def rank_by_scores(
     candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
-    hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None,
+    hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None, num_rows: int = 0,
 ) -> dict[str, Ranked]:  # fmt: skip
-    """Rankings of queries by name of the final score, in the order of `final_scores`; a sequence if correlated.
+    """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
 
-    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer.
+    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. Sequences need
+    `num_rows`, the number of images in the database.
     """
     known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
+    rankings: dict[str, Ranked] = {}
     for score in final_scores:
         base = score.base
         match score.step:
@@ -199,7 +209,11 @@ def rank_by_scores(
                 known[score.name] = fusion(base, candidates, known)
             case FrameCorrelation() as correlation:
                 known[score.name] = correlation(candidates, known[base])
-    return {score.name: _rank(candidates, known[score.name], ties) for score in final_scores}
+            case DriveFilter() as drive_filter:
+                rankings[score.name] = drive_filter(rankings[base], num_rows)
+        if score.name not in rankings:
+            rankings[score.name] = _rank(candidates, known[score.name], ties)
+    return rankings
 
 
 def _between(value: Any, low: float, high: float) -> bool:

@@ -12,6 +12,7 @@ from mfvpr.reranking.ranking import Scores
 from mfvpr.types import Shortlist
 
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
+SEQUENCE = "sequence"  # in names of rankings by the motion along a drive
 FRAMES = "frames"  # in names of rankings by frame correlation, which uses the queries before
 COHORT = "cohort"  # in names of rankings by scores that are normalized with a cohort
 

@@ -11,7 +11,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.reranking.results import COHORT
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
@@ -152,9 +152,12 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
         fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
     headline = fusing.system(main) if settings["final"] == "combined" else main
     correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
+    methods: Any = settings.get("sequence") or ()  # files of earlier versions lack it
+    methods = [methods] if isinstance(methods, str) else methods
     return {
         "scorers": chosen, "fused": fused, "correlated": correlated, "cohort": cohort, "ties": settings["ties"],
-        "final": headline, "settings": settings,
+        "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {}, "final": headline,
+        "settings": settings,
     }  # fmt: skip
 
 

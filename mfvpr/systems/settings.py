@@ -89,6 +89,7 @@ RULES: dict[str, Rule] = {
         "patch_sizes": list_of(whole(1, 64)),
         "stride": whole(1, 8),
         "previous_queries": whole(0, 1000),
+        ".sequence": either(or_list(one_of("causal", "lagged", "smoothed", "viterbi")), None),
         "trials": whole(1, 100_000),
         "batch hidden": whole(1, 1024),
         # numbers

@@ -1,4 +1,4 @@
-"""The filter over the rows of a map, against explicit loops in float64 and what is known in closed form."""
+"""Routes, against the filter of an evaluation and what is known of easy drives."""
 
 import math
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from mfvpr.localization import Alternative, Drive, Prediction, Route, route
-from mfvpr.localization.route import motion, shares
+from mfvpr.reranking.drives import Evidence
+from mfvpr.reranking.results import Ranked
+from mfvpr.reranking.sequences import follow
 from mfvpr.utils import InputError
 
 
@@ -21,62 +23,20 @@ def sharp(row, p=1.0):
     return prediction({row: 3.0}, p)
 
 
-def next_speeds(speed, speeds):
-    """Probabilities of the speeds after `speed`: it stays, changes by a few rows, or becomes any other."""
-    few = {other: math.exp(-((other - speed) ** 2) / 2) for other in speeds if other != speed}
-    total = sum(few.values())
-    return {
-        other: 0.98 * (0.95 if other == speed else 0.05 * few[other] / total) + 0.02 / len(speeds) for other in speeds
-    }
-
-
-def stepped_by_loops(belief, there, drive, scores, p):
-    """`step` of a prediction, written from the module's first lines; beliefs by (row, speed)."""
-    size, speeds = len(there), sorted({speed for _, speed in belief})
-    rows = [row for row in range(size) if there[row]]
-    before = dict.fromkeys(belief, 0.0)
-    for (row, speed), value in belief.items():
-        for other, chance in (next_speeds(speed, speeds) if len(speeds) > 1 else {speed: 1.0}).items():
-            moves = {k: math.exp(-((k - other) ** 2) / (2 * drive.spread**2))
-                     for k in range(-50, 51) if abs(k - other) <= 4 * drive.spread}  # fmt: skip
-            for k, weight in moves.items():
-                if 0 <= row + k < size and there[row + k]:
-                    before[row + k, other] += value * chance * weight / sum(moves.values())
-    total, states = sum(before.values()), len(rows) * len(speeds)
-    anywhere = {(row, speed): there[row] / states for row, speed in before}
-    before = {state: (1 - drive.kidnapped) * (value / total if total else anywhere[state])
-              + drive.kidnapped * anywhere[state] for state, value in before.items()}  # fmt: skip
-    mean = sum(scores.values()) / len(scores)
-    above = {row: max(0.0, score - mean) ** drive.sharpness for row, score in scores.items()}
-    beside = [0.0] * size
-    for row, share in above.items():
-        for k in range(-4, 5):
-            if 0 <= row + k < size and there[row + k]:
-                beside[row + k] += share * math.exp(-(k**2) / 2)
-    after = {(row, speed): value * (p * beside[row] / sum(beside) + (1 - p) * there[row] / len(rows))
-             for (row, speed), value in before.items()}  # fmt: skip
-    return {state: value / sum(after.values()) for state, value in after.items()}
-
-
 @pytest.mark.parametrize("advance", [1.3, None])
-def test_it_is_the_filter_that_its_first_lines_state(advance, monkeypatch):
-    monkeypatch.setattr(route, "SPEEDS", (-2, 0, 1, 3))
-    rng, drive = np.random.default_rng(0), Drive(advance, 0.8, 0.05, 0.4, 3.0)
-    there, drive_route = np.ones(40, bool), Route(drive)
+def test_it_is_the_causal_filter_of_an_evaluation(advance):
+    rng, drive = np.random.default_rng(0), Drive(advance, 0.8, 0.05)
+    there, drive_route = np.ones(40, bool), Route(drive, warn=lambda _: None)
     there[[5, 17]] = False
-    speeds = route.SPEEDS if advance is None else (advance,)
-    belief = {(row, speed): 0.0 for row in range(40) for speed in speeds}
-    for turn in range(12):
-        rows = rng.choice(np.flatnonzero(there), 8, replace=False).tolist()
-        scores = dict(zip(rows, rng.exponential(size=8).tolist(), strict=True))
-        p = None if turn % 3 else float(rng.uniform())
-        belief = stepped_by_loops(belief, there, drive, scores, 0.4 if p is None else p)
-        by_row = [sum(belief[row, speed] for speed in speeds) for row in range(40)]
-        located = drive_route(prediction(scores, p), there)
-        assert located.row == np.argmax(by_row)
-        assert located.p == pytest.approx(sum(by_row[max(0, located.row - 2) : located.row + 3]), rel=1e-4)
-        assert located.advance == pytest.approx(sum(speed * value for (_, speed), value in belief.items()), abs=1e-4)
-        np.testing.assert_allclose(drive_route.belief[:40], by_row, rtol=1e-3, atol=1e-7)
+    rows = np.stack([rng.choice(np.flatnonzero(there), 8, replace=False) for _ in range(12)])
+    scores = rng.exponential(size=rows.shape)
+    followed = follow(Evidence.of(Ranked(rows, scores)), drive, there)
+    for image, (of_image, its_scores) in enumerate(zip(rows.tolist(), scores.tolist(), strict=True)):
+        located = drive_route(prediction(dict(zip(of_image, its_scores, strict=True))), there)
+        assert drive_route.belief[located.row] == pytest.approx(followed.p[image, 0], rel=1e-4)  # rows may be level
+        assert located.off == pytest.approx(float(followed.off[image]), rel=1e-4)
+        np.testing.assert_allclose(drive_route.belief[followed.rows[image]], followed.p[image], rtol=1e-3)
+        assert located.p >= drive_route.belief[located.row] * (1 - located.off) - 1e-6
 
 
 @pytest.mark.parametrize("advance", [0, 1, 4, -2])
@@ -110,7 +70,7 @@ def test_a_sure_robot_moves_as_its_drive_says(advance):
     for turn in range(6):
         located = drive_route(sharp(30) if turn == 0 else None, there)
         assert located.row == 30 + turn * advance
-        assert located.p > 0.98
+        assert located.p > 0.98 * (1 - located.off)
         assert located.advance == pytest.approx(advance, abs=1e-5)
 
 
@@ -132,12 +92,7 @@ def test_it_finds_a_robot_that_was_carried_away():
 def test_a_sum_of_one_and_never_nan():
     there, drive_route = np.ones(30, bool), Route(Drive(1, 0.1, 0.0))
     infinite = prediction({4: math.nan}, 1.0), prediction({4: math.inf, 5: 1.0}, 1.0)
-    drive_route(sharp(3), there)
-    assert drive_route(sharp(20), there)[:2] == (
-        4,
-        pytest.approx(1, abs=0.01),
-    )  # image and motion exclude each other: the motion decides
-    for says in (None, *infinite, sharp(0), *[None] * 200):  # at last beyond the end of the map, with nothing left
+    for says in (sharp(3), sharp(20), None, *infinite, sharp(0), *[None] * 200):  # at last beyond the end of the map
         located = drive_route(says, there)
         assert drive_route.belief.sum() == pytest.approx(1, abs=1e-5)
         assert 0 <= located.p <= 1
@@ -147,7 +102,8 @@ def test_the_map_may_grow_and_costs_few_programs(compilations):
     drive_route = Route(Drive())
     assert drive_route(sharp(0), np.zeros(0, bool)) is None
     assert drive_route(sharp(0), np.zeros(4, bool)) is None
-    assert drive_route(sharp(2), np.ones(3, bool)).row == 2
+    for _ in range(2):  # the first image, and the others
+        assert drive_route(sharp(2), np.ones(3, bool)).row == 2
     compilations.reset()
     for rows in range(4, 1000, 50):
         assert drive_route(sharp(rows - 1), np.ones(rows, bool)).row < rows
@@ -156,25 +112,8 @@ def test_the_map_may_grow_and_costs_few_programs(compilations):
     assert len(drive_route.belief) == 2 * route.FIRST_ROWS
 
 
-@pytest.mark.parametrize(("scores", "expected"), [
-    ([4.0], [1]), ([2.0, 2.0], [0.5, 0.5]), ([3.0, 1.0, 2.0], [1, 0, 0]), ([4.0, 3.0, 0, 1], [0.8, 0.2, 0, 0]),
-    ([np.nan, 2.0], [0, 1]), ([np.nan], [0]), ([-1.0, -3.0], [1, 0]), ([1e-30, 0.0], [1, 0]),
-])  # fmt: skip
-def test_shares(scores, expected):
-    np.testing.assert_allclose(shares(np.array(scores), 2.0), expected, atol=1e-12)
-
-
-def test_motions_are_probabilities():
-    for advance, spread in ((0, 1), (1, 0.01), (0.5, 0.01), (-3.4, 2), (1000, 1)):
-        weights = motion(advance, spread)
-        assert len(weights) % 2 == 1
-        assert weights.sum() == pytest.approx(1, abs=1e-5)
-        steps = np.arange(len(weights)) - len(weights) // 2
-        assert weights @ steps == pytest.approx(advance, abs=0.01 + (0.5 if spread < 0.1 else 0) * (advance % 1 > 0))
-
-
 @pytest.mark.parametrize("incorrect", [
-    {"advance": math.nan}, {"spread": 0}, {"sharpness": math.inf}, {"kidnapped": 1.1}, {"confidence": -0.1},
+    {"advance": math.nan}, {"spread": 0}, {"spread": math.inf}, {"kidnapped": 1.1}, {"leaves": -0.1}, {"returns": 0},
 ])  # fmt: skip
 def test_drives_that_cannot_be(incorrect):
     with pytest.raises(InputError, match=r"Drive\("):
