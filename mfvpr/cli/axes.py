@@ -31,6 +31,10 @@ def axes(settings: dict[str, Any]) -> Axes:
     if "method" not in settings["scorer"]:
         raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
+    if isinstance(weights := settings["scorer"].get("weight"), list):
+        listed = ",".join(weights)
+        raise SettingsError(f"scorer.weight=[{listed}]: expected one weight; to compare weights, set "
+                            f"grid.weight=[{listed}]")  # fmt: skip
     [scorer] = assembly.scorers(settings["scorer"]).values()
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     known = [name for name in settings["grid"] if name in {*parameters_of(scorer), "max_distance", "c"}]

@@ -74,7 +74,8 @@ def _values(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     """Lines of some of a scorer's parameters."""
     for name, value in values.items():
         field = parameters_of(SCORERS[method])[name]
-        yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, field.words))))
+        of_a_list = "a list: a scorer of each" if name == "weight" else ""
+        yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, field.words, of_a_list))))
 
 
 def _axes() -> Iterator[str]:

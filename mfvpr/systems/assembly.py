@@ -162,8 +162,9 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def main_scorer(scorers: Mapping[str, Any]) -> str:
-    """Name of the scorer that decides: the histogram of shifts, or the first."""
-    return "histogram" if "histogram" in scorers else next(iter(scorers))
+    """Name of the scorer that decides: the first histogram of shifts, or the first scorer."""
+    histograms = (name for name, scorer in scorers.items() if isinstance(scorer, SCORERS["histogram"]))
+    return next(histograms, next(iter(scorers)))
 
 
 def fusion(settings: Mapping[str, Any]) -> Fusion:
@@ -186,9 +187,27 @@ def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return {settings["method"]: settings} if "method" in settings else settings
 
 
+def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Settings by scorer; a list of weights makes a scorer of each, such as `histogram_fs` and `histogram_ratio`."""
+    variants = [each for name, values in by_scorer(settings).items() for each in _variants(name, values)]
+    names = [name for name, _ in variants]
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise SettingsError(f"scorer: expected every scorer once, got {repeated[0]} twice; leave out one of its "
+                            "weights, or rename a file of weights")  # fmt: skip
+    return dict(variants)
+
+
+def _variants(name: str, values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """A scorer's name and settings for each of its weights."""
+    weights = values.get("weight")
+    if not isinstance(weights, list):
+        return [(name, values)]
+    return [(f"{name}_{Path(weight).stem}", {**values, "weight": weight}) for weight in weights]
+
+
 def weights(settings: Mapping[str, Any]) -> list[str]:
     """Names of the match weights of the scorers, and of those that a sweep tries."""
-    names = {values.get("weight", "fs") for values in by_scorer(settings["scorer"]).values()}
+    names = {values.get("weight", "fs") for values in expand_weights(settings["scorer"]).values()}
     return sorted(names | {*((settings.get("grid") or {}).get("weight") or ())})
 
 
@@ -198,7 +217,7 @@ def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
         if values.get("weight", "fs") not in WEIGHTS
         else {**values}
-        for name, values in by_scorer(settings).items()
+        for name, values in expand_weights(settings).items()
     }
 
 
@@ -206,7 +225,7 @@ def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or several, by name."""
     return {
         name: from_values(SCORERS[values["method"]], _without(values, "method"))
-        for name, values in by_scorer(settings).items()
+        for name, values in expand_weights(settings).items()
     }
 
 

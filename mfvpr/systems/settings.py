@@ -184,7 +184,8 @@ def _rule(path: str, methods: Mapping[str, str]) -> Rule | None:
     scorers = scorer_rules(CONF / "rules.yaml")
     if path.startswith("scorer."):
         rules = scorers.get(group if group in scorers else methods.get(group, ""), {})
-        return rules.get(name) or (one_of(*scorers) if path == "scorer.method" else None)
+        rule = rules.get(name) or (one_of(*scorers) if path == "scorer.method" else None)
+        return or_list(rule) if rule and name == "weight" else rule
     if group == "grid":
         owners = (scorers.get(methods["scorer"], {}), *scorers.values(), RULES)
         listed = next((list_of(rules[name]) for rules in owners if name in rules), None)

@@ -65,7 +65,7 @@ norm: sum  # of x and y; sum, largest
 weight: unit  # WORDS
 size: null  # [x, y] px; null = any
 strict: false
-""".replace("WORDS", ", ".join([*NAMED_WEIGHTS, "FILE.json"]))
+""".replace("WORDS", ", ".join([*NAMED_WEIGHTS, "FILE.json; a list: a scorer of each"]))
 
 
 @pytest.fixture
