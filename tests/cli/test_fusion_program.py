@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from mfvpr import HistogramOfShifts, RatioWeight
 from mfvpr.cli import axes, evaluation
 from mfvpr.systems import assembly, settings
 from tests.programs import composed, csv_rows, small
@@ -42,19 +43,22 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
 
 
-def test_our_system_fuses_two_scores_and_retrieval():
-    for arguments, features, side, weight in (
-        ([], "aliked", 320, 0.5), (["features=sift", "fusion.weights.retrieval=1"], "sift", 336, 1),
-    ):  # fmt: skip
-        config = composed("system=mfvpr", *arguments)
-        settings.check(config)
-        assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
-        fusion = assembly.fusion(config)
-        assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": weight, "anchor": 1})
-        assert fusion.system("histogram") == SYSTEM
-        assert assembly.fusion(composed("system=mfvpr", "fusion.weights=null")).system("anchor") == "anchor + retrieval"
-    alone = ("scorer=histogram", "scorer.weight=ratio", "final=score", "grid.sigma=[10]")
-    config = composed("system=mfvpr", *alone, config="sweep")
+def test_weights_choose_what_is_fused():
+    fusion = assembly.fusion(composed(*FUSED))
+    assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": 0.5, "anchor": 1})
+    assert fusion.system("histogram") == SYSTEM
+    assert assembly.fusion(composed(*FUSED, "fusion.weights=null")).system("anchor") == "anchor + retrieval"
+
+
+@pytest.mark.parametrize(("arguments", "features", "side"), [([], "aliked", 320), (["features=sift"], "sift", 336)])
+def test_our_system_ranks_by_the_histogram_of_ratios(arguments, features, side):
+    config = composed("system=mfvpr", *arguments)
+    settings.check(config)
+    assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
+    rankings = assembly.rankings(config)
+    assert rankings["scorers"] == {"histogram": HistogramOfShifts(weight=RatioWeight())}
+    assert rankings["final"] == "histogram"
+    config = composed("system=mfvpr", *arguments, "grid.sigma=[10]", config="sweep")
     settings.check(config)
     assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]
 

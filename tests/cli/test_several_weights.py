@@ -45,8 +45,10 @@ def test_a_run_is_loaded_and_mapped_with_all_of_its_weights(root, small_street, 
     several = ("scorer=histogram_ratio", "scorer.weight=[ratio,fs]")
     run = evaluate(root, tmp_path / "run", *several)
     system = mfvpr.load_system(run / "run.json")
-    assert [*system.scorers] == ["histogram_ratio", "histogram_fs"]
-    assert [scorer.weight for scorer in system.scorers.values()] == [mfvpr.RatioWeight(), mfvpr.FeatureScoreWeight()]
+    assert [*system.scorers.items()] == [
+        ("histogram_ratio", mfvpr.HistogramOfShifts(weight=mfvpr.RatioWeight())),
+        ("histogram_fs", mfvpr.HistogramOfShifts()),
+    ]
     evaluate(root, tmp_path / "again", *several, f"confidence={run}/confidence.json")
     assert "other settings" not in capsys.readouterr().err
     alone = mfvpr.load_system(evaluate(root, tmp_path / "alone", several[0]) / "run.json")

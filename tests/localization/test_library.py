@@ -44,11 +44,17 @@ def test_what_is_there_is_not_added_again(street, small_street):
 
 
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
+    """The scores are those of `system=mfvpr` in 0.2.0; its maps and runs open, since they hold settings."""
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
-    system = mfvpr.load_system("mfvpr", **features, retrieval={"num_words": 8}, candidates=5)
+    weights = {"fusion.c": "zscore", "fusion.weights": "{retrieval: 0.5, anchor: 1}", "final": "combined"}
+    more = {"scorer": "ratio", "retrieval": {"num_words": 8}, "candidates": 5}
+    fused = mfvpr.load_system("mfvpr", **features, **weights, **more)
+    (tmp_path / "run.json").write_text(json.dumps({"settings": fused.settings}))
+    system = mfvpr.load_system(tmp_path / "run.json")
     dataset = mfvpr.datasets.folder(small_street / "database", small_street / "queries", ground_truth="order")
     result = mfvpr.evaluate(dataset, system, cache=FeatureCache(tmp_path / "cache"))
-    known = Map.create(tmp_path / "map", dataset.database, system)
+    Map.create(tmp_path / "map", dataset.database, fused)
+    known = Map.open(tmp_path / "map")
     assert system.headline == "histogram + anchor + retrieval"
     [ranked] = result.only.systems[system.headline]
     for row, path in enumerate(dataset.queries.paths):

@@ -40,7 +40,7 @@ def test_every_evaluation_has_settings_of_the_paper(run):
     for name, size in sizes.items():
         if run.startswith(name):
             assert settings["features"]["image_size"] == size
-    assert settings["final"] == ("combined" if "comb" in run or "mfvpr" in run else "score")
+    assert settings["final"] == ("combined" if "comb" in run else "score")
 
 
 def test_settings_depend_on_the_data_set(tmp_path):
