@@ -35,6 +35,9 @@ def axes(settings: dict[str, Any]) -> Axes:
         listed = ",".join(weights)
         raise SettingsError(f"scorer.weight=[{listed}]: expected one weight; to compare weights, set "
                             f"grid.weight=[{listed}]")  # fmt: skip
+    if isinstance(methods := settings.get("sequence"), list):
+        raise SettingsError(f"sequence=[{','.join(methods)}]: a sweep takes one at a time; sweep them with -m "
+                            f"sequence={','.join(methods)}")  # fmt: skip
     [scorer] = assembly.scorers(settings["scorer"]).values()
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     known = [name for name in settings["grid"] if name in {*parameters_of(scorer), "max_distance", "c"}]

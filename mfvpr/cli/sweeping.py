@@ -1,6 +1,8 @@
 """Sweep: matches -> scores of all settings -> the best setting, and its recall on other queries."""
 
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,8 @@ from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare
 from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.report import sweeps
+from mfvpr.reranking.results import Ranked
+from mfvpr.reranking.sequences import DriveFilter, Method
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
 from mfvpr.utils import Stopwatch
@@ -28,7 +32,8 @@ def sweep(settings: dict[str, Any]) -> None:
         blocks = _block_folder(settings, inputs)
         options = SweepOptions(
             settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
-            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, inputs.cache.runtime,
+            _sequence(settings["sequence"], len(inputs.dataset.database)), settings["chunk"]["settings"],
+            settings["chunk"]["queries"], blocks, inputs.cache.runtime,
         )  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
@@ -48,11 +53,16 @@ def sweep(settings: dict[str, Any]) -> None:
         shutil.rmtree(blocks, ignore_errors=True)
 
 
+def _sequence(method: Method | None, num_rows: int) -> Callable[[Ranked], Ranked] | None:
+    """The ranking of a drive's queries by a method."""
+    return None if method is None else partial(DriveFilter(method), num_rows=num_rows)
+
+
 def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:
     """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
     if settings["cache"] is None:
         return None
-    names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion")
+    names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion", "sequence")
     sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
     software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
     name = fingerprint({"matches": inputs.matches_recipe(), "sweep": sweep_settings, "versions": software})
@@ -62,10 +72,11 @@ def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:
 def _heading(settings: dict[str, Any], inputs: Inputs, outcome: Outcome) -> str:
     dataset, features, ground_truth = inputs.dataset, settings["features"], truth.in_words(inputs.ground_truth)
     size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
+    sequence = f" + {settings['sequence']} sequence" if settings["sequence"] else ""
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
         f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
-        f"{settings['scorer']['method']} score, {features['name']} features{size}; {ground_truth}"
+        f"{settings['scorer']['method']} score{sequence}, {features['name']} features{size}; {ground_truth}"
     )
 
 
@@ -74,6 +85,7 @@ def _results(settings: dict[str, Any], inputs: Inputs, outcome: Outcome, seconds
         "dataset": inputs.dataset.name, "data_fingerprint": fingerprints(inputs.contents),
         "reading": readings(inputs.contents), "scorer": settings["scorer"], "features": settings["features"],
         "retrieval": settings["retrieval"], "matching": settings["matching"], "candidates": settings["candidates"],
-        "fusion": settings["fusion"], "final": settings["final"], "ground_truth": inputs.ground_truth,
+        "fusion": settings["fusion"], "final": settings["final"], "sequence": settings["sequence"],
+        "ground_truth": inputs.ground_truth,
         **sweeps.sweep_json(outcome), "seconds": seconds, "versions": versions(),
     }  # fmt: skip

@@ -1,7 +1,8 @@
 """Sweeps of the parameters of a system, for users of the library; `sweeping` is the program."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from mfvpr.evaluation.protocol import Split
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.runs import LAST
 from mfvpr.report.sweeps import Sweep, axes_json
-from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import numbers_by_name, static_names
@@ -33,8 +34,9 @@ def sweep(
 
     Args:
         dataset: one query sequence with ground truth.
-        system: its only scorer is swept, and fused with the retrieval if the system ranks by that; or a scorer, for the
-            features and matches of `mfvpr sweep` (SIFT, VLAD, 50 candidates).
+        system: its only scorer is swept, and fused with the retrieval if the system ranks by that. If it has a sequence
+            of this ranking, the sequence ranks. Or a scorer, for the features and matches of `mfvpr sweep` (SIFT, VLAD,
+            50 candidates).
         split: half of the path to choose on ("first_half", "second_half"), or "both" in turn; the result is reported
             on the other half. None = choose and report on all queries.
         thresholds: largest distances of a correct prediction, in the unit of the ground truth. The middle one decides.
@@ -64,7 +66,10 @@ def sweep(
     protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
     runtime = runtime or cache.runtime
     kind = system.fused[name].retrieval_score if name in system.fused else "cosine"
-    options = SweepOptions(ties=system.ties, retrieval_score=kind, folder=_block_folder(out, swept), runtime=runtime)
+    options = SweepOptions(
+        ties=system.ties, retrieval_score=kind, sequence=_sequence(system, len(dataset.database)),
+        folder=_block_folder(out, swept), runtime=runtime,
+    )  # fmt: skip
     matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=runtime)
     result = Sweep(dataset.name, name, search_grid(swept, protocol, matched.by_scale, matched.candidates, options))
     if out is not None:
@@ -90,6 +95,14 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
     raise InputError(f"system: expected one that ranks by its only scorer, alone or + {RETRIEVAL}, got one of "
                      f"{', '.join(system.scorers)} that ranks by {system.headline}; sweep one scorer at a time with "
                      "mfvpr.System(system.pipeline, {name: scorer})")  # fmt: skip
+
+
+def _sequence(system: System, num_rows: int) -> Callable[[Ranked], Ranked] | None:
+    """The only sequence of the ranking that decides, for a database of so many rows."""
+    filters = system.sequences.get(system.headline, ())
+    if len(filters) > 1:
+        raise InputError(f"sequences: expected at most one of {system.headline}, got {len(filters)}; sweep each")
+    return partial(filters[0], num_rows=num_rows) if filters else None
 
 
 def _block_folder(out: Path | str | None, axes: Axes) -> Path | None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 import mfvpr
 from mfvpr.evaluation import statistics
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.reranking import Fusion
+from mfvpr.reranking import DriveFilter, Fusion
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import rankings
@@ -57,6 +58,23 @@ def test_the_best_setting_is_honestly_named(swept):
     assert result.interval == statistics.estimate(hits)
     assert repr(result).startswith("Sweep(folder, MyScorer: 6 settings of sigma, weight; best sigma = ")
     assert len(repr(result)) < 200
+
+
+@pytest.mark.parametrize("method", ["causal", "viterbi"])
+def test_a_sequence_ranks_as_in_an_evaluation(dataset, method):
+    """Its queries have been fused with the retrieval before."""
+    sift, cache = Sift(), FeatureCache()
+    pipeline = mfvpr.Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+    fused = mfvpr.System(pipeline, {"mine": MyScorer()}, {"mine": Fusion(0.5)}, final="mine + retrieval",
+                         sequences={"mine + retrieval": (DriveFilter(method),)})  # fmt: skip
+    rows = mfvpr.sweep(dataset, fused, cache=cache, sigma=[5, 22.5]).outcome.rows
+    for number, sigma in enumerate((5.0, 22.5)):
+        system = replace(fused, scorers={"mine": MyScorer(sigma)})
+        [ranked] = mfvpr.evaluate(dataset, system, cache=cache).only.systems[f"mine + retrieval + {method} sequence"]
+        np.testing.assert_array_equal(rows[0, number], ranked.rows[:, : rows.shape[-1]])
+    twice = replace(fused, sequences={"mine + retrieval": (DriveFilter(method), DriveFilter("lagged"))})
+    with pytest.raises(mfvpr.InputError, match=r"at most one of mine \+ retrieval, got 2"):
+        mfvpr.sweep(dataset, twice, cache=cache, sigma=[5])
 
 
 def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, monkeypatch, tmp_path):

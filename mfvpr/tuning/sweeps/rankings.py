@@ -8,7 +8,7 @@ block.
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -24,6 +24,7 @@ from mfvpr.matching.match_set import MatchSet, Scales, partition, queries_that_f
 from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
 from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
+from mfvpr.reranking.results import Ranked
 from mfvpr.scoring.scorer import check_host, on_host
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, group_by_program
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
@@ -41,12 +42,14 @@ _MEASURED = 64  # settings x batches: less work is done before its time is measu
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """Options of a sweep. Only `ks`, `ties` and `retrieval_score` change its results.
+    """Options of a sweep. Only `ks`, `ties`, `retrieval_score` and `sequence` change its results.
 
     Attributes:
         ks: depths of the recall; the largest is the number of rows of a ranking.
         ties: see `mfvpr.reranking.ranking.rank_shortlist`.
         retrieval_score: see `mfvpr.reranking.ranking.retrieval_scores`.
+        sequence: ranks the queries of a drive together, from their rankings by a setting, such as a `DriveFilter` with
+            its number of rows; then blocks have all queries. None = each query alone.
         settings_per_block: None = 64.
         queries_per_block: None = as many as fit into 256 MB.
         folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
@@ -59,6 +62,7 @@ class SweepOptions:
     ks: Sequence[int] = (1, 5, 10)
     ties: Ties = "retrieval"
     retrieval_score: RetrievalScore = "cosine"
+    sequence: Callable[[Ranked], Ranked] | None = None
     settings_per_block: int | None = None
     queries_per_block: int | None = None
     folder: Path | None = None
@@ -125,7 +129,7 @@ class Block:
         """Hash of everything that determines the rows: matches and shortlist, the scorer's program and numbers."""
         group, options = self.group, self.part.options
         names = [*group.settings, *group.weightings]
-        of_rows = max(options.ks), options.ties, options.retrieval_score, list(map(repr, self.cs))
+        of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence, list(map(repr, self.cs))
         numbers = group.scorer, dict(group.settings), dict(group.weightings)
         return content_hash(repr((*of_rows, group.rows.tolist(), names)), group.program, self.part.digest, numbers)
 
@@ -201,7 +205,8 @@ def _blocks(scorer: Any, settings: Sequence[Setting], work: Work) -> Iterator[Bl
     work = replace(work, settings=len(unique) / len(programs))
     if options.folder is not None:
         programs = [replace(group, program=group_program(work, group)) for group in programs]
-    for part in work.parts(options.queries_per_block or queries_that_fit(work.match_set, per_block)):
+    size = options.queries_per_block or queries_that_fit(work.match_set, per_block)
+    for part in work.parts(size if options.sequence is None else max(1, len(work.queries))):
         for number, program in enumerate(programs):
             for group in program.blocks(per_block):
                 of_settings = [places[row] for row in dict.fromkeys(group.rows.reshape(-1).tolist())]
@@ -283,9 +288,13 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
         members = np.flatnonzero(kinds == kind)
         c = np.array([cs[int(member)] for member in members], np.float32) if kind == "given" else None
         tie_break = indices if breaks_ties_by_row(part.options.ties) else None
-        order = np.asarray(_orders(by_retrieval, scores[members], c, view, tie_break, fused=kind != "alone"))
-        order = order[..., : max(part.options.ks)]
+        fused = kind != "alone"
+        order, final = map(np.asarray, _orders(by_retrieval, scores[members], c, view, tie_break, fused=fused))
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
+        if (sequence := part.options.sequence) is not None:
+            pairs = zip(ranked, np.take_along_axis(final, order, -1), strict=True)
+            ranked = np.stack([sequence(Ranked(*pair)).rows for pair in pairs])
+        ranked = ranked[..., : max(part.options.ks)]
         rows[members, :, : ranked.shape[-1]] = ranked
     return rows
 
@@ -293,12 +302,13 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
 @partial(compiled, static_argnames="fused")
 def _orders(
     by_retrieval: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
-) -> Array:
-    """Positions `[W, q, C]` into the shortlist, best first, one setting at a time."""
+) -> tuple[Array, Array]:
+    """Positions `[W, q, C]` into the shortlist, best first, and the final scores, one setting at a time."""
 
-    def order(scores_c: tuple[Array, Array | None]) -> Array:
+    def order(scores_c: tuple[Array, Array | None]) -> tuple[Array, Array]:
         scores, c = scores_c
-        return ranking.rank(ranking.fuse(by_retrieval, scores, view, c) if fused else scores, view, tie_break=tie_break)
+        scores = ranking.fuse(by_retrieval, scores, view, c) if fused else scores
+        return ranking.rank(scores, view, tie_break=tie_break), scores
 
     return jax.lax.map(order, (scores, c))
 
