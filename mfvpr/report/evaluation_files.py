@@ -16,6 +16,7 @@ from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.reranking.results import Ranked
+from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.utils.files import write_text
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
@@ -96,6 +97,36 @@ def write_skipped(folder: Path, ranked: RankedDataset) -> None:
               for matched in ranked.matched for row, reason in matched.bad_queries.items()]  # fmt: skip
     if lines:
         write_text(folder / "skipped.csv", Table(["folder", "image", "reason"], lines).csv())
+
+
+def write_changes(folder: Path, evaluation: EvaluationReport) -> None:
+    """Write `changes.csv` with the queries whose first prediction a sequence changes, if the system has sequences.
+
+    `correct_before` and `correct_after` are 1 or 0, or empty where it is unknown.
+    """
+    sequences = {name: score.base for name, score in evaluation.ranked.system.final_scores.items()
+                 if isinstance(score.step, DriveFilter)}  # fmt: skip
+    names = evaluation.ranked.dataset.database.names
+    lines = [
+        [name, sequence.name, sequence.images.names[query], *(cells[query] for cells in (*before, *after))]
+        for name, base in sequences.items()
+        for place, sequence in enumerate(evaluation.sequences)
+        for before, after in [[_first_predictions(evaluation, system, place, names) for system in (base, name)]]
+        for query in range(len(sequence.images))
+        if before[0][query] != after[0][query]
+    ]
+    if sequences:
+        header = ["system", "sequence", "query", "before", "correct_before", "after", "correct_after"]
+        write_csv(folder / "changes.csv", header, lines)
+
+
+def _first_predictions(
+    evaluation: EvaluationReport, system: str, place: int, names: Sequence[str]
+) -> tuple[list[str], list[int | str]]:
+    """Names of the first predictions of a sequence's queries, and whether they are correct."""
+    rows, correct = evaluation.ranked.systems[system][place].rows[:, 0], evaluation.is_correct(system, place)
+    predictions = [names[row] if row >= 0 else "" for row in rows]
+    return predictions, ["" if correct is None else int(correct[query, 0]) for query in range(len(rows))]
 
 
 class Difference(NamedTuple):

@@ -14,7 +14,7 @@ from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.features.extractor import Source
 from mfvpr.report.confidences import write_confidence
-from mfvpr.report.evaluation_files import write_gains, write_rankings, write_skipped
+from mfvpr.report.evaluation_files import write_changes, write_gains, write_rankings, write_skipped
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.runs import write_about, write_json, write_table, writing
 from mfvpr.report.tables import format_number, write_csv
@@ -97,6 +97,7 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     write_confidence(folder, report, _provenance(report, description))
     if report.histogram is not None:
         write_shifts(folder, report, report.histogram)
+    write_changes(folder, report)
     write_skipped(folder, report.ranked)
 
 

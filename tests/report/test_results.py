@@ -14,10 +14,10 @@ from mfvpr.datasets.truth import RADIUS, TOLERANCES
 from mfvpr.evaluation.evaluation import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
-from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils import InputError
-from tests.programs import composed
+from tests.programs import composed, csv_rows
 
 pytestmark = pytest.mark.thorough
 
@@ -60,6 +60,27 @@ def test_one_result_has_all_data_sets_and_systems(result, dataset, systems):
         assert len(repr(short)) < 200
     with pytest.raises(InputError, match=r"expected one data set .* got 4"):
         result.only  # noqa: B018
+
+
+def test_a_run_folder_says_which_predictions_a_sequence_changes(dataset, systems, tmp_path):
+    filters = DriveFilter(), DriveFilter("smoothed")
+    result = mfvpr.evaluate(dataset, replace(systems["paper"], sequences={"histogram": filters}))
+    result.save(tmp_path / "run")
+    lines = [[*line.values()] for line in csv_rows(tmp_path / "run" / "changes.csv")]
+    names, positives = dataset.database.names, dataset.truth.positives(2)
+    alone, expected = result.only.systems["histogram"][0].rows[:, 0], []
+    for method in ("causal", "smoothed"):
+        rows = result.only.systems[f"histogram + {method} sequence"][0].rows[:, 0]
+        correct, before = (positives.contains(each[:, None])[:, 0].astype(int) for each in (rows, alone))
+        expected += [
+            [f"histogram + {method} sequence", dataset.only.name, dataset.only.images.names[query], names[alone[query]],
+             str(before[query]), names[rows[query]], str(correct[query])]
+            for query in np.flatnonzero(alone != rows)
+        ]  # fmt: skip
+    assert lines == expected
+    assert lines
+    result.write_report(tmp_path / "report.html")
+    assert "with the other queries" in (tmp_path / "report.html").read_text()
 
 
 def test_predictions_are_those_of_the_score_that_decides(result, dataset):

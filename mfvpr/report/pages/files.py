@@ -29,7 +29,7 @@ _KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "retri
           "bytes_per_image": int | None}  # fmt: skip
 # Columns of text in front of the numbers; None = all.
 _TABLES = {"table.csv": 1, "differences.csv": 2, "confidence.csv": None, "rerank_share.csv": 0,
-           "precision_recall.csv": 2, "skipped.csv": None}  # fmt: skip
+           "precision_recall.csv": 2, "changes.csv": None, "skipped.csv": None}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,13 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     if run.gains and (table := run.tables.get("differences.csv")) and table.rows:
         words, tests = paired_tests("system", table.rows)
         sections.append(Section("differences", "Differences", words, tables={"Every two systems": tests}))
-    sections += [*_confidence_section(run), _predictions_section(run), _costs_section(run), _settings_section(run)]
+    sections += [
+        *_sequence_section(run),
+        *_confidence_section(run),
+        _predictions_section(run),
+        _costs_section(run),
+        _settings_section(run),
+    ]
     write_page(path, title=_title(run), words=description(run), facts=_facts(run), sections=sections)
     return path
 
@@ -177,6 +183,18 @@ def paired_tests(kind: str, lines: Sequence[Sequence[str]]) -> tuple[str, Table]
             for line in lines]  # fmt: skip
     columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
     return words, Table(columns, rows, text_columns=2)
+
+
+def _sequence_section(run: Run) -> Iterator[Section]:
+    """Queries whose prediction a sequence changes."""
+    if (table := run.tables.get("changes.csv")) and table.rows:
+        words = {"1": "correct", "0": "incorrect", "": ""}
+        rows = [[*cells[:3], cells[3], words[cells[4]], cells[5], words[cells[6]]] for cells in table.rows]
+        columns = ["system", "sequence", "query", "alone", "", "with the other queries", ""]
+        tables = {"Changed predictions": Table(columns, rows, len(columns))}
+        yield Section(
+            "sequence", "Sequences", "First predictions that the other queries of a drive change.", tables=tables
+        )
 
 
 def _confidence_section(run: Run) -> Iterator[Section]:
