@@ -9,6 +9,7 @@ The field's methods see the same images as "causal": those before.
 
 - single: each image alone
 - causal, lagged, smoothed, viterbi: `DriveFilter` of the scores
+- at speed 1: causal, told that the robot moves one row from one image to the next
 - frames: frame correlation with the 2 images before (Camara & Preucil, RAS 2020)
 - SeqSLAM 1, SeqSLAM any: straight trajectories of 10 images, 0.8 to 1.2 or -8 to 8 rows from one to the next, through
   the similarities of global descriptors, which are standardized for each image (after Milford & Wyeth, ICRA 2012)
@@ -27,6 +28,7 @@ from mfvpr.cli.systems import load_system
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.reranking.drives import Drive
 from mfvpr.reranking.fusion import FrameCorrelation
 from mfvpr.reranking.results import Ranked
 from mfvpr.reranking.sequences import DriveFilter
@@ -107,6 +109,7 @@ class Place:
         first = {"single": ranked.rows[:, 0]}
         for method in ("causal", "lagged", "smoothed", "viterbi"):
             first[method] = DriveFilter(method)(ranked, self._rows).rows[:, 0]
+        first["at speed 1"] = DriveFilter("causal", Drive(advance=1))(ranked, self._rows).rows[:, 0]
         frames = np.where(shortlist.mask, FrameCorrelation()(shortlist, ranked.scores), -np.inf)
         first["frames"] = ranked.rows[np.arange(len(images)), frames.argmax(axis=1)]
         vectors, scores = self._vectors[0][images], standardized(self._scores[images])
@@ -147,9 +150,9 @@ def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"])
     return f"{100 * correct.mean():.1f} ({100 * (correct.mean() - alone.mean()):+.1f}, p {p:.3f})"
 
 
-def run(arguments: list[str]) -> None:
+def run(arguments: list[str], features: str) -> None:
     """Print a table of all data sets."""
-    system, cache = load_system("mfvpr"), FeatureCache()
+    system, cache = load_system("mfvpr", features=features), FeatureCache()
     places = defaultdict[str, list[Place]](list)
     for name, _, paths in (argument.partition("=") for argument in arguments):
         dataset = folder(*paths.split(":"), ground_truth="order")
@@ -164,6 +167,7 @@ def run(arguments: list[str]) -> None:
 def add_arguments(parser: Parser) -> None:
     """Declare the command line."""
     parser.add_argument("arguments", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives along data sets")
+    parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
     parser.set_defaults(run="experiments.sequences:run")
 
 

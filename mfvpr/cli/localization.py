@@ -129,7 +129,7 @@ class _Drive:
         rows = rows[: max(0, len(rows) - self._settings["recent"])]
         position = self._route(prediction, rows)
         return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4),
-                                       "advance": round(position.advance, 2)}}  # fmt: skip
+                                       "advance": round(position.advance, 2), "off": round(position.off, 4)}}  # fmt: skip
 
 
 class _LocalizationFigures:

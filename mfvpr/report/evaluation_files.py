@@ -122,11 +122,11 @@ def write_changes(folder: Path, evaluation: EvaluationReport) -> None:
 
 def _first_predictions(
     evaluation: EvaluationReport, system: str, place: int, names: Sequence[str]
-) -> tuple[list[str], list[int | str]]:
+) -> tuple[list[str], list[str]]:
     """Names of the first predictions of a sequence's queries, and whether they are correct."""
     rows, correct = evaluation.ranked.systems[system][place].rows[:, 0], evaluation.is_correct(system, place)
-    predictions = [names[row] if row >= 0 else "" for row in rows]
-    return predictions, ["" if correct is None else int(correct[query, 0]) for query in range(len(rows))]
+    flags = [""] * len(rows) if correct is None else [str(int(flag)) for flag in correct[:, 0]]
+    return [names[int(row)] if row >= 0 else "" for row in rows], flags
 
 
 class Difference(NamedTuple):
