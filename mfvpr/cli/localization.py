@@ -128,8 +128,10 @@ class _Drive:
         rows = self._map.there[:row]
         rows = rows[: max(0, len(rows) - self._settings["recent"])]
         position = self._route(prediction, rows)
-        return {"route": position and {"place": self._map.place(position.row), "p": round(position.p, 4),
-                                       "advance": round(position.advance, 2), "off": round(position.off, 4)}}  # fmt: skip
+        if position is None:
+            return {"route": None}
+        numbers = {"p": round(position.p, 4), "advance": round(position.advance, 2), "off": round(position.off, 4)}
+        return {"route": {"place": self._map.place(position.row)} | numbers}
 
 
 class _LocalizationFigures:
