@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mfvpr.cli.console import tell
 from mfvpr.cli.groups import PROGRAMS, check_choice, choices, choices_with, groups
 from mfvpr.cli.launch import import_job, on_interrupt, one_line
-from mfvpr.cli.overrides import PATHS, compose_program, quote, split_first
+from mfvpr.cli.overrides import PATHS, compose_program, quote, register_resolvers, split_first
 from mfvpr.cli.wording import in_settings
 from mfvpr.systems.settings import CONF, SettingsError, check, nodes
 
@@ -67,6 +67,7 @@ def run(config: str) -> None:
             with interruptible, words, _frozen_imports(), cluster as started:
                 job(settings | {"multirun": multirun_job, "command": command, "cluster": started})
 
+    register_resolvers(lambda line: tell(f"note: {line}"))
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     typed = sys.argv[1:]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mfvpr.cli import confidences, run_folder, truth
-from mfvpr.cli.inputs import Inputs, prepare
+from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Shard, System, fill_shard, rank_dataset
 from mfvpr.report.confidences import confidence_figures, confidence_table
@@ -29,6 +29,7 @@ class Outcome:
 
 def evaluate(settings: dict[str, Any]) -> None:
     """Run all stages, print the table, fill the run folder; a shard fills the cache only."""
+    settings = with_image_size(settings)
     if settings["shard"] is not None:
         _fill_shard(settings)
         return

@@ -1,6 +1,7 @@
 """The groups of conf/ that a program has, and their choices; without Hydra, whose import is slow."""
 
 import difflib
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ PROGRAMS = {
     "map": ("mfvpr map build", "mfvpr.cli.localization:build_map"),
     "localize": ("mfvpr localize", "mfvpr.cli.localization:localize"),
 }
+_STEERING_WEIGHTS = "aliked-n16"
 
 
 def defaults(file: Path) -> list[Any]:
@@ -51,6 +53,17 @@ def choices_with(group: str, name: str) -> list[str]:
     """The choices of a group that have a setting, without those that combine or vary other choices."""
     files = {choice: CONF / group / f"{choice}.yaml" for choice in choices(group)}
     return [choice for choice, file in files.items() if name in _read(file) and not defaults(file)]
+
+
+def aliked_or_sift(note: Callable[[str], object]) -> str:
+    """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, which is noted."""
+    from mfvpr.checkpoints import entry_of, is_installed  # here, since --help of other systems does without
+
+    if is_installed(entry_of(_STEERING_WEIGHTS)):
+        return "aliked"
+    note(f"system=steering uses SIFT, because the weights {_STEERING_WEIGHTS} are not installed; with them it is more "
+         "precise, see `mfvpr weights list`")  # fmt: skip
+    return "sift"
 
 
 def check_choice(name: str, value: str, config: str) -> None:

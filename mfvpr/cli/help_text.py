@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from mfvpr.cli.groups import check_choice, choices, defaults, groups
+from mfvpr.cli.groups import aliked_or_sift, check_choice, choices, defaults, groups
 from mfvpr.systems.settings import CONF
 
 _WHOLE = ("system", "experiment")  # groups that set values of all other groups
@@ -24,7 +24,7 @@ def help_text(config: str, arguments: Sequence[str]) -> str:
     chosen |= _overrides(chosen) | typed
     for group, choice in chosen.items():
         if choice and choice.startswith("${"):
-            other = chosen[choice[2:-1]]
+            other = aliked_or_sift(lambda line: None) if choice.endswith(":}") else chosen[choice[2:-1]]
             chosen[group] = other if other in choices(group) else None
     return "\n".join([*_parts(config, chosen)])
 

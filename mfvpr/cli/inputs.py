@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mfvpr.cli import build, notes, truth
-from mfvpr.cli.console import Progress
+from mfvpr.cli.console import Progress, tell
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
+from mfvpr.evaluation.image_sizes import folders_of, size_for_images
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matching import MatchSet, Scales
@@ -52,6 +53,16 @@ class Inputs:
         recipe = matches_recipe(self.dataset, self.dataset.only, self.pipeline, self.cache)
         scales = self.pipeline.extractor.scales
         return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
+
+
+def with_image_size(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings with the image size that `features.image_size=auto`, or a number of pixels, leaves to the images."""
+    if isinstance(settings["features"]["image_size"], list | None):
+        return settings
+    dataset = dataset_of(settings["dataset"])
+    pipeline = assembly.pipeline(settings, dataset)
+    size = size_for_images(pipeline, folders_of(dataset), lambda line: tell(f"warning: {line}"))
+    return {**settings, "features": {**settings["features"], "image_size": [*size]}}
 
 
 def prepare(settings: Mapping[str, Any], watch: Stopwatch) -> Inputs:

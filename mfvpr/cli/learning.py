@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
-from mfvpr.cli.inputs import prepare
+from mfvpr.cli.inputs import prepare, with_image_size
 from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
 from mfvpr.matching import Scales
@@ -39,6 +39,7 @@ class Prepared(NamedTuple):
 
 def learn(settings: dict[str, Any]) -> None:
     """Learn, search, compare on queries that were not learned on, fill the run folder."""
+    settings = with_image_size(settings)
     with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         axes, options, watch = learning_axes(settings), _options(settings), Stopwatch()
         teach = [_prepare(choice, watch) for choice in _settings_by_data_set(settings)]

@@ -16,7 +16,7 @@ from mfvpr.cli.query_images import images
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Map, Prediction, Route
-from mfvpr.localization.declaration import read_declaration, read_system
+from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.disk import used_bytes
 from mfvpr.storage.maps import Entry
@@ -28,8 +28,11 @@ from mfvpr.utils.files import expand_user, printable
 
 def build_map(settings: dict[str, Any]) -> None:
     """Map the database of a data set."""
-    robot_map = map_of_settings(settings)
-    added = robot_map.build(dataset_of(settings["dataset"]).database, track=track("images"))
+    system = assembly.system({**settings, "cohort": None, "previous_queries": 0})
+    images = dataset_of(settings["dataset"]).database
+    folder, warn = expand_user(settings["map"]), lambda line: tell(f"warning: {line}")
+    robot_map = Map(folder, fit_to_map(folder, system, images, warn))
+    added = robot_map.build(images, track=track("images"))
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
 
 
@@ -56,12 +59,6 @@ def add_images(folder: Path, images: list[Path], place: str | None) -> None:
     for path in images:
         robot_map.add(path, path.name if place is None else place)
         print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
-
-
-def map_of_settings(settings: Mapping[str, Any]) -> Map:
-    """The map in the folder of the settings, which may be missing or empty."""
-    system = assembly.system({**settings, "cohort": None, "previous_queries": 0})
-    return Map(expand_user(settings["map"]), system)
 
 
 def localize(settings: dict[str, Any]) -> None:
@@ -106,9 +103,10 @@ class _Drive:
         start = time.perf_counter()
         row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
         localized = self._map.localize_with_evidence(pixels, recent=recent, before=row)
-        line = localized.prediction.as_json(self._settings["alternatives"]) | self.route_entry(
-            localized.prediction, row
-        )
+        prediction = localized.prediction
+        line = prediction.as_json(self._settings["alternatives"]) | self.route_entry(prediction, row)
+        if (field_of_view := self._settings["field_of_view"]) is not None:
+            line |= {"shift_angles": prediction.shift_angles(field_of_view)}
         return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
 
     def add(self, name: str, localized: Localization) -> dict[str, Any]:

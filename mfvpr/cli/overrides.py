@@ -1,6 +1,8 @@
 """Typed settings as Hydra's overrides: quoted values, and data sets as `streets:seed=1,corridor:root=DIR`."""
 
 import re
+import warnings
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
@@ -10,13 +12,21 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from mfvpr.cli.groups import choices
+from mfvpr.cli.groups import aliked_or_sift, choices
 from mfvpr.systems.settings import CONF, SettingsError, check
 
 PATHS = {"dataset.database", "dataset.queries", "dataset.root", "dataset.index_file", "dataset.cache"}
 PATHS |= {"dataset.database_labels", "dataset.query_labels", "map", "images"}
 PATHS |= {"cache", "out", "checkpoints", "confidence", "also", "report"}
 PATHS |= {f"{group}.{side}" for group in ("features", "retrieval") for side in ("database", "queries")}
+
+
+def register_resolvers(note: Callable[[str], object]) -> None:
+    """Let `${aliked_or_sift:}` in conf/ choose features by the installed weights; a line about it goes to `note`."""
+    OmegaConf.register_new_resolver("aliked_or_sift", lambda: aliked_or_sift(note), replace=True)
+
+
+register_resolvers(warnings.warn)  # in the library; programs register `tell`
 
 
 def quote(argument: str, *, several: bool = False) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
-from mfvpr.cli.inputs import Inputs, prepare
+from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.report import sweeps
 from mfvpr.reranking.results import Ranked
@@ -23,7 +23,7 @@ from mfvpr.utils.versions import versions
 
 def sweep(settings: dict[str, Any]) -> None:
     """Search the settings, print the table, fill the run folder."""
-    settings = with_final_axis(settings)
+    settings = with_image_size(with_final_axis(settings))
     with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         axes, watch = search_axes(settings), Stopwatch()
         inputs = prepare(settings, watch)

@@ -4,6 +4,7 @@ Decoding and the default resampling are Pillow's, as in the published networks' 
 their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
+import math
 import warnings
 from collections.abc import Iterator
 from io import BytesIO
@@ -81,6 +82,27 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             elif not orient:
                 orientation = 1
             return np.asarray(rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb)
+
+
+def read_size(path: Path | str, *, orient: bool = True) -> tuple[int, int]:
+    """(width, height) px of the image that `read_image` reads, from the header of the file; errors as there."""
+    with reading(Path(path), "an image file", "replace or remove it"), Image.open(path) as image:
+        width, height = image.size
+        is_stored = image.format != "TIFF"  # already turned by Pillow
+        return (height, width) if orient is is_stored and _orientation(image) >= 5 else (width, height)
+
+
+def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tuple[int, int]:
+    """(width, height) px of about `pixels` in all, in the shape of an image of `shape` (width, height).
+
+        shape_size((1920, 1080), 100_000)  # (421, 237)
+
+    Both sides are a `multiple`: the shorter one is rounded, then the longer one in its proportion.
+    """
+    short, long = sorted(shape)
+    rounded = multiple * max(1, round(math.sqrt(pixels * short / long) / multiple))
+    other = multiple * round(rounded * long / short / multiple)
+    return (other, rounded) if shape[0] > shape[1] else (rounded, other)
 
 
 def read_header(content: bytes) -> tuple[int, int | None]:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.evaluation.image_sizes import fit_image_size, folders_of
 from mfvpr.evaluation.sequence_matching import match_rows, matches_recipe
 from mfvpr.evaluation.system import Pipeline, System
 from mfvpr.features.extractor import Aggregated, Extractor, Source
@@ -62,6 +63,7 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
     """Do the part of a shard, and say in one line what is done, and what to do next."""
     if cache.root is None:
         raise InputError(f"shard={shard}: expected a cache with a root, the folder that all shards fill")
+    system = fit_image_size(system, folders_of(dataset), cache.warn)
     database, pipeline, sequences = dataset.database, system.pipeline, dataset.sequences
     if system.cohort is not None:
         sequences = (cohort_sequence(cache.recipes.contents(database), system.cohort), *sequences)
@@ -69,7 +71,7 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
     marks = cache.root / f"shards-{fingerprint(recipes)}"  # a file for each shard that has described its images
     paths = [marks / f"{index}-of-{shard.count}" for index in range(shard.count)]
     if not paths[shard.index].exists():
-        for folder in (database, *(sequence.images for sequence in dataset.sequences)):
+        for folder in folders_of(dataset):
             names = tuple(folder.names[row] for row in shard.rows(folder.names))
             _describe(replace(folder, names=names), database, pipeline, cache)
         marks.mkdir(parents=True, exist_ok=True)

@@ -1,14 +1,14 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.images import resize
+from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
@@ -42,12 +42,15 @@ class Pipeline:
         retriever: the retrieval, which finds candidates.
         matcher: matches a pair, see `mfvpr.Matcher`.
         candidates: number of candidates of each query.
+        pixels: of a resized image, in the shape of the first database image, which decides once; None = the
+            `image_size` of the extractor.
     """
 
     extractor: Extractor | Source
     retriever: Retriever
     matcher: Matcher = NEIGHBORS
     candidates: int | Literal["all"] = 50
+    pixels: int | None = None
 
     def __post_init__(self) -> None:
         """Raise an InputError unless the parts fit together."""
@@ -67,6 +70,16 @@ class Pipeline:
             require_word("cross_check", self.matcher.cross_check, CrossCheck)
         if isinstance(self.matcher, LightGlueMatcher):
             _check_lightglue(self.matcher, self.extractor)
+
+    def image_size_for(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Size of about `pixels` in the shape of an image of `shape`, both (width, height)."""
+        assert self.pixels is not None
+        return shape_size(shape, self.pixels, getattr(self.extractor, "side_multiple", 1))
+
+    def with_image_size(self, size: tuple[int, int]) -> "Pipeline":
+        """The pipeline with an extractor of another image size (width, height), px, in the retrieval as well."""
+        extractor: Any = self.extractor
+        return replace(_with_part(self, extractor, replace(extractor, image_size=size)), pixels=None)
 
 
 @dataclass(frozen=True)
@@ -124,6 +137,13 @@ class System:
         """Name of the ranking that decides."""
         return self.final or next(iter(self.scorers), RETRIEVAL)
 
+    def with_image_size(self, size: tuple[int, int]) -> "System":
+        """The system with another image size (width, height), px, also in its settings."""
+        settings = self.settings
+        if settings is not None:
+            settings = {**settings, "features": {**settings["features"], "image_size": [*size]}}
+        return replace(self, pipeline=self.pipeline.with_image_size(size), settings=settings)
+
     def warm_up(self, image_size: tuple[int, int]) -> None:
         """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.
 
@@ -131,7 +151,10 @@ class System:
         numbers of features may compile a few more programs, and so does a map: see `Map.warm_up`. An extractor that
         reads features raises an `InputError`.
         """
-        extractor, candidates = self.pipeline.extractor, self.pipeline.candidates
+        pipeline = self.pipeline
+        if pipeline.pixels is not None:
+            pipeline = pipeline.with_image_size(pipeline.image_size_for(image_size))
+        extractor, candidates = pipeline.extractor, pipeline.candidates
         if isinstance(extractor, Source):
             raise InputError(f"{type(extractor).__name__}: expected an extractor of images, got a reader of features")
         rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
@@ -140,7 +163,7 @@ class System:
         [description] = extractor(image[None])
         sets = [(FeatureSet.of([scale], unit_length=False), FeatureSet.of([scale] * rows.size, unit_length=False))
                 for scale in description.local]  # fmt: skip
-        matches = tuple(stages.match(*sides, shortlist, self.pipeline.matcher) for sides in sets)
+        matches = tuple(stages.match(*sides, shortlist, pipeline.matcher) for sides in sets)
         weights = tuple(scale.weight for scale in extractor.scales)
         stages.score(self.scorers, matches[0] if len(matches) == 1 else Scales(matches, weights), shortlist)
 
@@ -148,6 +171,18 @@ class System:
 def noise_image(size: tuple[int, int] = (64, 48)) -> UInt8[np.ndarray, "height width 3"]:
     """An image of random pixels, (width, height) px, in which every extractor finds features."""
     return np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
+
+
+def _with_part(whole: Any, part: Any, new: Any) -> Any:
+    """A dataclass of parts, in which a part is replaced wherever it is."""
+    if whole is part:
+        return new
+    if not is_dataclass(whole) or isinstance(whole, type):
+        return whole
+    parts = {field.name: getattr(whole, field.name) for field in fields(whole) if field.init}
+    changed = {name: _with_part(value, part, new) for name, value in parts.items()}
+    changed = {name: value for name, value in changed.items() if value is not parts[name]}
+    return replace(whole, **changed) if changed else whole
 
 
 def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Num
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
-from mfvpr.networks.aliked import Aliked
+from mfvpr.networks.aliked import STRIDE, Aliked
 from mfvpr.networks.aliked_detection import RADIUS, Detections
 
 _SMALLEST = 2 * RADIUS + 1  # px: one pixel within the border, which has no keypoints
@@ -37,6 +37,7 @@ class AlikedFeatures(NetworkExtractor):
     """
 
     vector_size = 0  # no global descriptor
+    side_multiple = STRIDE  # px: other images are padded, which costs recall
     model: Aliked = field(repr=False)
     image_size: tuple[int, int] = (320, 320)
     interpolation: Interpolation = "pil_bilinear"

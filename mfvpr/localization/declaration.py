@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.evaluation.image_sizes import Note, fit_image_size
 from mfvpr.evaluation.system import System
 from mfvpr.storage.manifest import MANIFEST
 from mfvpr.storage.maps import has_rows
@@ -45,6 +47,22 @@ def read_system(folder: Path) -> System:
         return assembly.system(settings)
     except SettingsError as error:
         raise InputError(f"{folder / _FILE}: {error}") from None
+
+
+def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: Note) -> System:
+    """The system at the image size of the map in a folder; in a new one, at that of the images, see `fit_image_size`.
+
+    Raises `InputError` if a new map has no images to take the shape from, or as `read_declaration`.
+    """
+    if system.pipeline.pixels is None:
+        return system
+    if system.settings is not None and (folder / _FILE).exists():
+        width, height = read_declaration(folder)["features"]["image_size"]
+        return system.with_image_size((width, height))
+    if images is None:
+        raise InputError("image_size: expected the images of a new map, whose shape decides, got none. Use "
+                         "`Map.create`, or a system with features.image_size=[WIDTH,HEIGHT].")  # fmt: skip
+    return fit_image_size(system, [images], note)
 
 
 def check_declaration(folder: Path, system: System) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
+from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
 from mfvpr.datasets.datasets import ImageFolder
@@ -39,7 +40,10 @@ class Describing:
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
-        pixels, name = (read_image(image), str(image)) if is_file(image) else (_pixels(image), "image")
+        return self.pixels(load(image), str(image) if is_file(image) else "image")
+
+    def pixels(self, pixels: UInt8[np.ndarray, "height width 3"], name: str) -> Described:
+        """Describe one image; `name` stands in errors."""
         descriptions = [_extract(extractor, pixels, name) for extractor in self._extractors]
         features = round_as_stored(descriptions[0].features)
         [vector] = self._vectors([features], descriptions[-1:])
@@ -92,7 +96,10 @@ def is_file(image: Image) -> TypeGuard[Path | str]:
     return isinstance(image, str | os.PathLike)
 
 
-def _pixels(image: Any) -> np.ndarray:
+def load(image: Image) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an image file, or convert an array; an InputError if it is no image."""
+    if is_file(image):
+        return read_image(image)
     try:
         pixels = np.asarray(as_array(image))
     except Exception as error:  # other libraries raise any error, torch for tensors with gradients

@@ -16,8 +16,8 @@ from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
-from mfvpr.localization.declaration import check_declaration, read_system
-from mfvpr.localization.describing import Described, Image
+from mfvpr.localization.declaration import check_declaration, fit_to_map, read_system
+from mfvpr.localization.describing import Described, Image, is_file, load
 from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
@@ -71,9 +71,10 @@ class Map(MapImages):
             runtime: memory that features may take on the device.
 
         Raises:
-            InputError: a system that a map cannot use, a threshold without a confidence, or a folder with a map that
-                was made with another system.
+            InputError: a system that a map cannot use, a threshold without a confidence, a folder with a map that was
+                made with another system, or a new map of a system whose image size follows the images (`create`).
         """
+        system = fit_to_map(Path(folder), system, None, runtime.log)
         extractor, describer = _extractor(system), _describer(system)
         check_declaration(Path(folder), system)
         self.confidence = confidence or read_confidence(Path(folder), system)
@@ -106,7 +107,8 @@ class Map(MapImages):
     ) -> "Map":
         """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
         images = images if isinstance(images, ImageFolder) else image_folder(images)
-        known = cls(folder, system, runtime=runtime)
+        warn = lambda line: runtime.log(f"warning: {line}")  # noqa: E731
+        known = cls(folder, fit_to_map(Path(folder), system, images, warn), runtime=runtime)
         if same := len({*known.names} & {*images.names}):
             runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; make "
                         "another map if their content is new")  # fmt: skip
@@ -159,9 +161,10 @@ class Map(MapImages):
         recent = _whole_number("recent", recent)
         before = None if before is None else _whole_number("before", before)
         described = self._refresh_images()
-        description, total = described.describing.image(image), self._vectors.total
+        pixels, total = load(image), self._vectors.total
+        description = described.describing.pixels(pixels, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
-        return self._localize(described, description, end)
+        return self._localize(described, description, end, pixels.shape[1::-1])
 
     @exclusive
     def warm_up(self) -> None:
@@ -170,7 +173,7 @@ class Map(MapImages):
         _, vector = described.describing.image(noise_image())
         rows, _ = self._vectors.nearest(vector, 1)
         for _, features in described.rows.features(rows.tolist()):  # its own best candidate: nothing is left out
-            self._localize(described, (features, vector), self._vectors.total)
+            self._localize(described, (features, vector), self._vectors.total, self.extractor.image_size)
 
     def _refresh_images(self) -> DescribedMap:
         self.refresh()
@@ -178,13 +181,16 @@ class Map(MapImages):
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
         return self._described
 
-    def _localize(self, described: DescribedMap, description: Described, end: int) -> Localization:
+    def _localize(
+        self, described: DescribedMap, description: Described, end: int, size: tuple[int, int]
+    ) -> Localization:
+        """Localize a described image of (width, height) px among the rows before `end`."""
         features, vector = description
         if strength(features) < LEAST_STRENGTH * described.strength(end):
-            return refusal("too few features", description)
+            return refusal("too few features", description, size[0])
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
-            return refusal("no candidates", description)
+            return refusal("no candidates", description, size[0])
         arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
         matcher, scorers = self.system.pipeline.matcher, self.system.scorers
         matches, scores = match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
@@ -192,15 +198,16 @@ class Map(MapImages):
         [place] = np.flatnonzero(rows == ranking.rows[0, 0])
         best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
         if best.mask.sum() < LEAST_MATCHES:
-            return refusal("too few matches", description)
+            return refusal("too few matches", description, size[0])
         p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
         p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
+        shift = shift_of(scorers.values(), best, size)
         prediction = Prediction(
-            alternatives[0].place, alternatives, alternatives[0].score, p, *shift_of(scorers.values(), best)
+            alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
         )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
             prediction = replace(

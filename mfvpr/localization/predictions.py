@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from mfvpr.evaluation.evaluation import Reason
 from mfvpr.localization.describing import Described
 from mfvpr.types import Matches
+from mfvpr.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,13 @@ class Prediction:
         alternatives: all candidates, best first; empty if there is no place for another reason than "low confidence".
         score: of the best candidate; 0 if there is none.
         confidence: probability that the top prediction is correct; None without a confidence or without candidates.
-        shift: (x, y) px of the image that the detector saw, from the query's center to the same point in the best
-            candidate; None without a place, if no match votes, or if the score is no histogram of shifts.
+        shift: (x, y) px of the query image as it was given, from its center to the same point in the best candidate,
+            as if both images had the size of the query; None without a place, if no match votes, or if the score is no
+            histogram of shifts.
         shift_interval: its 95 % interval (low, high), each (x, y); None likewise.
         scale: how much larger the candidate shows the place; None likewise.
         reason: why there is no place; None if there is one.
+        image_width: of the query image, px.
     """
 
     place: Any
@@ -43,10 +46,30 @@ class Prediction:
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
     scale: float | None
     reason: Reason | None = None
+    image_width: int = 0
+
+    @property
+    def shift_fraction(self) -> tuple[float, float] | None:
+        """`shift` in widths of the image, along both axes."""
+        return self.shift and (self.shift[0] / self.image_width, self.shift[1] / self.image_width)
+
+    def shift_angles(self, field_of_view: float) -> tuple[float, float, float] | None:
+        """Horizontal angles in degrees of `shift` and of both ends of its interval, of a pinhole camera.
+
+        `field_of_view` is the horizontal one of the camera, in degrees, above 0 and below 180.
+        """
+        if not 0 < field_of_view < 180:
+            raise InputError(f"field_of_view={field_of_view}: expected degrees above 0 and below 180")
+        if self.shift is None or self.shift_interval is None:
+            return None
+        focal = self.image_width / 2 / math.tan(math.radians(field_of_view) / 2)
+        shift, low, high = (math.degrees(math.atan(x / focal)) for x, _ in (self.shift, *self.shift_interval))
+        return shift, low, high
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with at most `most` alternatives."""
         values = asdict(replace(self, alternatives=self.alternatives[:most]))
+        values["shift_fraction"] = self.shift_fraction
         for scored in (values, *values["alternatives"]):
             scored["score"] = scored["score"] if math.isfinite(scored["score"]) else None
         return values
@@ -65,6 +88,6 @@ class Localization(NamedTuple):
     matches: Matches | None
 
 
-def refusal(reason: Reason, described: Described) -> Localization:
+def refusal(reason: Reason, described: Described, image_width: int) -> Localization:
     """A prediction without place and candidates."""
-    return Localization(Prediction(None, (), 0.0, None, None, None, None, reason), described, None)
+    return Localization(Prediction(None, (), 0.0, None, None, None, None, reason, image_width), described, None)

@@ -1,5 +1,6 @@
 """Turn checked settings into the parts of a system, by fixed tables: nothing named in a YAML file is called."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -41,10 +42,12 @@ _NETWORK_EXTRACTORS = {
 
 def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
     """The extractor of local features, or the feature files of another program."""
-    name, options = settings["name"], _without(settings, "name")
-    options["image_size"] = options["image_size"] and tuple(options["image_size"])
+    name, options = settings["name"], _without(settings, "name", "image_size")
+    size = tuple(settings["image_size"]) if isinstance(settings["image_size"], list) else None
     if name == "import":
-        return FeatureFiles(_files("features", options, data), options["lengths"], options["image_size"])
+        return FeatureFiles(_files("features", options, data), options["lengths"], size)
+    if size is not None:  # else the extractor's own, until images decide
+        options["image_size"] = size
     if name != "sift":
         return _network_extractor("features", name, options)
     if (kind := options["interpolation"]).startswith("torch"):
@@ -134,7 +137,9 @@ def pipeline(settings: Mapping[str, Any], data: Dataset | None) -> Pipeline:
     """The pipeline that the settings name; files of other programs need their data set."""
     local = extractor(settings["features"], data)
     retrieval = retriever(settings["retrieval"], local, data)
-    return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"])
+    size = settings["features"]["image_size"]
+    pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
+    return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"], pixels)
 
 
 def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:

@@ -25,7 +25,9 @@ _POSITIVE = number(1e-6, 1e12)
 _NOT_NEGATIVE = number(0, 1e12)
 _COUNT = whole(1, 10**6)
 _INDEX = whole(0, 10**6)
-_SIDE = whole(16, 4096)
+_SIDE_LEAST, _SIDE_MOST = 16, 4096
+_SIDE = whole(_SIDE_LEAST, _SIDE_MOST)
+_ANY_SHAPE = ("sift", "aliked", "d2net")  # features of images of any shape
 _TEXT = pattern(r"(?s).+", "text")
 _PATH = pattern(r"(?s)(?!.*\$\{).+", "a path, with names of variables filled in (double quotes let the shell do that)")
 _QUERY = any_of("a row or a name of a query", _INDEX, _TEXT)
@@ -80,7 +82,12 @@ RULES: dict[str, Rule] = {
         "candidates devices": either(_COUNT, "all"),
         "ks": list_of(_COUNT),
         "image_size": list_of(_SIDE, 2),
-        "features.image_size": either(list_of(_SIDE, 2), None),
+        "features.image_size": any_of(
+            "[width, height], each a whole number from 16 to 4096, or auto, a number of pixels, or null",
+            list_of(_SIDE, 2),
+            whole(_SIDE_LEAST**2, _SIDE_MOST**2),
+            one_of("auto", None),
+        ),
         "bits": either(whole(8, 16), None),
         "max_keypoints": either(whole(1, 20_000), None),
         "batch_size": whole(1, 256),
@@ -103,6 +110,7 @@ RULES: dict[str, Rule] = {
         "c": either(_NOT_NEGATIVE, "auto"),
         "fusion.c": either(_NOT_NEGATIVE, "auto", "zscore"),
         "fusion.weights": any_of("weights by name, such as {retrieval: 0.5, anchor: 1}, or null", one_of(None)),
+        "field_of_view": either(number(1, 179), None),
         "route": either(number(-1000, 1000), None, "auto"),
     }.items()
     for name in names.split()
@@ -131,6 +139,9 @@ def check(settings: Mapping[str, Any]) -> None:
     if features.get("name", "import") != "import" and features["image_size"] is None:
         raise SettingsError(f"features.image_size=null: expected width and height for features={features['name']}, "
                             "such as [336,336]")  # fmt: skip
+    if not isinstance(size := features.get("image_size"), list | None) and features["name"] not in _ANY_SHAPE:
+        raise SettingsError(f"features.image_size={size}: expected [width, height] for features={features['name']}; "
+                            f"other values are for {', '.join(_ANY_SHAPE)}")  # fmt: skip
     if method == "grid":
         _check_cells(settings)
     if features.get("name") == "patch_netvlad":

@@ -1,5 +1,6 @@
 """Systems by name in the library are those of the programs."""
 
+import json
 import sys
 
 import numpy as np
@@ -9,7 +10,7 @@ import mfvpr
 from mfvpr import InputError, load_system
 from mfvpr.cli import build, evaluation, programs
 from mfvpr.cli.groups import choices
-from mfvpr.features import Sift
+from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.utils.fingerprints import recipe_of
 from tests.programs import CANDIDATES, composed, csv_rows, small
@@ -22,10 +23,36 @@ SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CAND
 def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
     if name == "steering":
-        assert isinstance(load_system(name).pipeline.extractor, Sift)
+        with pytest.warns(UserWarning, match="^system=steering uses SIFT, because the weights aliked-n16 are not inst"):
+            assert isinstance(load_system(name).pipeline.extractor, Sift)
     else:
         with pytest.raises(InputError, match=r"^[\w-]+: not installed in "):
             load_system(name)
+
+
+def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch, recwarn):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(weights))
+    system = load_system("steering")
+    assert isinstance(system.pipeline.extractor, AlikedFeatures)
+    assert system.settings["features"]["weights"] == "aliked-n16"
+    assert isinstance(load_system("steering", features="sift").pipeline.extractor, Sift)
+    assert system.with_image_size((64, 96)).settings["features"]["image_size"] == [64, 96]
+    assert not recwarn
+
+
+def test_a_run_records_the_size_that_the_images_decide(tmp_path):
+    settings = composed(*small(tmp_path), "features.image_size=19200", f"out={tmp_path}/run", "figures=0")
+    evaluation.evaluate(settings | {"multirun": False})
+    assert json.loads((tmp_path / "run/run.json").read_text())["settings"]["features"]["image_size"] == [160, 120]
+
+
+@pytest.mark.parametrize(("size", "words"), [
+    ("auto", "expected .width, height. for features=selavpr; other values are for sift, aliked, d2net"),
+    (100, "expected .width, height., each a whole number from 16 to 4096, or auto, a number of pixels, or null"),
+])  # fmt: skip
+def test_image_sizes_that_are_none(size, words):
+    with pytest.raises(InputError, match=f"^features.image_size={size}: {words}"):
+        load_system("selavpr_msls", features={"image_size": size})
 
 
 @pytest.mark.parametrize(("name", "settings", "words"), [
@@ -33,7 +60,8 @@ def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monk
     ("steering", {"sigma": 3}, "^sigma: unknown setting; the nearest is scorer[.]sigma"),
     ("steering", {"scorer": {"sgma": 3}}, "^scorer.sgma: unknown setting; the nearest is scorer[.]sigma"),
     ("steering", {"features": "xfeat"}, "^features=xfeat: expected one of aliked"),
-    ("steering", {"features": "import"}, "^features: files of other programs belong to a data set"),
+    ("steering", {"features": "import"}, "^features.image_size=auto: expected .width, height. for features=import"),
+    ("mfvpr", {"features": "import"}, "^features: files of other programs belong to a data set"),
     ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),
     ("no/run.json", {"candidates": 3}, "^no/run.json: expected no other settings, got candidates"),
 ])  # fmt: skip

@@ -9,12 +9,14 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from mfvpr import InputError
 from mfvpr.datasets import image_folder, read_image, resize
 from mfvpr.datasets.contents import contents
-from mfvpr.datasets.images import MAX_PIXELS, read_header
+from mfvpr.datasets.images import MAX_PIXELS, read_header, read_size, shape_size
 from mfvpr.utils.threads import ordered_map
 from tests.builders import read_golden
 from tests.golden import make_resize
@@ -26,6 +28,17 @@ pytestmark = pytest.mark.thorough
 @pytest.fixture
 def photo():
     return np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+
+
+@given(st.tuples(st.integers(40, 4000), st.integers(40, 4000)), st.integers(10**4, 10**6), st.sampled_from([1, 14, 32]))
+def test_a_size_in_the_shape_of_an_image(shape, pixels, multiple):
+    (width, height), aspect = shape_size(shape, pixels, multiple), shape[0] / shape[1]
+    assert width % multiple == height % multiple == 0
+    exact = np.sqrt([pixels * aspect, pixels / aspect])
+    short, long = sorted((width, height))
+    assert short == multiple or abs(short - exact.min()) <= multiple / 2
+    assert abs(long - short * max(aspect, 1 / aspect)) <= multiple / 2  # the aspect ratio, within rounding
+    assert shape_size(shape[::-1], pixels, multiple) == (height, width)
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "P", "1", "LA"])
@@ -154,6 +167,8 @@ def test_orientation_is_applied_unless_switched_off(tmp_path, orientation, name)
     np.testing.assert_allclose(read_image(tmp_path / name).astype(int), photo, atol=tolerance)
     np.testing.assert_allclose(read_image(tmp_path / name, orient=False).astype(int), stored, atol=tolerance)
     assert read_header((tmp_path / name).read_bytes()) == (orientation, None)
+    assert read_size(tmp_path / name) == photo.shape[1::-1]
+    assert read_size(tmp_path / name, orient=False) == stored.shape[1::-1]
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import mfvpr
 from mfvpr import InputError, Map
@@ -20,7 +21,9 @@ SMALL = {"features": {"max_keypoints": 60, "image_size": [160, 120]}, "retrieval
 
 def small(name, **more):
     """A system by name with SIFT, small and quick."""
-    return mfvpr.load_system(name, **(SMALL | more))
+    settings = SMALL | more
+    features = {f"features.{setting}": value for setting, value in settings.pop("features").items()}
+    return mfvpr.load_system(name, **settings, features="sift", **features)
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +36,22 @@ def test_a_map_is_opened_by_its_folder_alone(street, small_street):
     query = small_street / "queries/0003.png"
     assert again.names == street.names
     assert again.localize(query) == street.localize(query)
+
+
+def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(small_street, tmp_path):
+    system = small("steering", features={"max_keypoints": 60, "image_size": "auto"})
+    with pytest.raises(InputError, match="expected the images of a new map"):
+        Map(tmp_path / "map", system)
+    known, query = Map.create(tmp_path / "map", small_street / "database", system), small_street / "queries/0003.png"
+    assert known.extractor.image_size == (388, 291)
+    assert json.loads((tmp_path / "map/settings.json").read_text())["features"]["image_size"] == [388, 291]
+    prediction = known.localize(query)
+    assert prediction.shift is not None
+    for again in (Map.open(tmp_path / "map"), Map(tmp_path / "map", system)):
+        assert again.localize(query) == prediction
+    Image.new("RGB", (50, 90)).save(tmp_path / "tall.png")
+    tall = mfvpr.datasets.image_folder(tmp_path)  # the map keeps its size
+    assert Map.create(tmp_path / "map", tall, system).extractor.image_size == (388, 291)
 
 
 def test_what_is_there_is_not_added_again(street, small_street):

@@ -95,6 +95,34 @@ def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
     assert len(prediction.as_json(2)["alternatives"]) == 2
 
 
+@pytest.mark.parametrize("width", [320, 640])
+def test_a_shift_is_in_px_of_the_image_that_was_given(small_street, tmp_path, width):
+    """A pair with a shift of an eighth of the width, in an image size of another shape."""
+    height, moved = 3 * width // 8, width // 8
+    scene = np.asarray(Image.open(small_street / "database/0000.png").resize((width + moved, height)))
+    Image.fromarray(scene[:, :width]).save(tmp_path / "candidate.png")
+    sift = Sift(max_keypoints=300, image_size=(200, 200))
+    scorer = mfvpr.HistogramOfShifts(bin_size=3.0, sigma=5.0)
+    known = Map(tmp_path / "map", map_system(sift, VladFitting(num_words=2), scorer))
+    known.build(mfvpr.datasets.image_folder(tmp_path))
+    prediction = known.localize(scene[:, moved:])
+    assert prediction.image_width == width
+    assert prediction.shift == pytest.approx((moved, 0), abs=width / 200)
+    assert prediction.shift_fraction == pytest.approx(np.divide(prediction.shift, width, dtype=np.float64), abs=1e-12)
+    assert prediction.shift_fraction == pytest.approx((0.125, 0), abs=0.005)
+    expected = [np.rad2deg(np.arctan(2 * x / width * np.tan(np.deg2rad(80.0) / 2)))
+                for x, _ in (prediction.shift, *prediction.shift_interval)]  # fmt: skip
+    assert prediction.shift_angles(80.0) == pytest.approx(expected, rel=1e-12)
+    assert prediction.as_json()["shift_fraction"] == prediction.shift_fraction
+    with pytest.raises(InputError, match=r"field_of_view=180: expected degrees"):
+        prediction.shift_angles(180)
+
+
+def test_without_a_shift_there_is_no_angle(dataset, folder):
+    prediction = opened(folder).localize(np.full((30, 40, 3), 90, np.uint8))
+    assert (prediction.shift_fraction, prediction.shift_angles(60), prediction.image_width) == (None, None, 40)
+
+
 def test_a_question_keeps_what_it_was_answered_with(dataset, folder):
     known = opened(folder)
     for path in dataset.queries.paths[:3]:
@@ -107,7 +135,7 @@ def test_a_question_keeps_what_it_was_answered_with(dataset, folder):
         keypoints = {tuple(point) for point in features.keypoints.tolist()}
         assert {tuple(point) for point in matches.points0[matches.mask].tolist()} <= keypoints
         assert vector @ vector == pytest.approx(1, rel=1e-5)
-        np.testing.assert_allclose(explain(scorer, matches).peak, prediction.shift, atol=1e-4)
+        np.testing.assert_allclose(2 * explain(scorer, matches).peak, prediction.shift, atol=2e-4)  # of 320 x 240 px
     assert known.row("no such") is None
     assert known.there.tolist() == [True] * len(dataset.database)
 

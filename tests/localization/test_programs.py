@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import localization, query_images
+from mfvpr.cli import query_images
 from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.images import read_frames
 from mfvpr.evaluation import write_confidences
@@ -97,6 +97,20 @@ def test_images_of_a_folder_are_localized(folder, small_street, monkeypatch, cap
     assert values_of("place", lines) == NAMES
     assert {len(line["alternatives"]) for line in lines} == {2}
     assert all(line["confidence"] is None and line["seconds"] > 0 and len(line["shift"]) == 2 for line in lines)
+
+
+def test_lines_have_angles_of_the_shift(folder, small_street, localize):
+    [line], _ = localize(f"{small_street}/queries/0003.png", "field_of_view=70")
+    focal = 320 / 2 / np.tan(np.deg2rad(35))
+    points = [line["shift"], *line["shift_interval"]]
+    np.testing.assert_allclose(line["shift_angles"], [np.rad2deg(np.arctan(x / focal)) for x, _ in points])
+    assert (line["image_width"], line["shift_fraction"][0]) == (320, line["shift"][0] / 320)
+
+
+def test_a_map_is_built_in_the_shape_of_its_images(tmp_path, small_street, build_map):
+    stdout, _ = build_map(tmp_path / "map", small_street, "features.image_size=19200")
+    assert stdout == f"{tmp_path}/map: 10 images, 10 of them new\n"
+    assert read_declaration(tmp_path / "map")["features"]["image_size"] == [160, 120]
 
 
 def test_images_of_the_map_are_not_added_again(folder, small_street, call_program, build_map):
@@ -185,7 +199,8 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
 
 def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
     settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    first, second = map(localization.map_of_settings, settings)
+    systems = (assembly.system({**each, "cohort": None, "previous_queries": 0}) for each in settings)
+    first, second = (Map(tmp_path / "map", system) for system in systems)
     images = image_folder(small_street / "database")
     second.build(images)
     with pytest.raises(InputError, match="was made with other candidates"):

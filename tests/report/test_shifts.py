@@ -9,7 +9,7 @@ import pytest
 from mfvpr import HistogramOfShifts
 from mfvpr.cli import evaluation
 from mfvpr.cli.inputs import prepare
-from mfvpr.evaluation.stages import dominant_shifts
+from mfvpr.evaluation.stages import SHIFT_FLOOR, dominant_shifts
 from mfvpr.matching import MatchSet
 from mfvpr.report.run_files import SHIFTS
 from mfvpr.utils import Stopwatch
@@ -49,8 +49,11 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
         numbers = [float(line[name]) for name in SHIFTS[2:]]
         fitted = scorer.with_capacity(pair.image_size0, pair.image_size1)
         np.testing.assert_allclose(numbers[:2], fitted.dominant_shift(pair, refine=True), atol=0.02)
-        np.testing.assert_allclose(np.reshape(numbers[2:6], (2, 2)).T, fitted.shift_interval(pair), atol=0.02)
-        assert numbers[6] == 1
+        low, high = np.asarray(fitted.shift_interval(pair), np.float64)
+        half = np.hypot((high - low) / 2, SHIFT_FLOOR * np.array([160, 120]))
+        expected = [(low + high) / 2 - half, (low + high) / 2 + half]
+        np.testing.assert_allclose(np.reshape(numbers[2:6], (2, 2)).T, expected, atol=0.02)
+        assert numbers[6:] == [1, 160, 120]
 
 
 @pytest.mark.parametrize("direction", ["candidate_minus_query", "query_minus_candidate"])
@@ -67,12 +70,13 @@ def test_a_zoomed_candidate_shows_the_middle_of_the_query_where_it_does(zoom, di
     match_set = MatchSet([matches], np.array([counts]), 40)
     scorer = HistogramOfShifts(bin_size=4.0, sigma=5.0, scales=(0.5, 1.0, 2.0), direction=direction)
     with jax.debug_nans(True):  # which takes no NaN for a fault that says there is nothing
-        shifts, intervals, scales = dominant_shifts(scorer, match_set, np.array([0, 0]), np.array([0, 1]))
+        shifts, intervals, scales, sizes = dominant_shifts(scorer, match_set, np.array([0, 0]), np.array([0, 1]))
     expected = size1 / 2 - size0 / 2 + [17, -9]
     np.testing.assert_allclose(shifts[0], expected, atol=0.01)
     assert (intervals[0, 0] < expected).all()
     assert (expected < intervals[0, 1]).all()
     assert scales[0] == zoom
+    assert sizes[0].tolist() == [*size0]
     assert np.isnan([*shifts[1], *intervals[1].ravel(), scales[1]]).all()
 
 
