@@ -24,7 +24,7 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
 
         system = mfvpr.load_system("mfvpr")
         system = mfvpr.load_system("mix_hist_50", candidates=20, scorer={"sigma": 15})
-        system = mfvpr.load_system("steering", features="aliked")
+        system = mfvpr.load_system("steering", features="sift")
         system = mfvpr.load_system("runs/streets/2026-01-31_12-00-00/run.json")
 
     Args:
