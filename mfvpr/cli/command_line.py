@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import hydra
@@ -67,7 +68,7 @@ def run(config: str) -> None:
             with interruptible, words, _frozen_imports(), cluster as started:
                 job(settings | {"multirun": multirun_job, "command": command, "cluster": started})
 
-    register_resolvers(lambda line: tell(f"note: {line}"))
+    register_resolvers(cache(lambda line: tell(f"note: {line}")))  # once, though Hydra composes twice
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     typed = sys.argv[1:]

@@ -13,7 +13,7 @@ from mfvpr.cli.groups import choices
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.utils.fingerprints import recipe_of
-from tests.programs import CANDIDATES, composed, csv_rows, small
+from tests.programs import CANDIDATES, composed, csv_rows, output_of, small
 
 FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
 SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CANDIDATES}
@@ -38,6 +38,13 @@ def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch
     assert isinstance(load_system("steering", features="sift").pipeline.extractor, Sift)
     assert system.with_image_size((64, 96)).settings["features"]["image_size"] == [64, 96]
     assert not recwarn
+
+
+def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
+    for more, notes in (((), 1), (("features=sift",), 0)):
+        _, stderr = output_of(monkeypatch, capsys, "evaluate", "system=steering", "candidates=0", *more, code=2)
+        assert stderr.count("note: system=steering uses SIFT, because the weights") == notes
 
 
 def test_a_run_records_the_size_that_the_images_decide(tmp_path):
