@@ -437,8 +437,8 @@ def test_images_may_be_what_numpy_converts(dataset, folder):
         np.testing.assert_array_equal(known.describing.image(image)[1], expected)
 
 
-def without_place(reason):
-    return Prediction(None, (), 0.0, None, None, None, None, reason)
+def without_place(reason, image):
+    return Prediction(None, (), 0.0, None, None, None, None, reason, image.shape[1])
 
 
 @pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])
@@ -450,7 +450,7 @@ def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
     if kind == "lens cap":  # with a little light at its rim
         image[:, :40] = np.arange(40, 0, -1)[:, None]
     prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
-    assert (prediction, matches) == (without_place("too few features"), None)
+    assert (prediction, matches) == (without_place("too few features", image), None)
     assert prediction.as_json()["reason"] == "too few features"
 
 
@@ -459,7 +459,7 @@ def test_strong_features_with_few_matches_have_no_place(folder):
     image[40:60, 70:95] = 255
     prediction, (features, _), matches = opened(folder, confidence=SURE).localize_with_evidence(image)
     assert 0 < len(features.scores) < LEAST_MATCHES
-    assert (prediction, matches) == (without_place("too few matches"), None)
+    assert (prediction, matches) == (without_place("too few matches", image), None)
 
 
 def test_the_strength_of_a_map_is_of_a_few_of_its_rows():
