@@ -16,9 +16,10 @@ from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
-from mfvpr.evaluation import Confidence, System, fit_confidence
+from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.metrics import reliability
-from mfvpr.localization.calibration import fit_on_drive, inputs_of
+from mfvpr.localization.calibration import data_of_drive
+from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer
@@ -26,10 +27,11 @@ SURE = 0.8  # confidence from which on a prediction is taken for an answer
 Ranked = tuple[Float[np.ndarray, "queries inputs"], Bool[np.ndarray, " queries"]]
 
 
-def rank(dataset: Dataset, system: System, cache: FeatureCache) -> Ranked:
-    """Inputs of the confidence, and whether the top predictions are correct; none is without a ground truth."""
-    (inputs, rows), truth = inputs_of(dataset, system, cache), dataset.only.truth
-    return inputs, np.zeros(len(rows), bool) if truth is None else truth.positives(2).contains(rows)[:, 0]
+def rank_elsewhere(dataset: Dataset, system: System, cache: FeatureCache) -> Ranked:
+    """Inputs of the confidence of queries that show no place of the database, so that no top prediction is correct."""
+    result = rank_dataset(dataset, system, cache=cache)
+    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
+    return confidence_inputs(ranked, by_retrieval), np.zeros(len(ranked.rows), bool)
 
 
 def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> list[str]:
@@ -48,15 +50,16 @@ def run(drives: list[str]) -> None:
     system, cache = load_system("mfvpr"), FeatureCache()
     folders = {name: paths.split(":") for name, _, paths in (drive.partition("=") for drive in drives)}
     datasets = {name: folder(*paths, ground_truth="order") for name, paths in folders.items()}
-    present = {name: rank(dataset, system, cache) for name, dataset in datasets.items()}
+    data = {name: data_of_drive(dataset, system, cache) for name, dataset in datasets.items()}
+    present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = {}
     for place, other in itertools.permutations(folders, 2):
         elsewhere = folder(folders[place][0], folders[other][1], ground_truth="none")
-        absent[place, other] = rank(elsewhere, system, cache)
+        absent[place, other] = rank_elsewhere(elsewhere, system, cache)
     print("| fitted on | queries count | ECE, % | absent, answered, % | present and correct, answered, % |")
     print("| :-- | :-- | --: | --: | --: |")
-    for name, dataset in datasets.items():
-        fits = {"once": fit_confidence(*present[name]), "twice": fit_on_drive(dataset, system, cache)}
+    for name in datasets:
+        fits = {"once": fit_confidence(*present[name]), "twice": data[name].fit()}
         for turns, confidence in fits.items():
             cells = row(confidence, [each for other, each in present.items() if other != name],
                         [each for (place, _), each in absent.items() if place != name])  # fmt: skip

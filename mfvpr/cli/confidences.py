@@ -30,6 +30,13 @@ def read_file(path: str) -> ConfidenceFile:
     return ConfidenceFile(path, *read_confidences(expand_user(path)))
 
 
+def warn_of_absent_places(file: ConfidenceFile) -> None:
+    """Warn if the file was fitted on places only that the database shows."""
+    if not file.origin.get("absent_queries"):
+        tell(f"warning: confidence={file.path} was fitted without absent places, so that it is too high for them; "
+             "evaluate again on a path that is long enough to leave out the images of a query's place")  # fmt: skip
+
+
 def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> ConfidenceFile:
     """Keep the final scores of a file whose settings fit this run at least as well as those of the one that decides.
 
@@ -45,6 +52,7 @@ def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> Co
     before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), fingerprints(inputs.contents)))
     if before & now:
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
+    warn_of_absent_places(file)
     if not any(file.systems[headline].weights):
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
     threshold = inputs.thresholds and [middle(inputs.thresholds), inputs.ground_truth["unit"]]

@@ -7,6 +7,7 @@ from mfvpr.cli import confidences, run_folder, truth
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Shard, System, fill_shard, rank_dataset
+from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.report.confidences import confidence_figures, confidence_table
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.query_figures import query_figures
@@ -60,9 +61,10 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     confidence = confidence and confidences.check_confidence(confidence, system, inputs)
     ranked = rank_dataset(inputs.dataset, system, cache=inputs.cache)
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
+    lacking = None if settings["threshold"] is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport.of(
         ranked, inputs.thresholds, settings["recall"]["ks"],
-        confidences=confidence and confidence.systems, least_confidence=settings["threshold"],
+        confidences=confidence and confidence.systems, least_confidence=settings["threshold"], lacking=lacking,
     )  # fmt: skip
     figures = query_figures(report, figure_queries) + (confidence_figures(report) if figure_queries else [])
     return Outcome(inputs, report, _describe(settings, inputs, system), figures)

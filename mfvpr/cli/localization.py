@@ -187,8 +187,7 @@ def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | Non
     if name not in file.systems:
         raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
-    tell(f"warning: confidence={file.path} may be too high for places that the map does not show; mfvpr map calibrate "
-         "fits one that knows absent places")  # fmt: skip
+    confidences.warn_of_absent_places(file)
     scorers = system.final_scores[name].scorers
     if other := confidences.other_settings(file.origin, scorers, map_settings, map_settings["candidates"]):
         tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "

@@ -105,6 +105,11 @@ def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tupl
     return (other, rounded) if shape[0] > shape[1] else (rounded, other)
 
 
+def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write an image (RGB) in the format of the path's suffix."""
+    Image.fromarray(image).save(path)
+
+
 def read_header(content: bytes) -> tuple[int, int | None]:
     """Orientation and range of an image file's `content`.
 

@@ -9,6 +9,7 @@ __all__ = [
     "Split",
     "System",
     "best_setting",
+    "calibration_data",
     "confidence_inputs",
     "estimate",
     "evaluation_protocol",
@@ -28,7 +29,14 @@ __all__ = [
     "write_confidences",
 ]
 
-from .calibration import Confidence, confidence_inputs, fit_confidence, read_confidences, write_confidences
+from .calibration import (
+    Confidence,
+    calibration_data,
+    confidence_inputs,
+    fit_confidence,
+    read_confidences,
+    write_confidences,
+)
 from .evaluation import RankedDataset, Recall, rank_dataset
 from .metrics import hits, precision_recall, recall_at_k, reliability
 from .protocol import EvaluationProtocol, Split, evaluation_protocol

@@ -3,18 +3,25 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from mfvpr.datasets.positives import Positives
+from mfvpr.datasets.truth import Truth
 from mfvpr.reranking.confidence import APART, INPUTS, Confidence, Input, confidence_inputs
+from mfvpr.reranking.results import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
 
-__all__ = ["Confidence", "confidence_inputs", "fit_confidence", "read_confidences", "write_confidences"]
+__all__ = [
+    "CalibrationData", "Confidence", "absent_rankings", "calibration_data", "confidence_inputs", "fit_confidence",
+    "read_confidences", "write_confidences",
+]  # fmt: skip
 
+AROUND = 5  # times the distance of a correct prediction: nearer images show the place, or are not known to be elsewhere
 _LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which would order equal predictions by rounding
 _FORMAT = "mfvpr confidence 2"
 
@@ -60,6 +67,67 @@ def fit_confidence(
     best = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     bias, *weights = np.where(np.abs(best) > _LEAST_WEIGHT, best, 0.0).tolist()
     return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
+
+
+class CalibrationData(NamedTuple):
+    """Inputs of a confidence of Q queries, for places that the database shows and for absent places.
+
+    Attributes:
+        present: inputs of the queries as they are, see `confidence_inputs`.
+        absent: inputs of the same queries without the images of their place; NaN without candidates of other places.
+        correct: whether the top predictions of the queries as they are are correct.
+    """
+
+    present: Float[np.ndarray, "queries inputs"]
+    absent: Float[np.ndarray, "queries inputs"]
+    correct: Bool[np.ndarray, " queries"]
+
+    @property
+    def num_absent(self) -> int:
+        """Number of queries that count once more, as images of an absent place."""
+        return int(np.isfinite(self.absent).all(axis=1).sum())
+
+    def take(self, queries: Int[np.ndarray, " _"]) -> "CalibrationData":
+        """Select queries by their numbers."""
+        return CalibrationData(*(values[queries] for values in self))
+
+    def fit(self) -> Confidence:
+        """Fit a confidence on present and absent places; an `InputError` if no query has usable inputs."""
+        never = np.zeros(len(self.absent), bool)
+        return fit_confidence(np.concatenate([self.present, self.absent]), np.concatenate([self.correct, never]))
+
+
+def calibration_data(ranked: Ranked, by_retrieval: Ranked, truth: Truth, threshold: float) -> CalibrationData:
+    """Count each query as it is, and once more as an image of an absent place, see `absent_rankings`.
+
+        confidence = calibration_data(by_score, by_retrieval, truth, 2).fit()
+
+    Args:
+        ranked: of a system.
+        by_retrieval: the ranking of the same candidates by retrieval.
+        truth: ground truth of the queries.
+        threshold: largest distance of a correct prediction.
+    """
+    absent = confidence_inputs(*absent_rankings(ranked, by_retrieval, truth, threshold))
+    correct = truth.positives(threshold).contains(ranked.rows)[:, 0]
+    return CalibrationData(confidence_inputs(ranked, by_retrieval), absent, correct)
+
+
+def absent_rankings(ranked: Ranked, by_retrieval: Ranked, truth: Truth, threshold: float) -> tuple[Ranked, Ranked]:
+    """Both rankings without the images of each query's place, as if the database did not show it.
+
+    Images within five times the threshold are left out, and the other candidates keep their scores. A query without
+    images to leave out has no candidates: it shows an absent place as it is. Arguments are those of `calibration_data`.
+    """
+    place = truth.shows_place(AROUND * max(threshold, 1))
+    return _leave_out(ranked, place), _leave_out(by_retrieval, place)
+
+
+def _leave_out(ranked: Ranked, place: Positives) -> Ranked:
+    is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
+    order = np.argsort(is_left_out, axis=1, kind="stable")
+    rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
+    return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:

@@ -35,7 +35,9 @@ from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
 KS = (1, 5, 10)  # depths of recall, by default
-Reason = Literal["no candidates", "too few features", "too few matches", "low confidence"]  # why there is no place
+Reason = Literal[  # why there is no place
+    "no candidates", "too few features", "too few matches", "no better than noise", "low confidence"
+]
 
 Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer
 

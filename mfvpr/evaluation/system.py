@@ -168,9 +168,13 @@ class System:
         stages.score(self.scorers, matches[0] if len(matches) == 1 else Scales(matches, weights), shortlist)
 
 
-def noise_image(size: tuple[int, int] = (64, 48)) -> UInt8[np.ndarray, "height width 3"]:
-    """An image of random pixels, (width, height) px, in which every extractor finds features."""
-    return np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
+def noise_image(
+    size: tuple[int, int] = (64, 48), *, seed: int = 0, grain: int = 1
+) -> UInt8[np.ndarray, "height width 3"]:
+    """An image of random squares of `grain` px, (width, height) px, in which every extractor finds features."""
+    width, height = size
+    squares = np.random.default_rng(seed).integers(0, 256, (-(-height // grain), -(-width // grain), 3), np.uint8)
+    return squares.repeat(grain, axis=0).repeat(grain, axis=1)[:height, :width]
 
 
 def _with_part(whole: Any, part: Any, new: Any) -> Any:

@@ -17,8 +17,8 @@ from mfvpr.features.extractor import Aggregation, Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.declaration import LEARNING, write_declaration
 from mfvpr.localization.describing import Describing, Image, is_file
-from mfvpr.localization.evidence import MapStrength
 from mfvpr.localization.resident import Resident
+from mfvpr.localization.strength import MapStrength
 from mfvpr.localization.vectors import Vectors
 from mfvpr.localization.vocabulary import VocabularyFile
 from mfvpr.storage.feature_cache import FeatureCache

@@ -12,13 +12,13 @@ import numpy as np
 
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
+from mfvpr.evaluation.evidence import LEAST_STRENGTH, evidence_scores, noise_images, reason_against, strength
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
 from mfvpr.localization.declaration import check_declaration, fit_to_map, read_system
 from mfvpr.localization.describing import Described, Image, is_file, load
-from mfvpr.localization.evidence import LEAST_MATCHES, LEAST_STRENGTH, strength
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
@@ -27,8 +27,9 @@ from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
+from mfvpr.scoring.scorer import Scorer
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Shortlist
+from mfvpr.types import Matches, Shortlist
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle
@@ -83,6 +84,7 @@ class Map(MapImages):
         if threshold is not None and self.confidence is None:
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.threshold = threshold
+        self._noise_scores: dict[int, float] = {}  # by the number of rows
         keep_compiled_programs()
         super().__init__(folder, system, extractor, describer, memory=runtime.memory)
 
@@ -135,8 +137,8 @@ class Map(MapImages):
             cache: keeps features.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
-        self.confidence = fit_on_drive(dataset, self.system, cache)
-        write_confidence(self.folder, self.system, self.confidence)
+        self.confidence, data = fit_on_drive(dataset, self.system, cache)
+        write_confidence(self.folder, self.system, self.confidence, data)
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0) -> Prediction:
@@ -147,8 +149,8 @@ class Map(MapImages):
     def localize_with_evidence(self, image: Image, *, recent: int = 0, before: int | None = None) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
-        There is no place, and `reason` says why, for a query with too few features or matches
-        (`mfvpr.localization.evidence`), without candidates, or with a confidence below the threshold.
+        There is no place, and `reason` says why, for a query with too few features or matches, or no better than noise
+        (`mfvpr.evaluation.evidence`), without candidates, or with a confidence below the threshold.
 
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
@@ -185,27 +187,25 @@ class Map(MapImages):
         self, described: DescribedMap, description: Described, end: int, size: tuple[int, int]
     ) -> Localization:
         """Localize a described image of (width, height) px among the rows before `end`."""
-        features, vector = description
-        if strength(features) < LEAST_STRENGTH * described.strength(end):
+        if strength(description[0]) < LEAST_STRENGTH * described.strength(end):
             return refusal("too few features", description, size[0])
-        rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
-        if not len(rows):
+        matched = self._match(described, description, end, self.system.scorers)
+        if matched is None:
             return refusal("no candidates", description, size[0])
-        arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
-        matcher, scorers = self.system.pipeline.matcher, self.system.scorers
-        matches, scores = match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
+        rows, similarities, matches, scores = matched
         ranking, by_retrieval = self._rank(rows, similarities, scores)
         [place] = np.flatnonzero(rows == ranking.rows[0, 0])
         best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
-        if best.mask.sum() < LEAST_MATCHES:
-            return refusal("too few matches", description, size[0])
+        [score], noise = evidence_scores(best), self._noise_score(described, end)
+        if reason := reason_against(best.mask.sum(), score, noise):
+            return refusal(reason, description, size[0])
         p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
         p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._entries[row].name, self._entries[row].place, score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
-        shift = shift_of(scorers.values(), best, size)
+        shift = shift_of(self.system.scorers.values(), best, size)
         prediction = Prediction(
             alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
         )
@@ -214,6 +214,28 @@ class Map(MapImages):
                 prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
             )
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
+
+    def _match(
+        self, described: DescribedMap, description: Described, end: int, scorers: Mapping[str, Scorer]
+    ) -> tuple[np.ndarray, np.ndarray, Matches, dict[str, np.ndarray]] | None:
+        """Candidates before `end`, their similarities, matches and scores; None without candidates."""
+        features, vector = description
+        rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
+        if not len(rows):
+            return None
+        arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
+        matcher = self.system.pipeline.matcher
+        return rows, similarities, *match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
+
+    def _noise_score(self, described: DescribedMap, end: int) -> float:
+        """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
+        end = 1 << max(0, end.bit_length() - 1)
+        if end not in self._noise_scores:
+            descriptions = map(described.describing.image, noise_images(self.extractor.image_size))
+            parts = [self._match(described, description, end, {}) for description in descriptions]
+            scores = [evidence_scores(matches)[: len(rows)] for rows, _, matches, _ in filter(None, parts)]
+            self._noise_scores[end] = float(np.max(scores, initial=0))
+        return self._noise_scores[end]
 
     def _rank(
         self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]

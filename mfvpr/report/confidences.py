@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.evaluation.calibration import fit_confidence, write_confidences
-from mfvpr.evaluation.evaluation import Reason
+from mfvpr.evaluation.calibration import write_confidences
 from mfvpr.evaluation.metrics import chance_calibration_error, reliability
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport
@@ -19,19 +18,22 @@ from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.reranking.results import RETRIEVAL
 
 _COUNTS = ("correct", "incorrect", "refused", "of these correct")
+TOP_PREDICTIONS = ("query", "prediction", "refused", "score", "confidence", "absent_confidence", "correct", "outcome",
+                   "reason", "in_database")  # fmt: skip
 SHARES = tuple(share / 20 for share in range(21))
 
 
 def confidence_table(evaluation: EvaluationReport) -> Table:
     """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; counts of queries.
 
-    All in percent but the counts, which need `least_confidence`. "by chance" is the expected calibration error of a
-    perfectly calibrated confidence.
+    All in percent but the counts, which need `least_confidence`. "ECE" is the expected calibration error of the queries
+    as they are, "by chance" that of a perfectly calibrated confidence. "ECE with absent" counts each query once more
+    without the images of its place, as the fits do.
     """
     header = [f"{name} by {by}" for by in ("score", "confidence") for name in ("AP", "R@100P", "R@99P")]
     counts = () if evaluation.least_confidence is None else _COUNTS
     rows = [_confidence_row(evaluation, name) for name in evaluation.probabilities]
-    return Table(["system", *header, "ECE", "by chance", *counts], rows)
+    return Table(["system", *header, "ECE", "by chance", "ECE with absent", *counts], rows)
 
 
 def _confidence_row(evaluation: EvaluationReport, system: str) -> list[str]:
@@ -39,6 +41,8 @@ def _confidence_row(evaluation: EvaluationReport, system: str) -> list[str]:
                for value in (curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99))]  # fmt: skip
     probabilities, correct = evaluation.probabilities[system], evaluation.hits(system)
     percent += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
+    both = np.concatenate([probabilities, evaluation.absent_probabilities[system]])
+    percent.append(reliability(both, np.append(correct, np.zeros(len(correct), bool))).calibration_error)
     known = 3 if np.isnan(probabilities).all() else len(percent)  # an unknown confidence has empty cells
     cells = [system, *(f"{100 * value:.1f}" if place < known else "" for place, value in enumerate(percent))]
     if evaluation.least_confidence is not None:
@@ -83,33 +87,38 @@ def write_confidence(folder: Path, evaluation: EvaluationReport, provenance: Map
     points = [[name, by, *map(format_number, point)] for name in evaluation.ranked.systems
               for by, curve in evaluation.curves(name).items() for point in zip(*curve, strict=True)]  # fmt: skip
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
-    inputs = {name: evaluation.confidence_inputs(name) for name in evaluation.ranked.systems}
-    fits = {name: fit_confidence(values, evaluation.hits(name)) for name, values in inputs.items()
-            if np.isfinite(values).all(axis=1).any()}  # fmt: skip
+    fits = {name: data.fit() for name, data in evaluation.calibration.items()
+            if np.isfinite(data.present).all(axis=1).any()}  # fmt: skip
     write_confidences(folder / "confidence.json", fits, provenance)
 
 
 def _write_top_predictions(folder: Path, evaluation: EvaluationReport) -> None:
-    """Write `query,prediction,score,confidence,correct,reason,in_database`.
+    """Write `top_predictions.csv` of every sequence.
 
     `score`, `confidence` and `correct` are of the first candidate, also where the prediction is `NO_PLACE` for a
-    `reason`. `in_database` is 1 where the database shows the query's place; elsewhere `NO_PLACE` is correct.
+    `reason`; `refused` is then its name, and `outcome` is "refused". `absent_confidence` is the confidence of the query
+    without the images of its place. `in_database` is 1 where the database shows the query's place; elsewhere `NO_PLACE`
+    is correct.
     """
     name, database = evaluation.headline, evaluation.ranked.dataset.database.names
-    refused, probabilities = evaluation.refused, evaluation.by_sequence(evaluation.probabilities[name])
-    for place, ranked in enumerate(evaluation.ranked.systems[name]):
+    absent = evaluation.absent_probabilities.get(name, np.full(evaluation.num_queries, np.nan))
+    values = map(evaluation.by_sequence, (evaluation.reasons(name), evaluation.probabilities[name], absent))
+    for place, (ranked, *parts) in enumerate(zip(evaluation.ranked.systems[name], *values, strict=True)):
         is_correct, positives = evaluation.is_correct(name, place), evaluation.positives[place]
         lines = []
-        for query, image in enumerate(evaluation.sequences[place].images.names):
-            row, unsure = ranked.rows[query, 0], refused[place][query]
-            reason: Reason | None = "no candidates" if row < 0 else "low confidence" if unsure else None
-            values = (ranked.scores[query, 0], probabilities[place][query])
-            numbers = ["" if np.isnan(value) else format_number(value) for value in values]
+        for image, row, score, reason, *both, query in zip(
+            evaluation.sequences[place].images.names, ranked.rows[:, 0], ranked.scores[:, 0], *parts,
+            range(len(ranked.rows)), strict=True,
+        ):  # fmt: skip
+            candidate = database[row] if row >= 0 else ""
+            predictions = [NO_PLACE, candidate] if reason else [candidate, ""]
+            numbers = ["" if np.isnan(score) else format_number(score)]
+            numbers += ["" if np.isnan(p) else repr(float(p)) for p in both]  # rounding may move them to another bin
             correct = "" if is_correct is None else int(is_correct[query, 0])
+            outcome = "refused" if reason else {"": "", 0: "incorrect", 1: "correct"}[correct]
             in_database = "" if positives is None else int(positives.counts[query] > 0)
-            lines.append([image, NO_PLACE if reason else database[row], *numbers, correct, reason or "", in_database])
-        header = ["query", "prediction", "score", "confidence", "correct", "reason", "in_database"]
-        write_csv(evaluation.folder(folder, place) / "top_predictions.csv", header, lines)
+            lines.append([image, *predictions, *numbers, correct, outcome, reason or "", in_database])
+        write_csv(evaluation.folder(folder, place) / "top_predictions.csv", TOP_PREDICTIONS, lines)
 
 
 def confidence_figures(evaluation: EvaluationReport) -> list[Figure]:

@@ -47,20 +47,21 @@ def write_predictions(
     correct: Bool[np.ndarray, "queries candidates"] | None,
     refused: Bool[np.ndarray, " queries"] | None = None,
 ) -> None:
-    """Write a CSV line per query and candidate, best first: `query,rank,database,score,correct`.
+    """Write a CSV line per query and candidate, best first: `query,rank,database,score,correct,refused`.
 
     `correct` is 1 or 0, or empty where it is unknown. A query that is refused has one line, `NO_PLACE`, with score and
-    `correct` of its first candidate.
+    `correct` of its first candidate, and its name in `refused`.
     """
     refused = np.zeros(len(queries), bool) if refused is None else refused
     lines = (
         [queries[query], rank + 1, NO_PLACE if refused[query] else database[row],
          format_number(ranked.scores[query, rank]) if row >= 0 else "",
-         "" if correct is None else int(correct[query, rank])]
+         "" if correct is None else int(correct[query, rank]),
+         database[row] if refused[query] and row >= 0 else ""]
         for (query, rank), row in np.ndenumerate(ranked.rows)
         if (rank == 0 if refused[query] else row >= 0)
     )  # fmt: skip
-    write_csv(path, ("query", "rank", "database", "score", "correct"), lines)
+    write_csv(path, ("query", "rank", "database", "score", "correct", "refused"), lines)
 
 
 def write_failures(

@@ -1,5 +1,6 @@
 """The report of an evaluation: recall, and confidences of the first predictions."""
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,15 +12,15 @@ from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Unit, middle, threshold_words
-from mfvpr.evaluation.calibration import fit_confidence
-from mfvpr.evaluation.evaluation import KS, RankedDataset, Recall
+from mfvpr.datasets.truth import Truth, Unit, middle, threshold_words
+from mfvpr.evaluation.calibration import CalibrationData, absent_rankings, calibration_data
+from mfvpr.evaluation.evaluation import KS, RankedDataset, Reason, Recall
 from mfvpr.evaluation.metrics import PrecisionRecall, precision_recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
-from mfvpr.reranking.confidence import Confidence, confidence_inputs
-from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.reranking.confidence import Confidence
+from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 
@@ -38,6 +39,8 @@ class EvaluationReport:
         confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
             confidence that was fitted on the other half.
         least_confidence: below which the prediction is `NO_PLACE`; None = no prediction is refused.
+        lacking: by sequence, why there is too little evidence for predictions of the system that decides, which are
+            `NO_PLACE` as well, see `mfvpr.evaluation.evidence`; None = not tested.
     """
 
     ranked: RankedDataset
@@ -45,16 +48,18 @@ class EvaluationReport:
     ks: Sequence[int]
     confidences: Mapping[str, Confidence] | None = None
     least_confidence: float | None = None
+    lacking: Sequence[Sequence[Reason | None]] | None = None
 
     @classmethod
     def of(
         cls, ranked: RankedDataset, thresholds: Sequence[float] | None = None, ks: Sequence[int] = KS, *,
         confidences: Mapping[str, Confidence] | None = None, least_confidence: float | None = None,
+        lacking: Sequence[Sequence[Reason | None]] | None = None,
     ) -> "EvaluationReport":  # fmt: skip
         """The report with criteria in any order; without thresholds, those that the programs have by default."""
         truth = ranked.dataset.sequences[0].truth
         known = [] if truth is None else truth.thresholds() if thresholds is None else thresholds
-        return cls(ranked, sorted({*known}), sorted({*ks}), confidences, least_confidence)
+        return cls(ranked, sorted({*known}), sorted({*ks}), confidences, least_confidence, lacking)
 
     @property
     def headline(self) -> str:
@@ -134,22 +139,49 @@ class EvaluationReport:
     @cached_property
     def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
         """Confidence by system, NaN without a prediction, or without anything to fit on."""
-        systems = self.ranked.systems
-        if self.confidences is not None:
-            return {name: confidence.probability(self.confidence_inputs(name, confidence))
-                    for name, confidence in self.confidences.items() if name in systems}  # fmt: skip
-        return {name: self._cross_fitted_probability(name) for name in systems} if self.thresholds else {}
+        if self.confidences is None:
+            return {name: present for name, (present, _) in self._cross_fitted.items()}
+        return {name: np.concatenate([self.confidences[name](*pair) for pair in self._pairs(name)])
+                for name in self.confidences if name in self.ranked.systems}  # fmt: skip
+
+    @cached_property
+    def absent_probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
+        """Confidence by system of the queries without the images of their place; nothing without ground truth."""
+        if self.confidences is None or not self.thresholds:
+            return {name: absent for name, (_, absent) in self._cross_fitted.items()}
+        return {name: np.concatenate([self.confidences[name](*absent_rankings(*pair, truth, self.threshold))
+                                      for pair, truth in zip(self._pairs(name), self._truths, strict=True)])
+                for name in self.probabilities}  # fmt: skip
+
+    @cached_property
+    def calibration(self) -> dict[str, CalibrationData]:
+        """Data that the confidence of a system is fitted on, by system; nothing without ground truth."""
+        parts = {name: [calibration_data(*pair, truth, self.threshold)
+                        for pair, truth in zip(self._pairs(name), self._truths, strict=True)]
+                 for name in self.ranked.systems if self.thresholds}  # fmt: skip
+        return {name: CalibrationData(*map(np.concatenate, zip(*each, strict=True))) for name, each in parts.items()}
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
         parts = self.ranked.systems[system]
         return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
 
+    def reasons(self, system: str) -> Shaped[np.ndarray, " queries"]:
+        """Why predictions are `NO_PLACE`, objects; None = they are not."""
+        reasons = np.full(self.num_queries, None, object)
+        if self.least_confidence is not None:
+            reasons[~(self.probabilities[system] >= self.least_confidence)] = "low confidence"
+        reasons[np.concatenate([ranked.rows[:, 0] < 0 for ranked in self.ranked.systems[system]])] = "no candidates"
+        if self.lacking is not None and system == self.headline:
+            lacking = np.array([*itertools.chain(*self.lacking)], object)
+            reasons = np.where(lacking == None, reasons, lacking)  # noqa: E711
+        return reasons
+
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
-        """Whether the prediction is `NO_PLACE`."""
+        """Whether the threshold or the evidence refuses the prediction."""
         if self.least_confidence is None:
             return np.zeros(self.num_queries, bool)
-        return ~(self.probabilities[system] >= self.least_confidence)
+        return np.array([reason is not None for reason in self.reasons(system)])
 
     @cached_property
     def refused(self) -> list[Bool[np.ndarray, " _"]]:
@@ -163,27 +195,34 @@ class EvaluationReport:
         return {by: precision_recall(values, self.hits(system), has_positives)
                 for by, values in by_kind.items() if values is not None}  # fmt: skip
 
-    def confidence_inputs(self, system: str, like: Confidence | None = None) -> Float[np.ndarray, "queries inputs"]:
-        """Inputs of the confidence of a system; those of a known confidence, or all."""
-        options = {} if like is None else {"inputs": like.inputs, "apart": like.apart}
-        pairs = zip(self.ranked.systems[system], self.ranked.systems[RETRIEVAL], strict=True)
-        return np.concatenate([confidence_inputs(*pair, **options) for pair in pairs])
+    @cached_property
+    def _cross_fitted(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
+        """Confidence on each half of the path by a fit on the other, without what shows places of both.
 
-    def _cross_fitted_probability(self, system: str) -> np.ndarray:
-        """Confidence on each half of the path by a fit on the other, without what shows places of both."""
-        inputs, correct = self.confidence_inputs(system), self.hits(system)
-        probability = np.full(len(correct), np.nan)
-        for half in self.path_halves():
-            if np.isfinite(inputs[half.tune]).all(axis=1).any():
-                confidence = fit_confidence(inputs[half.tune], correct[half.tune])
-                probability[half.report] = confidence.probability(inputs[half.report])
-        return probability
+        Of the queries as they are, and without the images of their place.
+        """
+        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in self.calibration}
+        for name, data in self.calibration.items():
+            for half in self.path_halves():
+                tune, report = data.take(half.tune), data.take(half.report)
+                if np.isfinite(tune.present).all(axis=1).any():
+                    fitted = map(tune.fit().probability, (report.present, report.absent))
+                    probabilities[name][:, half.report] = [*fitted]
+        return probabilities
+
+    def _pairs(self, system: str) -> Iterator[tuple[Ranked, Ranked]]:
+        """Rankings of each sequence by a system, and by retrieval."""
+        return zip(self.ranked.systems[system], self.ranked.systems[RETRIEVAL], strict=True)
+
+    @property
+    def _truths(self) -> list[Truth]:
+        """Ground truth of each sequence, if there is any."""
+        return [sequence.truth for sequence in self.sequences if sequence.truth is not None]
 
     def path_halves(self) -> tuple[Half, Half]:
         """Halves of the path; with several sequences, which may pass places in any order, halves of the database."""
-        truths = [sequence.truth for sequence in self.sequences if sequence.truth is not None]
-        shown = [truth.shows_place(self.thresholds[-1]) for truth in truths]
-        return halves(shown[0]) if len(shown) == 1 else halves_of_map(shown, truths[0].unit)
+        shown = [truth.shows_place(self.thresholds[-1]) for truth in self._truths]
+        return halves(shown[0]) if len(shown) == 1 else halves_of_map(shown, self._truths[0].unit)
 
 
 def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:

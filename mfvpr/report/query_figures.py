@@ -53,7 +53,7 @@ class SequenceFigures:
         self._matched, self._database = evaluation.ranked.matched[place], evaluation.ranked.dataset.database
         self._ranked = evaluation.ranked.systems[evaluation.headline][place]
         self._correct, self._positives = evaluation.is_correct(evaluation.headline, place), evaluation.positives[place]
-        self._refused = evaluation.refused[place]
+        self._reasons = evaluation.by_sequence(evaluation.reasons(evaluation.headline))[place]
 
     def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
@@ -72,7 +72,7 @@ class SequenceFigures:
         truth, headline = self._sequence.truth, self._evaluation.headline
         within = "" if truth is None else " at" + threshold_words(truth.unit, self._evaluation.threshold)
         names = f"{_short(self._sequence.images.names[query])} -> {_short(self._prediction(query))}"
-        note = " (no place: confidence below the threshold)" if self._refused[query] else ""
+        note = f" (no place: {reason})" if (reason := self._reasons[query]) else ""
         return f"{headline}, {verdict}{within}: {names}{note}"
 
     def draw(self, path: Path, query: int, verdict: str) -> None:

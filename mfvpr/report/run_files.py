@@ -170,6 +170,7 @@ def _provenance(report: EvaluationReport, description: RunDescription) -> dict[s
         "dataset": report.ranked.dataset.name,
         "data_fingerprint": fingerprints(description.contents),
         "queries": report.num_queries,
+        "absent_queries": report.calibration[report.headline].num_absent if truth else 0,
         "correct_within": [middle(report.thresholds), truth.unit] if truth else None,
         "candidates": _num_candidates(report),
         "ground_truth": description.truth,

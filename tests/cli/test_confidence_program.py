@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mfvpr.evaluation import precision_recall, read_confidences, reliability
+from mfvpr.evaluation.system import noise_image
 from tests.programs import QUERIES, csv_rows, small
 
 pytestmark = pytest.mark.thorough
@@ -71,6 +73,12 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
         assert table[system]["R@100P by score"] == f"{100 * curve.recall_at(1):.1f}"
     error = reliability(probability, hits["histogram"]).calibration_error
     assert table["histogram"]["ECE"] == f"{100 * error:.1f}"
+    absent = np.array([float(line["absent_confidence"] or "nan") for line in top])
+    both = np.concatenate([probability, absent]), np.append(hits["histogram"], np.zeros(len(absent), bool))
+    assert table["histogram"]["ECE with absent"] == f"{100 * reliability(*both).calibration_error:.1f}"
+    assert np.nanmean(absent) < probability.mean()
+    [*_, origin] = read_confidences(out / "confidence.json")
+    assert 0 < origin["absent_queries"] <= np.isfinite(absent).sum()
     average_precision = precision_recall(probability, hits["histogram"]).average_precision
     assert table["histogram"]["AP by confidence"] == f"{100 * average_precision:.1f}"
     shares = csv_rows(out / "rerank_share.csv")
@@ -83,7 +91,9 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert tuple(systems) == SYSTEMS
     assert (origin["queries"], origin["correct_within"]) == (QUERIES, [1, "frames"])
     assert origin["ground_truth"]["thresholds"] == [0, 1]
-    threshold = (f"confidence={confidence}", "threshold=0.4")
+    first = csv_rows(confidence.parent / "top_predictions.csv")
+    least = np.median([float(line["confidence"]) for line in first])
+    threshold = (f"confidence={confidence}", f"threshold={least}")
     out, stderr, stdout = evaluate("second", *threshold)
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
@@ -91,11 +101,20 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert header.endswith("correct  incorrect  refused  of these correct")
     top = csv_rows(out / "top_predictions.csv")
     probability, score = (np.array([float(line[name]) for line in top]) for name in ("confidence", "score"))
-    refused = probability < 0.4
+    lacks = np.array([line["reason"] not in ("", "low confidence") for line in top])
+    refused = (probability < least) | lacks
+    names = [line["prediction"] for line in first]
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
     assert [line["prediction"] == "no place" for line in top] == refused.tolist()
-    assert [line["reason"] for line in top] == np.where(refused, "low confidence", "").tolist()
+    assert lacks.sum() < QUERIES / 4  # small images at night: they score no better than noise
+    reasons = [line["reason"] for line in top if line["reason"] != "no better than noise"]
+    assert reasons == np.where(refused, "low confidence", "")[~lacks].tolist()
+    assert [line["refused"] for line in top] == np.where(refused, names, "").tolist()
+    outcome = {"": "refused", "0": "incorrect", "1": "correct"}
+    assert [line["outcome"] for line in top] == [
+        outcome[line["correct"] * (line["prediction"] != "no place")] for line in top
+    ]
     assert {line["in_database"] for line in top} == {"1"}
     correct = np.array([line["histogram"] == "1" for line in csv_rows(out / "gains.csv")])
     assert [line["correct"] for line in top] == correct.astype(int).astype(str).tolist()
@@ -105,14 +124,16 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert line["ECE"] == f"{100 * reliability(probability, correct).calibration_error:.1f}"
     predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
-    assert [(line["query"], line["rank"], line["score"], line["correct"]) for line in none] == [
-        (line["query"], "1", line["score"], line["correct"]) for line in top if line["prediction"] == "no place"
+    columns = ("query", "score", "correct", "refused")
+    assert [[line["rank"], *(line[name] for name in columns)] for line in none] == [
+        ["1", *(line[name] for name in columns)] for line in top if line["prediction"] == "no place"
     ]
     refusing = {line["query"] for line in none}
     rest = [line for line in csv_rows(out / "predictions" / "histogram.csv") if line["query"] not in refusing]
     assert [line for line in predictions if line not in none] == rest
     unknown, *_ = evaluate("third", *threshold, "dataset.ground_truth=none", "dataset.index_file=null")
-    expected = [{**line, "correct": "", "in_database": ""} for line in top]
+    unknown_values = {"correct": "", "in_database": "", "absent_confidence": ""}
+    expected = [{**line, **unknown_values, "outcome": line["outcome"] * (line["reason"] != "")} for line in top]
     assert csv_rows(unknown / "top_predictions.csv") == expected
     assert not (unknown / "confidence.csv").exists()
 
@@ -133,6 +154,29 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confide
     last = [line for line in csv_rows(out / "precision_recall.csv") if line["system"] == "histogram"][-1]
     assert float(last["recall"]) == pytest.approx(hits.count("1") / (QUERIES - 1))
     assert float(last["precision"]) == pytest.approx(hits.count("1") / QUERIES)
+
+
+def test_unusable_queries_are_refused_whatever_the_threshold(evaluate, confidence, root, tmp_path):
+    """A lens cap and noise among the queries, without ground truth."""
+    (tmp_path / "queries").mkdir()
+    for name, image in {"black": np.zeros((96, 128, 3), np.uint8), "noise": noise_image((128, 96), seed=9)}.items():
+        Image.fromarray(image).save(tmp_path / "queries" / f"{name}.png")
+    queries = ("dataset.ground_truth=none", "dataset.index_file=null", f"dataset.queries={tmp_path}/queries")
+    out, *_ = evaluate("second", f"confidence={confidence}", "threshold=0", *queries)
+    top = {line["query"]: line for line in csv_rows(out / "top_predictions.csv")}
+    assert {name: line["reason"] for name, line in top.items()} == {
+        "black.png": "too few features", "noise.png": "no better than noise"
+    }  # fmt: skip
+    assert {line["outcome"] for line in top.values()} == {"refused"}
+
+
+def test_a_file_without_absent_places_is_told(evaluate, content, tmp_path):
+    for absent in (0, 5):
+        (tmp_path / "other.json").write_text(
+            json.dumps(content | {"made": content["made"] | {"absent_queries": absent}})
+        )
+        _, stderr, _ = evaluate(f"out{absent}", f"confidence={tmp_path}/other.json")
+        assert ("was fitted without absent places" in stderr) == (absent == 0)
 
 
 def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
@@ -203,4 +247,5 @@ def test_a_confidence_that_is_the_same_for_all_is_told_and_refuses_none_at_its_v
     out, stderr, _ = evaluate("out", f"confidence={tmp_path}/flat.json", "threshold=0.5")
     assert "flat.json has the same confidence for all predictions" in stderr
     top = csv_rows(out / "top_predictions.csv")
-    assert {(line["confidence"], line["reason"]) for line in top} == {("0.5", "")}
+    assert {line["confidence"] for line in top} == {"0.5"}
+    assert {line["reason"] for line in top} <= {"", "no better than noise"}

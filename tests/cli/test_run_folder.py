@@ -54,7 +54,7 @@ def test_predictions_are_long_and_agree_with_the_recall(evaluated):
     entries = json.loads((evaluated / "results.json").read_text())
     for system in SYSTEMS:
         lines = csv_rows(evaluated / "predictions" / f"{system.replace(' + ', '_')}.csv")
-        assert list(lines[0]) == ["query", "rank", "database", "score", "correct"]
+        assert list(lines[0]) == ["query", "rank", "database", "score", "correct", "refused"]
         assert [int(line["rank"]) for line in lines] == QUERIES * [*range(1, CANDIDATES + 1)]
         scores = np.array([float(line["score"]) for line in lines]).reshape(QUERIES, -1)
         assert np.all(np.diff(scores) <= 0)

@@ -151,7 +151,7 @@ def test_noise_gets_no_place_though_all_predictions_of_the_drive_are_correct(tmp
     )
     known = Map.open(tmp_path / "map", threshold=0.8)
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
-    assert known.localize(image).reason == "low confidence"
+    assert known.localize(image).reason == "no better than noise"
     for row in (2, 20):
         assert known.localize(street / f"database/{row:04d}.png").place == f"{row:04d}.png"
 

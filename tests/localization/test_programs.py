@@ -362,17 +362,18 @@ def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
 
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):
     settings = json.loads((folder / "settings.json").read_text())
-    for candidates in (settings["candidates"], settings["candidates"] + 1):
+    for candidates, absent in ((settings["candidates"], 0), (settings["candidates"] + 1, 7)):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {
             "settings": same | {"scorer": assembly.describe_settings(settings["scorer"])},
             "candidates": candidates,
+            "absent_queries": absent,
         }
         write_confidences(tmp_path / "c.json", {"histogram": SURE}, origin)
         [line], stderr = localize(small_street / "database/0001.png", f"confidence={tmp_path}/c.json")
         assert 0 <= line["confidence"] <= 1
         assert ("other settings of candidates" in stderr) == (candidates != settings["candidates"])
-        assert "too high for places that the map does not show" in stderr
+        assert ("fitted without absent places" in stderr) == (absent == 0)
 
 
 def test_a_map_is_calibrated(folder, small_street, call_program, localize):
