@@ -15,7 +15,7 @@ from mfvpr.cli.inputs import dataset_of
 from mfvpr.cli.query_images import images
 from mfvpr.datasets import read_image
 from mfvpr.evaluation import Confidence, System
-from mfvpr.localization import Drive, Localization, Map, Prediction, Route
+from mfvpr.localization import Drive, Localization, Located, Map, Route
 from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.disk import used_bytes
@@ -78,7 +78,7 @@ def localize(settings: dict[str, Any]) -> None:
             if not len(robot_map):
                 raise
             failed += 1
-            line = {"error": str(error)} | drive.route_entry(None, None)
+            line = {"error": str(error)} | drive.entry_without_image()
         else:
             line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
         print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
@@ -102,9 +102,9 @@ class _Drive:
         """Localize an image and return its line; an image that is in the map sees only the images before it."""
         start = time.perf_counter()
         row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
-        localized = self._map.localize_with_evidence(pixels, recent=recent, before=row)
+        localized = self._map.localize_with_evidence(pixels, recent=recent, before=row, route=self._route)
         prediction = localized.prediction
-        line = prediction.as_json(self._settings["alternatives"]) | self.route_entry(prediction, row)
+        line = prediction.as_json(self._settings["alternatives"]) | self._route_entry(prediction.located)
         if (field_of_view := self._settings["field_of_view"]) is not None:
             line |= {"shift_angles": prediction.shift_angles(field_of_view)}
         return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
@@ -119,17 +119,17 @@ class _Drive:
             self._map.add_described([Entry(name, name, vector)], [features])
         return {"added": is_new}
 
-    def route_entry(self, prediction: Prediction | None, row: int | None) -> dict[str, Any]:
-        """The route's entry in the line of an image, which may have no prediction."""
-        if self._route is None:
-            return {}
-        rows = self._map.there[:row]
+    def entry_without_image(self) -> dict[str, Any]:
+        """The route's entry in the line of an image that cannot be read: the robot has moved."""
+        rows = self._map.there
         rows = rows[: max(0, len(rows) - self._settings["recent"])]
-        position = self._route(prediction, rows)
-        if position is None:
-            return {"route": None}
-        numbers = {"p": round(position.p, 4), "advance": round(position.advance, 2), "off": round(position.off, 4)}
-        return {"route": {"place": self._map.place(position.row)} | numbers}
+        return self._route_entry(self._route and self._route(None, rows))
+
+    def _route_entry(self, located: Located | None) -> dict[str, Any]:
+        if self._route is None or located is None:
+            return {} if self._route is None else {"route": None}
+        numbers = {"p": round(located.p, 4), "advance": round(located.advance, 2), "off": round(located.off, 4)}
+        return {"route": {"place": self._map.place(located.row)} | numbers}
 
 
 class _LocalizationFigures:

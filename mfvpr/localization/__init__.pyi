@@ -1,5 +1,5 @@
 __all__ = ["Alternative", "Drive", "Localization", "Located", "Map", "Prediction", "Route"]
 
 from .map import Map
-from .predictions import Alternative, Localization, Prediction
-from .route import Drive, Located, Route
+from .predictions import Alternative, Localization, Located, Prediction
+from .route import Drive, Route

@@ -22,6 +22,7 @@ from mfvpr.localization.describing import Described, Image, is_file, load
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
+from mfvpr.localization.route import Route
 from mfvpr.reranking.confidence import Confidence
 from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
@@ -141,12 +142,14 @@ class Map(MapImages):
         write_confidence(self.folder, self.system, self.confidence, data)
         return self.confidence
 
-    def localize(self, image: Image, *, recent: int = 0) -> Prediction:
+    def localize(self, image: Image, *, recent: int = 0, route: Route | None = None) -> Prediction:
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
-        return self.localize_with_evidence(image, recent=recent).prediction
+        return self.localize_with_evidence(image, recent=recent, route=route).prediction
 
     @exclusive
-    def localize_with_evidence(self, image: Image, *, recent: int = 0, before: int | None = None) -> Localization:
+    def localize_with_evidence(
+        self, image: Image, *, recent: int = 0, before: int | None = None, route: Route | None = None
+    ) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
         There is no place, and `reason` says why, for a query with too few features or matches, or no better than noise
@@ -156,6 +159,7 @@ class Map(MapImages):
             image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
             recent: number of newest rows to leave out: while a drive is added, they show the same place.
             before: rows from this one on are left out as well, as if the map ended there; None = no such limit.
+            route: of the drive that the image is the next one of; the prediction is then `located` on it.
 
         Raises:
             InputError: the map is empty, the image cannot be read, or `recent` or `before` is no number of rows.
@@ -166,7 +170,11 @@ class Map(MapImages):
         pixels, total = load(image), self._vectors.total
         description = described.describing.pixels(pixels, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
-        return self._localize(described, description, end, pixels.shape[1::-1])
+        localized = self._localize(described, description, end, pixels.shape[1::-1])
+        if route is None:
+            return localized
+        located = route(localized.prediction, self.there[:end])
+        return localized._replace(prediction=replace(localized.prediction, located=located))
 
     @exclusive
     def warm_up(self) -> None:

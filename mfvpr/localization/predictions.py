@@ -10,6 +10,21 @@ from mfvpr.types import Matches
 from mfvpr.utils.errors import InputError
 
 
+class Located(NamedTuple):
+    """The position of a robot on a route.
+
+    row: of the map, the most probable one.
+    p: probability that the robot is there or at most 2 rows away.
+    advance: mean motion from one image to the next, rows.
+    off: probability that the robot is not on the map.
+    """
+
+    row: int
+    p: float
+    advance: float
+    off: float
+
+
 @dataclass(frozen=True)
 class Alternative:
     """A candidate: the name and the place of the image in a row of the map, and its score; larger = more similar."""
@@ -36,6 +51,7 @@ class Prediction:
         scale: how much larger the candidate shows the place; None likewise.
         reason: why there is no place; None if there is one.
         image_width: of the query image, px.
+        located: position on the route, if there is one.
     """
 
     place: Any
@@ -47,6 +63,7 @@ class Prediction:
     scale: float | None
     reason: Reason | None = None
     image_width: int = 0
+    located: Located | None = None
 
     @property
     def shift_fraction(self) -> tuple[float, float] | None:
@@ -67,8 +84,9 @@ class Prediction:
         return shift, low, high
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
-        """JSON values, with at most `most` alternatives."""
+        """JSON values, with at most `most` alternatives and without the position on a route."""
         values = asdict(replace(self, alternatives=self.alternatives[:most]))
+        del values["located"]
         values["shift_fraction"] = self.shift_fraction
         for scored in (values, *values["alternatives"]):
             scored["score"] = scored["score"] if math.isfinite(scored["score"]) else None

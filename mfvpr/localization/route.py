@@ -9,13 +9,12 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.localization.predictions import Prediction
+from mfvpr.localization.predictions import Located, Prediction
 from mfvpr.reranking.drives import DEFAULT_DRIVE, Drive, DriveModel, Evidence, off_the_map
 from mfvpr.reranking.results import Ranked
 from mfvpr.types import Array
@@ -28,26 +27,11 @@ _CANDIDATES = 64  # evidence has a multiple of so many
 _ODDS, _ODDS_OF_ONE = math.log(1000), math.log(10)  # for another speed than the given one: of a warning, of an image
 
 
-class Located(NamedTuple):
-    """The position of the robot.
-
-    row: of the map, the most probable one.
-    p: probability that the robot is there or within `NEAR` rows.
-    advance: mean motion from one image to the next, rows.
-    off: probability that the robot is not on the map.
-    """
-
-    row: int
-    p: float
-    advance: float
-    off: float
-
-
 class Route:
     """The belief, updated with every image. Rows may be added to the map between two images.
 
         route = Route()
-        located = route(street.localize("query.jpg"), street.there)
+        located = street.localize("query.jpg", route=route).located
 
     `warn` is called once if the images fit another speed much better than the given one.
     """

@@ -1,6 +1,7 @@
 """A map as a program of one's own makes, opens and calibrates it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import mfvpr
 from mfvpr import InputError, Map
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.features import VladFitting
+from mfvpr.localization import Route
 from mfvpr.storage import FeatureCache
 from tests.builders import map_system
 from tests.storage.extractors import SIFT, Counted
@@ -52,6 +54,18 @@ def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(sm
     Image.new("RGB", (50, 90)).save(tmp_path / "tall.png")
     tall = mfvpr.datasets.image_folder(tmp_path)  # the map keeps its size
     assert Map.create(tmp_path / "map", tall, system).extractor.image_size == (388, 291)
+
+
+def test_an_image_is_located_on_a_route(street, small_street):
+    """The position is that of the route when it is called by itself, which sees the rows that the image sees."""
+    by_map, by_hand = Route(), Route()
+    for path in sorted((small_street / "database").iterdir())[:4]:
+        prediction = street.localize(path, route=by_map, recent=2)
+        alone = street.localize(path, recent=2)
+        assert alone.located is None
+        assert prediction == replace(alone, located=by_hand(alone, street.there[:-2]))
+        assert prediction.located is not None
+        assert "located" not in prediction.as_json()
 
 
 def test_what_is_there_is_not_added_again(street, small_street):
