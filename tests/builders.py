@@ -25,13 +25,21 @@ def evaluate_parts(dataset, extractor, retriever, scorers, *, cache=None, runtim
     return rank_dataset(dataset, system, cache=cache, runtime=runtime)
 
 
+@mfvpr.value
+class WithoutRatio:
+    """A matcher whose matches have no ratio."""
+
+    def __call__(self, features0, features1):
+        return mfvpr.match(features0, features1)
+
+
 def map_system(extractor, describer, scorer=None, candidates=50):
     """A system for a map; the describer is an extractor, or the fitting of a vocabulary.
 
     The other extractors of tests find the same features in noise: without a ratio, matches are not compared with noise.
     """
     describer = describer if isinstance(describer, Extractor) else Aggregated(extractor, describer)
-    matcher = mfvpr.NearestNeighborMatcher() if isinstance(extractor, Sift) else mfvpr.match
+    matcher = mfvpr.NearestNeighborMatcher() if isinstance(extractor, Sift) else WithoutRatio()
     pipeline = Pipeline(extractor, Retrieval(describer), matcher, candidates)
     return System(pipeline, {"histogram": mfvpr.HistogramOfShifts()} if scorer is None else {"it": scorer})
 

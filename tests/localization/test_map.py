@@ -472,7 +472,7 @@ def test_strong_features_with_few_matches_have_no_place(folder):
 def test_noise_has_no_place_whatever_the_confidence(folder, grain):
     image = noise_image((160, 120), seed=7, grain=grain)
     prediction = opened(folder, confidence=replace(SURE, bias=100.0)).localize(image)
-    assert prediction == without_place("no better than noise")
+    assert prediction == without_place("no better than noise", image)
 
 
 def test_the_strength_of_a_map_is_of_a_few_of_its_rows():

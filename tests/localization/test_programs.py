@@ -268,8 +268,9 @@ def test_a_route_goes_on_where_an_image_is_wrong_or_says_nothing(folder, small_s
     assert [line["route"]["place"] for line in lines] == NAMES
     assert all(0 < line["route"]["p"] <= 1 for line in lines)
     assert lines[-1]["route"]["advance"] == pytest.approx(1, abs=0.3)
-    _, stderr = localize(small_street / "database", "route=9")
-    assert stderr.startswith("warning: route=9: the images fit ")
+    write_confidences(tmp_path / "c.json", {"histogram": replace(SURE, bias=2.0)}, {"settings": {}})
+    _, stderr = localize(small_street / "database", "route=9", f"confidence={tmp_path}/c.json")
+    assert "warning: route=9: the images fit " in stderr
     plain, _ = localize(drive, code=2)
     assert [line.get("place") for line in plain] == places
     assert all("route" not in line and "added" not in line for line in plain)
