@@ -12,7 +12,16 @@ import numpy as np
 
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
-from mfvpr.evaluation.evidence import LEAST_STRENGTH, evidence_scores, noise_images, reason_against, strength
+from mfvpr.datasets.images import resize
+from mfvpr.evaluation.evaluation import Reason
+from mfvpr.evaluation.evidence import (
+    LEAST_STRENGTH,
+    evidence_scores,
+    noise_images,
+    reason_against,
+    reason_against_image,
+    strength,
+)  # fmt: skip
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
@@ -170,7 +179,8 @@ class Map(MapImages):
         pixels, total = load(image), self._vectors.total
         description = described.describing.pixels(pixels, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
-        localized = self._localize(described, description, end, pixels.shape[1::-1])
+        of_size = resize(pixels, self.extractor.image_size, self.extractor.interpolation)
+        localized = self._localize(described, description, end, pixels.shape[1::-1], reason_against_image(of_size))
         if route is None:
             return localized
         located = route(localized.prediction, self.there[:end])
@@ -183,7 +193,7 @@ class Map(MapImages):
         _, vector = described.describing.image(noise_image())
         rows, _ = self._vectors.nearest(vector, 1)
         for _, features in described.rows.features(rows.tolist()):  # its own best candidate: nothing is left out
-            self._localize(described, (features, vector), self._vectors.total, self.extractor.image_size)
+            self._localize(described, (features, vector), self._vectors.total, self.extractor.image_size, None)
 
     def _refresh_images(self) -> DescribedMap:
         self.refresh()
@@ -192,11 +202,13 @@ class Map(MapImages):
         return self._described
 
     def _localize(
-        self, described: DescribedMap, description: Described, end: int, size: tuple[int, int]
+        self, described: DescribedMap, description: Described, end: int, size: tuple[int, int], reason: Reason | None
     ) -> Localization:
-        """Localize a described image of (width, height) px among the rows before `end`."""
+        """Localize a described image of (width, height) px among the rows before `end`, if no reason is against it."""
         if strength(description[0]) < LEAST_STRENGTH * described.strength(end):
-            return refusal("too few features", description, size[0])
+            reason = "too few features"
+        if reason is not None:
+            return refusal(reason, description, size[0])
         matched = self._match(described, description, end, self.system.scorers)
         if matched is None:
             return refusal("no candidates", description, size[0])

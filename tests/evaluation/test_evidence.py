@@ -1,0 +1,37 @@
+"""Reasons against images, without a map."""
+
+import numpy as np
+import pytest
+
+from mfvpr.datasets.images import read_image, resize
+from mfvpr.evaluation.evidence import reason_against_image
+from mfvpr.evaluation.system import noise_image
+
+SIZES = [(320, 320), (160, 120), (512, 192)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_photographs_of_a_street_are_neither_noise_nor_overexposed(small_street, size):
+    for path in sorted((small_street / "queries").iterdir()):
+        image = resize(read_image(path), size)
+        assert reason_against_image(image) is None
+        assert reason_against_image(image // 16) is None  # dark
+        assert reason_against_image(np.clip(image.astype(int) * 64, 0, 255).astype(np.uint8)) == "overexposed"
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("deviation", [2, 40, 200])
+def test_noise_of_any_strength_is_noise(size, deviation):
+    rng = np.random.default_rng(0)
+    for grain in (1, 2):
+        image = noise_image(size, seed=3, grain=grain).astype(float)
+        image = 128 + deviation * (image - 128) / 128
+        assert reason_against_image(np.clip(image, 0, 255).astype(np.uint8)) == "no better than noise"
+    gray = np.clip(128 + deviation * rng.normal(size=(*size[::-1], 1)), 0, 255).astype(np.uint8)
+    assert reason_against_image(np.repeat(gray, 3, axis=2)) == "no better than noise"
+
+
+def test_plain_images_are_left_to_the_other_tests():
+    assert reason_against_image(np.full((48, 64, 3), 128, np.uint8)) is None
+    assert reason_against_image(np.full((48, 64, 3), 255, np.uint8)) == "overexposed"
+    assert reason_against_image(np.zeros((2, 2, 3), np.uint8)) is None
