@@ -11,7 +11,7 @@ from mfvpr.reranking.results import Ranked
 from mfvpr.reranking.sequences import LAG, DriveFilter, follow
 from mfvpr.utils import InputError
 
-SPEEDS = (-1, 1)
+SPEEDS = (-1, 1, 2)
 
 
 def next_speeds(speed, speeds):
