@@ -1,8 +1,8 @@
 """The least evidence for a prediction: enough keypoints, enough matches, and a better score than noise has.
 
 A confidence compares the scores of one query with each other, so a black image can look certain. The tests here are
-absolute. An image is noise if its brightness at points near to each other has nothing in common, and overexposed if
-most of it is white. The strength of an image is the sum of its detection scores; the strength of a query is compared
+absolute. An image is noise if its brightness at points near to each other has nothing in common, blurred if it is nearly
+the same there, and overexposed if most of the image is white. The strength of an image is the sum of its detection scores; the strength of a query is compared
 with the mean strength of the database images. The score of a query with its best candidate, a histogram of shifts
 weighted by ratio, is compared with the best scores of a few images of random pixels in the same database.
 
@@ -34,7 +34,9 @@ from mfvpr.types import Features, Matches
 
 # Round numbers. The first two were chosen with two real sets in view, a park path and a corridor: results on those sets
 # are no independent test. The last was chosen on synthetic streets and the park path.
-_LEAST_CORRELATION = 0.3  # of brightness at an 80th of the image's side; streets have at least 0.64, noise at most 0.19
+# Of brightness at an 80th of the image's side, chosen on synthetic streets: noise has at most 0.19, streets have 0.64 to
+# 0.94, and streets that are blurred over 8 % of the width at least 0.97.
+_LEAST_CORRELATION, _MOST_CORRELATION = 0.3, 0.97
 _MOST_WHITE = 0.6  # share of the image
 LEAST_STRENGTH = 0.05  # of the mean strength of the database images
 LEAST_MATCHES = 8  # of a query with its best candidate
@@ -50,8 +52,10 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     brightness = pixels.mean(axis=2)
     rows, columns = (max(1, round(side / 80)) for side in brightness.shape)
     pairs = (brightness[rows:], brightness[:-rows]), (brightness[:, columns:], brightness[:, :-columns])
-    is_noise = min(_correlation(*pair) for pair in pairs) < _LEAST_CORRELATION
-    return "no better than noise" if is_noise else None
+    correlation = np.min([_correlation(*pair) for pair in pairs])
+    if correlation < _LEAST_CORRELATION:
+        return "no better than noise"
+    return "blurred" if correlation > _MOST_CORRELATION else None
 
 
 def _reason_against_image(images: ImageFolder, row: int, extractor: Extractor | Source) -> Reason | None:
@@ -61,9 +65,9 @@ def _reason_against_image(images: ImageFolder, row: int, extractor: Extractor | 
 
 
 def _correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of two images of one size; 1 if one of them is plain."""
+    """Correlation of two images of one size; NaN if one of them is plain."""
     deviations = first.std() * second.std()
-    return float(np.mean((first - first.mean()) * (second - second.mean())) / deviations) if deviations else 1.0
+    return float(np.mean((first - first.mean()) * (second - second.mean())) / deviations) if deviations else np.nan
 
 
 def strength(features: Features) -> float:

@@ -1,5 +1,6 @@
 """Reasons against images, without a map."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ def test_photographs_of_a_street_are_neither_noise_nor_overexposed(small_street,
         image = resize(read_image(path), size)
         assert reason_against_image(image) is None
         assert reason_against_image(image // 16) is None  # dark
+        assert reason_against_image(cv2.blur(image, (size[0] // 10, size[1] // 10))) == "blurred"
         assert reason_against_image(np.clip(image.astype(int) * 64, 0, 255).astype(np.uint8)) == "overexposed"
 
 
