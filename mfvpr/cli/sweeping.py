@@ -1,20 +1,20 @@
 """Sweep: matches -> scores of all settings -> the best setting, and its recall on other queries."""
 
 import shutil
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
+from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints, readings
+from mfvpr.evaluation import EvaluationProtocol
 from mfvpr.report import sweeps
-from mfvpr.reranking.results import Ranked
 from mfvpr.reranking.sequences import DriveFilter, Method
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
+from mfvpr.tuning.sweeps.rankings import DriveRanking
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
@@ -32,7 +32,7 @@ def sweep(settings: dict[str, Any]) -> None:
         blocks = _block_folder(settings, inputs)
         options = SweepOptions(
             settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
-            _sequence(settings["sequence"], len(inputs.dataset.database)), settings["chunk"]["settings"],
+            _sequence(settings["sequence"], inputs.dataset, protocol), settings["chunk"]["settings"],
             settings["chunk"]["queries"], blocks, inputs.cache.runtime,
         )  # fmt: skip
         with watch("sweep"):
@@ -53,9 +53,10 @@ def sweep(settings: dict[str, Any]) -> None:
         shutil.rmtree(blocks, ignore_errors=True)
 
 
-def _sequence(method: Method | None, num_rows: int) -> Callable[[Ranked], Ranked] | None:
+def _sequence(method: Method | None, dataset: Dataset, protocol: EvaluationProtocol) -> DriveRanking | None:
     """The ranking of a drive's queries by a method."""
-    return None if method is None else partial(DriveFilter(method), num_rows=num_rows)
+    of_data = len(dataset.database), dataset.only.excluded, protocol.halves
+    return None if method is None else DriveRanking(DriveFilter(method), *of_data)
 
 
 def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:

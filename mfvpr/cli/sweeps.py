@@ -1,23 +1,23 @@
 """Sweeps of the parameters of a system, for users of the library; `sweeping` is the program."""
 
 import json
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets import Dataset
-from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
+from mfvpr.evaluation import EvaluationProtocol, Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.protocol import Split
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.runs import LAST
 from mfvpr.report.sweeps import Sweep, axes_json
-from mfvpr.reranking.results import RETRIEVAL, Ranked
+from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import numbers_by_name, static_names
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
+from mfvpr.tuning.sweeps.rankings import DriveRanking
 from mfvpr.utils import InputError, Runtime
 
 
@@ -67,7 +67,7 @@ def sweep(
     runtime = runtime or cache.runtime
     kind = system.fused[name].retrieval_score if name in system.fused else "cosine"
     options = SweepOptions(
-        ties=system.ties, retrieval_score=kind, sequence=_sequence(system, len(dataset.database)),
+        ties=system.ties, retrieval_score=kind, sequence=_sequence(system, dataset, protocol),
         folder=_block_folder(out, swept), runtime=runtime,
     )  # fmt: skip
     matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=runtime)
@@ -97,12 +97,13 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
                      "mfvpr.System(system.pipeline, {name: scorer})")  # fmt: skip
 
 
-def _sequence(system: System, num_rows: int) -> Callable[[Ranked], Ranked] | None:
-    """The only sequence of the ranking that decides, for a database of so many rows."""
+def _sequence(system: System, dataset: Dataset, protocol: EvaluationProtocol) -> DriveRanking | None:
+    """The only sequence of the ranking that decides."""
     filters = system.sequences.get(system.headline, ())
     if len(filters) > 1:
         raise InputError(f"sequences: expected at most one of {system.headline}, got {len(filters)}; sweep each")
-    return partial(filters[0], num_rows=num_rows) if filters else None
+    of_data = len(dataset.database), dataset.only.excluded, protocol.halves
+    return DriveRanking(filters[0], *of_data) if filters else None
 
 
 def _block_folder(out: Path | str | None, axes: Axes) -> Path | None:

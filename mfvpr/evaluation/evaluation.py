@@ -159,8 +159,11 @@ def rank_dataset(
         strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
     scored = [_score(dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
     ways = system.final_scores.values(), system.ties
-    options = {"hubness": strengths, "num_rows": size}
-    ranked = [rank_by_scores(matched.candidates, scores, *ways, **options) for matched, scores in scored]
+    ranked = []
+    for matched, scores in scored:
+        excluded = matched.sequence.excluded if system.sequences else None
+        options = {"num_rows": size, "excluded": None if excluded is None else excluded.dense()}
+        ranked.append(rank_by_scores(matched.candidates, scores, *ways, hubness=strengths, **options))
     matched = [sequence for sequence, _ in scored]
     for line in score_warnings(matched, ranked, system.scorers):
         cache.warn(line)

@@ -1,10 +1,11 @@
 """The least evidence for a prediction: enough keypoints, enough matches, and a better score than noise has.
 
 A confidence compares the scores of one query with each other, so a black image can look certain. The tests here are
-absolute. An image is noise if its brightness at points near to each other has nothing in common, blurred if it is nearly
-the same there, and overexposed if most of the image is white. The strength of an image is the sum of its detection scores; the strength of a query is compared
-with the mean strength of the database images. The score of a query with its best candidate, a histogram of shifts
-weighted by ratio, is compared with the best scores of a few images of random pixels in the same database.
+absolute. An image is noise if its brightness at points near to each other has nothing in common, blurred if it is
+nearly the same there, and overexposed if most of the image is white. The strength of an image is the sum of its
+detection scores; the strength of a query is compared with the mean strength of the database images. The score of a
+query with its best candidate, a histogram of shifts weighted by ratio, is compared with the best scores of a few images
+of random pixels in the same database.
 
 The tests refuse lens caps, plain images, very dark, blurred or overexposed images, and noise. They do not refuse images
 of places that the database does not show.
@@ -34,8 +35,8 @@ from mfvpr.types import Features, Matches
 
 # Round numbers. The first two were chosen with two real sets in view, a park path and a corridor: results on those sets
 # are no independent test. The last was chosen on synthetic streets and the park path.
-# Of brightness at an 80th of the image's side, chosen on synthetic streets: noise has at most 0.19, streets have 0.64 to
-# 0.94, and streets that are blurred over 8 % of the width at least 0.97.
+# Of brightness at an 80th of the image's side, chosen on synthetic streets: noise has at most 0.19, streets have from
+# 0.64 to 0.94, and streets that are blurred over 8 % of the width at least 0.97.
 _LEAST_CORRELATION, _MOST_CORRELATION = 0.3, 0.97
 _MOST_WHITE = 0.6  # share of the image
 LEAST_STRENGTH = 0.05  # of the mean strength of the database images
@@ -52,10 +53,10 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     brightness = pixels.mean(axis=2)
     rows, columns = (max(1, round(side / 80)) for side in brightness.shape)
     pairs = (brightness[rows:], brightness[:-rows]), (brightness[:, columns:], brightness[:, :-columns])
-    correlation = np.min([_correlation(*pair) for pair in pairs])
-    if correlation < _LEAST_CORRELATION:
+    correlations = np.array([_correlation(*pair) for pair in pairs])
+    if (correlations < _LEAST_CORRELATION).all():
         return "no better than noise"
-    return "blurred" if correlation > _MOST_CORRELATION else None
+    return "blurred" if (correlations > _MOST_CORRELATION).all() else None
 
 
 def _reason_against_image(images: ImageFolder, row: int, extractor: Extractor | Source) -> Reason | None:

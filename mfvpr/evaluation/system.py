@@ -119,6 +119,9 @@ class System:
         require_word("ties", self.ties, Ties)
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
+        if isinstance(self.final_scores[self.headline].step, DriveFilter):
+            raise InputError(f"final={self.final!r}: a sequence cannot decide, as its first row may be no candidate; "
+                             "it is ranked beside the score that decides")  # fmt: skip
         for name, scorer in self.scorers.items():
             is_class = isinstance(scorer, type)
             if is_class or not callable(scorer):
@@ -179,7 +182,7 @@ def noise_image(
 
 def _with_part(whole: Any, part: Any, new: Any) -> Any:
     """A dataclass of parts, in which a part is replaced wherever it is."""
-    if whole is part:
+    if whole is part or (type(whole) is type(part) and whole == part):
         return new
     if not is_dataclass(whole) or isinstance(whole, type):
         return whole

@@ -17,6 +17,7 @@ from mfvpr.utils.files import write_text
 
 LEARNING = "learning"  # the folder of features that a vocabulary is being learned from
 _FILE, _FORMAT = "settings.json", "mfvpr map 1"
+_ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
 _GROUPS = ("features", "retrieval", "matching", "scorer", "candidates")
 _SCORE_ALONE = {"fusion": {"c": "auto", "weights": None, "retrieval_score": "cosine"}, "final": "score",
                 "ties": "retrieval"}  # what a map means whose file lacks these  # fmt: skip
@@ -58,6 +59,9 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
         return system
     if system.settings is not None and (folder / _FILE).exists():
         width, height = read_declaration(folder)["features"]["image_size"]
+        if not 1 / _ABOUT < width * height / system.pipeline.pixels < _ABOUT:
+            raise InputError(f"{folder}: this map was made with images of {width} x {height} px; expected "
+                             f"features.image_size=[{width},{height}], got {system.pipeline.pixels} pixels")  # fmt: skip
         return system.with_image_size((width, height))
     if images is None:
         raise InputError("image_size: expected the images of a new map, whose shape decides, got none. Use "

@@ -173,6 +173,8 @@ class Map(MapImages):
         Raises:
             InputError: the map is empty, the image cannot be read, or `recent` or `before` is no number of rows.
         """
+        if not isinstance(route, Route | None):
+            raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
         recent = _whole_number("recent", recent)
         before = None if before is None else _whole_number("before", before)
         described = self._refresh_images()

@@ -37,6 +37,8 @@ class Route:
     """
 
     def __init__(self, drive: Drive = DEFAULT_DRIVE, *, warn: Callable[[str], object] = warnings.warn) -> None:
+        if not isinstance(drive, Drive):
+            raise InputError(f"Route: expected Drive(...), got {drive!r}")
         self._drive, self._warn, self._filter, self._lead = drive, warn, _Filter(drive), 0.0
         self._other = None if drive.advance is None else _Filter(replace(drive, advance=None))
 

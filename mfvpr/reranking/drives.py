@@ -15,6 +15,7 @@ or shows nothing of the map.
 """
 
 import math
+import sys
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -68,6 +69,8 @@ class Drive:
 
     def __post_init__(self) -> None:
         advance = self.advance or 0.0
+        if wrong := [value for value in vars(self).values() if not isinstance(value, int | float | None)]:
+            raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
         if not (abs(advance) <= _MOST_ROWS and 1 / _MOST_ROWS <= self.spread <= _MOST_SPREAD):
             raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected at most {_MOST_ROWS} "
                              f"rows, and a spread from {1 / _MOST_ROWS:g} to {_MOST_SPREAD}")  # fmt: skip
@@ -144,7 +147,7 @@ class DriveModel:
     def before(self, later: Float[Array, "speeds rows"], here: Float[Array, " rows"]) -> Float[Array, "speeds rows"]:
         """Relative probabilities of an image and those after it, by the state at the image before."""
         seen = self._seen_from_before(later * here[None])
-        return seen / seen.max()
+        return jnp.where(seen.max() > 0, seen / jnp.where(seen.max() > 0, seen.max(), 1.0), 1.0)
 
     def likelihood(self, evidence: Evidence) -> Float[Array, " rows"]:
         """Likelihood of an image at each row, relative to that of an image that shows nothing of the map."""
@@ -158,9 +161,9 @@ class DriveModel:
         return jnp.where(self.there & (total > 0), self.correct * evidence.odds * relative + 1 - self.correct, 1.0)
 
     def normalize(self, belief: Float[Array, "speeds rows"]) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
-        """A belief of total 1, and its total before."""
+        """A belief of total 1, and its total before; if images and motion exclude each other, nothing is known."""
         total = self._total(belief)
-        return belief / total, total
+        return jnp.where(total > 0, belief / jnp.where(total > 0, total, 1.0), self.anywhere), total
 
     def by_row(self, belief: Float[Array, "speeds rows"]) -> Float[Array, " rows"]:
         """Probabilities of the rows at any speed."""
@@ -252,4 +255,4 @@ def off_the_map(drive: Drive, off: float, chance: float) -> float:
     `chance` is the probability of the image on the map, relative to an image that shows nothing of it.
     """
     moved = off * (1 - drive.returns) + (1 - off) * drive.leaves
-    return moved / (moved + (1 - moved) * chance)
+    return moved / max(moved + (1 - moved) * chance, sys.float_info.min)

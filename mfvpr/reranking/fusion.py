@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mfvpr.reranking.cohort_normalization import by_hubness
 from mfvpr.reranking.ranking import (
@@ -184,6 +184,8 @@ def final_scores(
     for name, correlation in correlated.items():
         add_step("correlated", name, FRAMES, correlation)
     for name, filters in sequences.items():
+        if not isinstance(filters, list | tuple) or not all(isinstance(each, DriveFilter) for each in filters):
+            raise InputError(f"sequences: expected a list of DriveFilter(...) for {name}, got {filters!r}")
         for each in filters:
             add_step("sequences", name, each.name, each)
     return known
@@ -192,11 +194,12 @@ def final_scores(
 def rank_by_scores(
     candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
     hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None, num_rows: int = 0,
+    excluded: Bool[np.ndarray, "queries database"] | None = None,
 ) -> dict[str, Ranked]:  # fmt: skip
     """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
 
     `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. Sequences need
-    `num_rows`, the number of images in the database.
+    `num_rows`, the number of images in the database, and the images of it that are `excluded` for each query.
     """
     known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
     rankings: dict[str, Ranked] = {}
@@ -210,7 +213,7 @@ def rank_by_scores(
             case FrameCorrelation() as correlation:
                 known[score.name] = correlation(candidates, known[base])
             case DriveFilter() as drive_filter:
-                rankings[score.name] = drive_filter(rankings[base], num_rows)
+                rankings[score.name] = drive_filter(rankings[base], num_rows, excluded)
         if score.name not in rankings:
             rankings[score.name] = _rank(candidates, known[score.name], ties)
     return rankings

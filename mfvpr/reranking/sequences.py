@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.reranking.drives import DEFAULT_DRIVE, Drive, DriveModel, Evidence, off_the_map
 from mfvpr.reranking.results import SEQUENCE, Ranked
 from mfvpr.types import Array
-from mfvpr.utils.errors import require_word
+from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import compiled
 
 Method = Literal["causal", "lagged", "smoothed", "viterbi"]
@@ -46,25 +46,41 @@ class DriveFilter:
 
     def __post_init__(self) -> None:
         require_word("method", self.method, Method)
+        if not isinstance(self.drive, Drive):
+            raise InputError(f"drive: expected Drive(...), got {self.drive!r}")
 
     @property
     def name(self) -> str:
         """Its part in the name of a ranking, such as `causal sequence`."""
         return f"{self.method} {SEQUENCE}"
 
-    def __call__(self, ranked: Ranked, num_rows: int) -> Ranked:
+    def __call__(
+        self, ranked: Ranked, num_rows: int, excluded: Bool[np.ndarray, "queries rows"] | None = None
+    ) -> Ranked:
         """Rank all rows of the database, from rankings of the queries in their order; as many rows as candidates.
 
         Scores are probabilities of the rows, small if the query seems to show a place that is not in the database. With
-        "viterbi", those of a query are relative to the best path's.
+        "viterbi", those of a query are relative to the best path's. Rows that a query has in `excluded` are not ranked.
         """
-        followed = follow(Evidence.of(ranked), self.drive, np.ones(num_rows, bool), self.method)
-        return Ranked(np.asarray(followed.rows), np.asarray(followed.p) * (1 - followed.off[:, None]))
+        size = ranked.rows.shape[1]
+        left_out = 0 if excluded is None else int(excluded.sum(axis=1).max(initial=0))
+        followed = follow(Evidence.of(ranked), self.drive, np.ones(num_rows, bool), self.method, size + left_out)
+        rows, p = followed.rows, followed.p * (1 - followed.off[:, None])
+        if excluded is None:
+            return Ranked(rows, p)
+        is_left_out = np.take_along_axis(excluded, rows, axis=1)
+        order = np.argsort(is_left_out, axis=1, kind="stable")[:, :size]
+        values = np.where(is_left_out, -1, rows), np.where(is_left_out, np.nan, p)
+        return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
 
 
-def follow(evidence: Evidence, drive: Drive, there: Bool[np.ndarray, " rows"], method: Method = "causal") -> Followed:
-    """Rows of each image of a drive, as many as there are candidates; see `DriveFilter`."""
-    (images, candidates), depth = evidence.rows.shape, min(evidence.rows.shape[1], len(there))
+def follow(
+    evidence: Evidence, drive: Drive, there: Bool[np.ndarray, " rows"], method: Method = "causal",
+    depth: int | None = None,
+) -> Followed:  # fmt: skip
+    """The first `depth` rows of each image of a drive, None = as many as candidates; see `DriveFilter`."""
+    images, candidates = evidence.rows.shape
+    depth = min(candidates if depth is None else depth, len(there))
     if not images or not depth:
         return Followed(np.full((images, candidates), -1), np.zeros((images, candidates)), np.zeros(images))
     model = DriveModel.of(drive, there)

@@ -25,8 +25,8 @@ _POSITIVE = number(1e-6, 1e12)
 _NOT_NEGATIVE = number(0, 1e12)
 _COUNT = whole(1, 10**6)
 _INDEX = whole(0, 10**6)
-_SIDE_LEAST, _SIDE_MOST = 16, 4096
-_SIDE = whole(_SIDE_LEAST, _SIDE_MOST)
+_SIDE_MOST, _LEAST_PIXELS = 4096, 10_000  # fewer pixels are a side that was meant
+_SIDE = whole(16, _SIDE_MOST)
 _ANY_SHAPE = ("sift", "aliked", "d2net")  # features of images of any shape
 _TEXT = pattern(r"(?s).+", "text")
 _PATH = pattern(r"(?s)(?!.*\$\{).+", "a path, with names of variables filled in (double quotes let the shell do that)")
@@ -83,9 +83,9 @@ RULES: dict[str, Rule] = {
         "ks": list_of(_COUNT),
         "image_size": list_of(_SIDE, 2),
         "features.image_size": any_of(
-            "[width, height], each a whole number from 16 to 4096, or auto, a number of pixels, or null",
+            "[width, height], each a whole number from 16 to 4096, or auto, a number of pixels from 10000, or null",
             list_of(_SIDE, 2),
-            whole(_SIDE_LEAST**2, _SIDE_MOST**2),
+            whole(_LEAST_PIXELS, _SIDE_MOST**2),
             one_of("auto", None),
         ),
         "bits": either(whole(8, 16), None),

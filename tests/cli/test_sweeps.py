@@ -10,7 +10,7 @@ import pytest
 import mfvpr
 from mfvpr.evaluation import statistics
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.reranking import DriveFilter, Fusion
+from mfvpr.reranking import DriveFilter, Fusion, Ranked
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import rankings
@@ -75,6 +75,23 @@ def test_a_sequence_ranks_as_in_an_evaluation(dataset, method):
     twice = replace(fused, sequences={"mine + retrieval": (DriveFilter(method), DriveFilter("lagged"))})
     with pytest.raises(mfvpr.InputError, match=r"at most one of mine \+ retrieval, got 2"):
         mfvpr.sweep(dataset, twice, cache=cache, sigma=[5])
+
+
+def test_choosing_for_a_sequence_sees_nothing_of_the_reported_half(dataset):
+    """Other scores of the queries that are reported on change no row that is chosen by."""
+    sift, cache, number = Sift(), FeatureCache(), len(dataset.queries)
+    pipeline = mfvpr.Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+    system = mfvpr.System(pipeline, {"mine": MyScorer()}, sequences={"mine": [DriveFilter("smoothed")]})
+    swept = mfvpr.sweep(dataset, system, cache=cache, sigma=[5, 22.5], split="both", thresholds=[1])
+    rng, protocol = np.random.default_rng(0), swept.outcome.protocol
+    rows, scores = np.tile(np.arange(number), (number, 1)), rng.uniform(size=(number, number))
+    ranking = rankings.DriveRanking(DriveFilter("smoothed"), number, halves=protocol.halves)
+    for view, half in enumerate(protocol.halves, start=1):
+        assert np.isin(swept.outcome.rows[view][:, half.tune], [-1, *np.flatnonzero(half.allowed)]).all()
+        others = scores.copy()
+        others[half.report] = rng.uniform(size=(len(half.report), number))
+        first, second = (ranking.rows(Ranked(rows, each), view)[half.tune] for each in (scores, others))
+        np.testing.assert_array_equal(first, second)
 
 
 def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, monkeypatch, tmp_path):

@@ -33,6 +33,12 @@ def test_noise_of_any_strength_is_noise(size, deviation):
     assert reason_against_image(np.repeat(gray, 3, axis=2)) == "no better than noise"
 
 
+def test_a_fence_is_no_noise():
+    image = np.zeros((320, 320, 3), np.uint8)
+    image[:, (np.arange(320) // 5) % 2 == 0] = 60
+    assert reason_against_image(image) is None
+
+
 def test_plain_images_are_left_to_the_other_tests():
     assert reason_against_image(np.full((48, 64, 3), 128, np.uint8)) is None
     assert reason_against_image(np.full((48, 64, 3), 255, np.uint8)) == "overexposed"

@@ -13,7 +13,7 @@ from mfvpr.datasets import FrameTruth, image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
 from mfvpr.matching import NearestNeighborMatcher
-from mfvpr.reranking import FrameCorrelation, Fusion
+from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
 from mfvpr.types import Shortlist
@@ -86,6 +86,8 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"ties": "indx"}, "ties='indx': expected one of retrieval, index"),
         ({"candidates": True}, "candidates=True: expected"),
         ({"fused": {"nope": Fusion()}}, r"fused: .*\(histogram\), got nope"),
+        ({"sequences": {"histogram": DriveFilter()}}, r"sequences: expected a list of DriveFilter"),
+        ({"sequences": {"histogram": [DriveFilter()]}, "final": "histogram + causal sequence"}, "cannot decide"),
         ({"correlated": {"retrieval": FRAMES}}, r"correlated: .*\(histogram\), got retrieval"),
         ({"scorers": HISTOGRAM | {"histogram + frames": mfvpr.MatchCount()}, "correlated": {"histogram": FRAMES}},
          r"histogram \+ frames .*system"),

@@ -122,7 +122,7 @@ def random_rankings(number, size, seed=0):
 def test_a_lagged_row_is_the_smoothed_one_of_a_drive_that_ends_there():
     ranked, evidence = random_rankings(12, 30), Evidence.of(random_rankings(12, 30))
     lagged = follow(evidence, Drive(), np.ones(30, bool), "lagged")
-    for image in (0, 3, 6, 11):
+    for image in (3, 11):
         seen = Ranked(ranked.rows[: image + LAG + 1], ranked.scores[: image + LAG + 1])
         smoothed = follow(Evidence.of(seen), Drive(), np.ones(30, bool), "smoothed")
         assert lagged.rows[image].tolist() == smoothed.rows[image].tolist()
@@ -170,6 +170,31 @@ def test_images_without_candidates_say_nothing():
     assert DriveFilter("viterbi")(Ranked(rows[:1], scores[:1]), 3).rows.shape == (1, 3)
 
 
-def test_unknown_methods():
+@pytest.mark.parametrize("method", ["causal", "smoothed"])
+def test_excluded_rows_are_not_ranked(method):
+    ranked, excluded = drive_of(np.arange(30), 40, True), np.abs(np.arange(30)[:, None] - np.arange(40)) <= 2
+    every, sequence = DriveFilter(method)(ranked, 40), DriveFilter(method)(ranked, 40, excluded)
+    assert sequence.rows.shape == (30, 20)
+    for query in range(30):
+        left = every.rows[query][np.abs(every.rows[query] - query) > 2]
+        assert sequence.rows[query, : len(left)].tolist() == left.tolist()
+        assert (np.abs(sequence.rows[query] - query) > 2).all()
+    nothing = DriveFilter(method)(ranked, 40, np.ones((30, 40), bool))
+    assert (nothing.rows == -1).all()
+    assert np.isnan(nothing.scores).all()
+
+
+@pytest.mark.parametrize("method", ["causal", "lagged", "smoothed", "viterbi"])
+def test_a_drive_that_excludes_its_images_gives_numbers(method):
+    drive = Drive(advance=8, spread=0.1, kidnapped=0.0, leaves=0.0, correct=1.0)
+    result = DriveFilter(method, drive)(drive_of(np.arange(30), 40, True), 40)
+    assert np.isfinite(result.scores).all()
+
+
+def test_wrong_arguments_are_one_line():
     with pytest.raises(InputError, match="method"):
         DriveFilter("best")
+    with pytest.raises(InputError, match=r"drive: expected Drive\(...\), got 0.5"):
+        DriveFilter("causal", 0.5)
+    with pytest.raises(InputError, match="expected numbers, got 'slow'"):
+        Drive(advance="slow")

@@ -8,7 +8,7 @@ block.
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,12 +19,15 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation.selection import Half
 from mfvpr.evaluation.validation import require_finite
 from mfvpr.matching.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
 from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
 from mfvpr.reranking.results import Ranked
+from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.scoring.scorer import check_host, on_host
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, group_by_program
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
@@ -41,6 +44,32 @@ _MEASURED = 64  # settings x batches: less work is done before its time is measu
 
 
 @dataclass(frozen=True)
+class DriveRanking:
+    """A drive filter for the queries of a sweep, and what it needs of their data set.
+
+    `halves` are those that the views after the first are of: of a half, only the queries to choose on are ranked, among
+    the rows that choosing may see.
+    """
+
+    drive_filter: DriveFilter
+    num_rows: int
+    excluded: Positives | None = None
+    halves: Sequence[Half] = ()
+
+    def rows(self, ranked: Ranked, view: int) -> Int[np.ndarray, "queries candidates"]:
+        """Rows of a view's rankings, -1 where none are ranked."""
+        shape = len(ranked.rows), self.num_rows
+        excluded = np.zeros(shape, bool) if self.excluded is None else self.excluded.dense()
+        if not view:
+            return self.drive_filter(ranked, self.num_rows, excluded).rows
+        half, rows = self.halves[view - 1], np.full_like(ranked.rows, -1)
+        excluded, tuned = excluded[half.tune] | ~half.allowed, Ranked(ranked.rows[half.tune], ranked.scores[half.tune])
+        ranking = self.drive_filter(tuned, self.num_rows, excluded).rows
+        rows[half.tune, : ranking.shape[1]] = ranking
+        return rows
+
+
+@dataclass(frozen=True)
 class SweepOptions:
     """Options of a sweep. Only `ks`, `ties`, `retrieval_score` and `sequence` change its results.
 
@@ -48,8 +77,8 @@ class SweepOptions:
         ks: depths of the recall; the largest is the number of rows of a ranking.
         ties: see `mfvpr.reranking.ranking.rank_shortlist`.
         retrieval_score: see `mfvpr.reranking.ranking.retrieval_scores`.
-        sequence: ranks the queries of a drive together, from their rankings by a setting, such as a `DriveFilter` with
-            its number of rows; then blocks have all queries. None = each query alone.
+        sequence: ranks the queries of a drive together, from their rankings by a setting; then blocks have all queries.
+            None = each query alone.
         settings_per_block: None = 64.
         queries_per_block: None = as many as fit into 256 MB.
         folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
@@ -62,7 +91,7 @@ class SweepOptions:
     ks: Sequence[int] = (1, 5, 10)
     ties: Ties = "retrieval"
     retrieval_score: RetrievalScore = "cosine"
-    sequence: Callable[[Ranked], Ranked] | None = None
+    sequence: DriveRanking | None = None
     settings_per_block: int | None = None
     queries_per_block: int | None = None
     folder: Path | None = None
@@ -129,7 +158,8 @@ class Block:
         """Hash of everything that determines the rows: matches and shortlist, the scorer's program and numbers."""
         group, options = self.group, self.part.options
         names = [*group.settings, *group.weightings]
-        of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence, list(map(repr, self.cs))
+        drives = options.sequence and content_hash(repr(options.sequence.drive_filter), vars(options.sequence))
+        of_rows = max(options.ks), options.ties, options.retrieval_score, drives, list(map(repr, self.cs))
         numbers = group.scorer, dict(group.settings), dict(group.weightings)
         return content_hash(repr((*of_rows, group.rows.tolist(), names)), group.program, self.part.digest, numbers)
 
@@ -156,11 +186,11 @@ class Block:
         _, first = np.unique(group.rows, return_index=True)
         scores = scores[:, np.sort(first)]
 
-        def first_rows(view: np.ndarray) -> np.ndarray:
+        def first_rows(number: int, view: np.ndarray) -> np.ndarray:
             fused = np.repeat(fuse_all(part.match_set, scores, view), self.repeats, axis=0)
-            return _first_rows(part, fused, self.cs, view)
+            return _first_rows(part, fused, self.cs, number)
 
-        return np.stack([first_rows(view) for view in part.views])
+        return np.stack([first_rows(*view) for view in enumerate(part.views)])
 
 
 def rank_settings(
@@ -279,8 +309,9 @@ def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array])
     return grids.score_settings(scorer, matches, *values)
 
 
-def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndarray) -> np.ndarray:
-    """Database rows `[W, q, depth]` by scores `[W, q, C]`, each setting fused with its own c."""
+def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], number: int) -> np.ndarray:
+    """Database rows `[W, q, depth]` by scores `[W, q, C]` of a view, each setting fused with its own c."""
+    view = part.views[number]
     indices, by_retrieval = part.candidates.indices, retrieval_scores(part.candidates, part.options.retrieval_score)
     rows = np.full((*scores.shape[:2], max(part.options.ks)), -1, np.int32)
     kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
@@ -293,7 +324,7 @@ def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], view: np.ndar
         ranked = np.where(np.take_along_axis(view[None], order, -1), np.take_along_axis(indices[None], order, -1), -1)
         if (sequence := part.options.sequence) is not None:
             pairs = zip(ranked, np.take_along_axis(final, order, -1), strict=True)
-            ranked = np.stack([sequence(Ranked(*pair)).rows for pair in pairs])
+            ranked = np.stack([sequence.rows(Ranked(*pair), number) for pair in pairs])
         ranked = ranked[..., : max(part.options.ks)]
         rows[members, :, : ranked.shape[-1]] = ranked
     return rows
