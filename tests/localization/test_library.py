@@ -54,7 +54,7 @@ def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(sm
     Image.new("RGB", (50, 90)).save(tmp_path / "tall.png")
     tall = mfvpr.datasets.image_folder(tmp_path)  # the map keeps its size
     assert Map.create(tmp_path / "map", tall, system).extractor.image_size == (388, 291)
-    with pytest.raises(InputError, match=r"made with images of 388 x 291 px; .* got 20000 pixels"):
+    with pytest.raises(InputError, match=r"made with images of 388 x 291 px, got 20000 pixels"):
         Map(tmp_path / "map", small("steering", features={"max_keypoints": 60, "image_size": 20000}))
 
 
