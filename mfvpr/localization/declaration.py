@@ -60,8 +60,8 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
     if system.settings is not None and (folder / _FILE).exists():
         width, height = read_declaration(folder)["features"]["image_size"]
         if not 1 / _ABOUT < width * height / system.pipeline.pixels < _ABOUT:
-            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got "
-                             f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}].")  # fmt: skip
+            got = f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}]."
+            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got {got}")
         return system.with_image_size((width, height))
     if images is None:
         raise InputError("image_size: expected the images of a new map, whose shape decides, got none. Use "

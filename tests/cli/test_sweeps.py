@@ -88,9 +88,9 @@ def test_choosing_for_a_sequence_sees_nothing_of_the_reported_half(dataset):
     ranking = rankings.DriveRanking(DriveFilter("smoothed"), number, halves=protocol.halves)
     for view, half in enumerate(protocol.halves, start=1):
         assert np.isin(swept.outcome.rows[view][:, half.tune], [-1, *np.flatnonzero(half.allowed)]).all()
-        others = scores.copy()
-        others[half.report] = rng.uniform(size=(len(half.report), number))
-        first, second = (ranking.rows(Ranked(rows, each), view)[half.tune] for each in (scores, others))
+        changed = scores.copy()
+        changed[half.report] = rng.uniform(size=(len(half.report), number))
+        first, second = (ranking.rows(Ranked(rows, each), view)[half.tune] for each in (scores, changed))
         np.testing.assert_array_equal(first, second)
 
 

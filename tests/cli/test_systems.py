@@ -55,7 +55,7 @@ def test_a_run_records_the_size_that_the_images_decide(tmp_path):
 
 @pytest.mark.parametrize(("size", "words"), [
     ("auto", "expected .width, height. for features=selavpr; other values are for sift, aliked, d2net"),
-    (100, "expected .width, height., each a whole number from 16 to 4096, or auto, a number of pixels, or null"),
+    (336, "expected .width, height., each a whole number .* or auto, a number of pixels from 10000, or null"),
 ])  # fmt: skip
 def test_image_sizes_that_are_none(size, words):
     with pytest.raises(InputError, match=f"^features.image_size={size}: {words}"):

@@ -179,9 +179,9 @@ def test_excluded_rows_are_not_ranked(method):
         left = every.rows[query][np.abs(every.rows[query] - query) > 2]
         assert sequence.rows[query, : len(left)].tolist() == left.tolist()
         assert (np.abs(sequence.rows[query] - query) > 2).all()
-    nothing = DriveFilter(method)(ranked, 40, np.ones((30, 40), bool))
-    assert (nothing.rows == -1).all()
-    assert np.isnan(nothing.scores).all()
+    empty = DriveFilter(method)(ranked, 40, np.ones((30, 40), bool))
+    assert (empty.rows == -1).all()
+    assert np.isnan(empty.scores).all()
 
 
 @pytest.mark.parametrize("method", ["causal", "lagged", "smoothed", "viterbi"])
