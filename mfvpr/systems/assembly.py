@@ -159,6 +159,8 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
     correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
     methods: Any = settings.get("sequence") or ()  # files of earlier versions lack it
     methods = [methods] if isinstance(methods, str) else methods
+    if len({*methods}) < len(methods):
+        raise SettingsError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
         "scorers": chosen, "fused": fused, "correlated": correlated, "cohort": cohort, "ties": settings["ties"],
         "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {}, "final": headline,
