@@ -95,12 +95,12 @@ class System:
             other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
             before (`name + frames`).
-        sequences: by name of a scorer or a fused ranking, how the queries of a drive are ranked with the help of each
-            other (`name + causal sequence`); the database must be in the order of a drive as well.
         cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
             sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
         final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.
+        sequences: by name of a scorer or a fused ranking, how the queries of a drive are ranked with the help of each
+            other (`name + causal sequence`); the database must be in the order of a drive as well.
         settings: that it was made from, by `mfvpr.load_system`; a map keeps them, so that `Map.open` needs no system.
     """
 
@@ -108,10 +108,10 @@ class System:
     scorers: Mapping[str, Scorer]
     fused: Mapping[str, Fusion] = field(default_factory=dict)
     correlated: Mapping[str, FrameCorrelation] = field(default_factory=dict)
-    sequences: Mapping[str, Sequence[DriveFilter]] = field(default_factory=dict)
     cohort: int | None = None
     ties: Ties = "retrieval"
     final: str | None = None
+    sequences: Mapping[str, Sequence[DriveFilter]] = field(default_factory=dict)
     settings: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:

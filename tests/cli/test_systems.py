@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import mfvpr
 from mfvpr import InputError, load_system
 from mfvpr.cli import build, evaluation, programs
 from mfvpr.cli.groups import choices
+from mfvpr.cli.overrides import register_resolvers
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.utils.fingerprints import recipe_of
@@ -23,6 +25,7 @@ SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CAND
 def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
     if name == "steering":
+        register_resolvers(warnings.warn)  # as the library does; a program in this process may have changed it
         with pytest.warns(UserWarning, match="^system=steering uses SIFT, because the weights aliked-n16 are not inst"):
             assert isinstance(load_system(name).pipeline.extractor, Sift)
     else:

@@ -89,7 +89,7 @@ def test_the_refined_shift_stays_in_the_range_of_shifts():
 
 def test_refused_answers_have_no_shift(root, tmp_path):
     evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
-    confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.5", f"out={tmp_path}/out")
+    confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.25", f"out={tmp_path}/out")
     evaluation.evaluate(composed(*small(root), *STEERING, *confidence))
     predictions = {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "top_predictions.csv")}
     places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
