@@ -153,8 +153,11 @@ def test_a_drive_corrects_images_that_see_another_place(method, speed):
 def test_images_of_no_place_are_off_the_map():
     """Scores that do not stand out, image after image: the robot has left the map, and comes back."""
     there = (np.arange(30) < 10) | (np.arange(30) >= 20)
-    evidence = Evidence.of(drive_of(np.arange(30), 100, there))
-    off = follow(evidence, Drive(), np.ones(100, bool)).off
+    ranked = drive_of(np.arange(30), 100, there)
+    followed = follow(Evidence.of(ranked), Drive(), np.ones(100, bool))
+    off, scores = followed.off, DriveFilter()(ranked, 100).scores
+    np.testing.assert_allclose(scores, followed.p * (1 - off[:, None]), rtol=1e-6)
+    assert scores[15:20].max() < 0.2 < scores[there, 0][1:].min()
     assert (off[there][1:] < 0.1).all()
     assert (off[15:20] > 0.8).all()
 
