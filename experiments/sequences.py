@@ -26,7 +26,8 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.datasets.datasets import Dataset, folder
-from mfvpr.evaluation import System, rank_dataset
+from mfvpr.evaluation import Confidence, System, rank_dataset
+from mfvpr.evaluation.calibration import CalibrationData, calibration_data
 from mfvpr.evaluation.statistics import block_sign_flips
 from mfvpr.reranking.drives import Drive
 from mfvpr.reranking.fusion import FrameCorrelation
@@ -150,8 +151,23 @@ def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"])
     return f"{100 * correct.mean():.1f} ({100 * (correct.mean() - alone.mean()):+.1f}, p {p:.3f})"
 
 
-def run(arguments: list[str], features: str) -> None:
-    """Print a table of all data sets."""
+def fit(arguments: list[str]) -> Confidence:
+    """The confidence of all scores of `scorer=demo` with SIFT on some drives, see `mfvpr.reranking.drives.STREETS`."""
+    system, cache, parts = load_system("mfvpr", features="sift", scorer="demo"), FeatureCache(), []
+    for argument in arguments:
+        dataset = folder(*argument.partition("=")[2].split(":"), ground_truth="order")
+        systems, truth = rank_dataset(dataset, system, cache=cache).systems, dataset.only.truth
+        assert truth is not None
+        [by_retrieval] = systems["retrieval"]
+        parts += [calibration_data(systems[name][0], by_retrieval, truth, NEAR) for name in system.scorers]
+    return CalibrationData(*map(np.concatenate, zip(*parts, strict=True))).fit()
+
+
+def run(arguments: list[str], features: str, *, is_fit: bool = False) -> None:
+    """Print a table of all data sets, or the confidence that is fitted on them."""
+    if is_fit:
+        print(fit(arguments))
+        return
     system, cache = load_system("mfvpr", features=features), FeatureCache()
     places = defaultdict[str, list[Place]](list)
     for name, _, paths in (argument.partition("=") for argument in arguments):
@@ -168,6 +184,7 @@ def add_arguments(parser: Parser) -> None:
     """Declare the command line."""
     parser.add_argument("arguments", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives along data sets")
     parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
+    parser.add_argument("--fit", dest="is_fit", action="store_true", help="fit a confidence on the drives instead")
     parser.set_defaults(run="experiments.sequences:run")
 
 

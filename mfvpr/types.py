@@ -7,7 +7,7 @@ Matches also take lists, arrays of torch and other libraries (DLPack) on any dev
 """
 
 from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
@@ -69,6 +69,15 @@ def value(cls: Class) -> Class:
 
     jax.tree_util.register_pytree_with_keys(data, flatten_with_keys, unflatten, flatten)
     return data
+
+
+def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
+    """Apply a function to the fields of a dataclass; the same object if none changes, or if it is no dataclass."""
+    if not is_dataclass(whole) or isinstance(whole, type):
+        return whole
+    parts = {part.name: getattr(whole, part.name) for part in fields(whole) if part.init}
+    changed = {name: new for name, part in parts.items() if (new := change(part)) is not part}
+    return replace(whole, **changed) if changed else whole
 
 
 def short_repr(self: Any) -> str:

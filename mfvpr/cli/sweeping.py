@@ -7,14 +7,12 @@ from typing import Any
 from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
-from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints, readings
-from mfvpr.evaluation import EvaluationProtocol
 from mfvpr.report import sweeps
-from mfvpr.reranking.sequences import DriveFilter, Method
+from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
-from mfvpr.tuning.sweeps.rankings import DriveRanking
+from mfvpr.tuning.sweeps.drives import DriveRanking
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
@@ -32,8 +30,8 @@ def sweep(settings: dict[str, Any]) -> None:
         blocks = _block_folder(settings, inputs)
         options = SweepOptions(
             settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
-            _sequence(settings["sequence"], inputs.dataset, protocol), settings["chunk"]["settings"],
-            settings["chunk"]["queries"], blocks, inputs.cache.runtime,
+            settings["sequence"] and DriveRanking.of(DriveFilter(settings["sequence"]), inputs.dataset, protocol),
+            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, inputs.cache.runtime,
         )  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
@@ -51,12 +49,6 @@ def sweep(settings: dict[str, Any]) -> None:
         )  # fmt: skip
     if blocks is not None:
         shutil.rmtree(blocks, ignore_errors=True)
-
-
-def _sequence(method: Method | None, dataset: Dataset, protocol: EvaluationProtocol) -> DriveRanking | None:
-    """The ranking of a drive's queries by a method."""
-    of_data = len(dataset.database), dataset.only.excluded, protocol.halves
-    return None if method is None else DriveRanking(DriveFilter(method), *of_data)
 
 
 def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:

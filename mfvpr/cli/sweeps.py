@@ -17,7 +17,7 @@ from mfvpr.scoring import Scorer
 from mfvpr.scoring.parameters import numbers_by_name, static_names
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
-from mfvpr.tuning.sweeps.rankings import DriveRanking
+from mfvpr.tuning.sweeps.drives import DriveRanking
 from mfvpr.utils import InputError, Runtime
 
 
@@ -102,8 +102,7 @@ def _sequence(system: System, dataset: Dataset, protocol: EvaluationProtocol) ->
     filters = system.sequences.get(system.headline, ())
     if len(filters) > 1:
         raise InputError(f"sequences: expected at most one of {system.headline}, got {len(filters)}; sweep each")
-    of_data = len(dataset.database), dataset.only.excluded, protocol.halves
-    return DriveRanking(filters[0], *of_data) if filters else None
+    return DriveRanking.of(filters[0], dataset, protocol) if filters else None
 
 
 def _block_folder(out: Path | str | None, axes: Axes) -> Path | None:

@@ -59,7 +59,7 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     return "blurred" if (correlations > _MOST_CORRELATION).all() else None
 
 
-def _reason_against_image(images: ImageFolder, row: int, extractor: Extractor | Source) -> Reason | None:
+def _reason_against_query(images: ImageFolder, row: int, extractor: Extractor | Source) -> Reason | None:
     if isinstance(extractor, Source):
         return None
     return reason_against_image(resize(images.read(row), extractor.image_size, extractor.interpolation))
@@ -120,7 +120,7 @@ def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Re
         counts = np.sum([match_set.counts[pairs] for match_set in matched.matches], axis=0)
         of_sequence: list[Reason | None] = []
         for row, (weak, count, score) in enumerate(zip(is_weak, counts, _scores(matched)[pairs], strict=True)):
-            of_image = None if row in matched.bad_queries else _reason_against_image(images, row, extractor)
+            of_image = None if row in matched.bad_queries else _reason_against_query(images, row, extractor)
             of_sequence.append("too few features" if weak else of_image or reason_against(count, score, noise))
         reasons.append(of_sequence)
     return reasons

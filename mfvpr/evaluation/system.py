@@ -1,7 +1,7 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -25,7 +25,7 @@ from mfvpr.retrieval.retriever import Retriever
 from mfvpr.scoring.parameters import check_bounds
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.scoring.scorer import Scorer
-from mfvpr.types import Shortlist
+from mfvpr.types import Shortlist, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 
@@ -184,12 +184,7 @@ def _with_part(whole: Any, part: Any, new: Any) -> Any:
     """A dataclass of parts, in which a part is replaced wherever it is."""
     if whole is part or (type(whole) is type(part) and whole == part):
         return new
-    if not is_dataclass(whole) or isinstance(whole, type):
-        return whole
-    parts = {field.name: getattr(whole, field.name) for field in fields(whole) if field.init}
-    changed = {name: _with_part(value, part, new) for name, value in parts.items()}
-    changed = {name: value for name, value in changed.items() if value is not parts[name]}
-    return replace(whole, **changed) if changed else whole
+    return with_parts(whole, lambda each: _with_part(each, part, new))
 
 
 def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:

@@ -24,6 +24,7 @@ from mfvpr.utils.progress import Track, no_progress
 
 Image = Path | str | ArrayLike
 Described = tuple[Features, np.ndarray]
+Pixels = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,15 @@ class Describing:
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
-        return self.pixels(load(image), str(image) if is_file(image) else "image")
+        return self.resized(self.resize(load(image)), str(image) if is_file(image) else "image")
 
-    def pixels(self, pixels: UInt8[np.ndarray, "height width 3"], name: str) -> Described:
-        """Describe one image; `name` stands in errors."""
-        descriptions = [_extract(extractor, pixels, name) for extractor in self._extractors]
+    def resize(self, pixels: Pixels) -> list[Pixels]:
+        """Resize an image for each extractor."""
+        return [resize(pixels, extractor.image_size, extractor.interpolation) for extractor in self._extractors]
+
+    def resized(self, images: Sequence[Pixels], name: str) -> Described:
+        """Describe one image, from what `resize` made of it; `name` stands in errors."""
+        descriptions = [_extract(*pair, name) for pair in zip(self._extractors, images, strict=True)]
         features = round_as_stored(descriptions[0].features)
         [vector] = self._vectors([features], descriptions[-1:])
         return features, vector
@@ -96,7 +101,7 @@ def is_file(image: Image) -> TypeGuard[Path | str]:
     return isinstance(image, str | os.PathLike)
 
 
-def load(image: Image) -> UInt8[np.ndarray, "height width 3"]:
+def load(image: Image) -> Pixels:
     """Read an image file, or convert an array; an InputError if it is no image."""
     if is_file(image):
         return read_image(image)
@@ -113,8 +118,8 @@ def load(image: Image) -> UInt8[np.ndarray, "height width 3"]:
     return pixels
 
 
-def _extract(extractor: Extractor, pixels: np.ndarray, name: str) -> Description:
-    [description] = describe_images(resize(pixels, extractor.image_size, extractor.interpolation)[None], extractor)
+def _extract(extractor: Extractor, image: Pixels, name: str) -> Description:
+    [description] = describe_images(image[None], extractor)
     if description is None:
         raise InputError(f"{name}: features are not finite (NaN or infinite)")
     return description

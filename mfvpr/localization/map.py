@@ -12,7 +12,6 @@ import numpy as np
 
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
-from mfvpr.datasets.images import resize
 from mfvpr.evaluation.evaluation import Reason
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
@@ -161,8 +160,8 @@ class Map(MapImages):
     ) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
-        There is no place, and `reason` says why, for a query with too few features or matches, or no better than noise
-        (`mfvpr.evaluation.evidence`), without candidates, or with a confidence below the threshold.
+        There is no place, and `reason` says why, for a query without enough evidence, such as a black, blurred or noisy
+        image (`mfvpr.evaluation.evidence`), without candidates, or with a confidence below the threshold.
 
         Args:
             image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
@@ -171,7 +170,8 @@ class Map(MapImages):
             route: of the drive that the image is the next one of; the prediction is then `located` on it.
 
         Raises:
-            InputError: the map is empty, the image cannot be read, or `recent` or `before` is no number of rows.
+            InputError: the map is empty, the image cannot be read, `recent` or `before` is no number of rows, or
+                `route` is no `Route`.
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
@@ -179,10 +179,11 @@ class Map(MapImages):
         before = None if before is None else _whole_number("before", before)
         described = self._refresh_images()
         pixels, total = load(image), self._vectors.total
-        description = described.describing.pixels(pixels, str(image) if is_file(image) else "image")
+        resized = described.describing.resize(pixels)
+        description = described.describing.resized(resized, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
-        of_size = resize(pixels, self.extractor.image_size, self.extractor.interpolation)
-        localized = self._localize(described, description, end, pixels.shape[1::-1], reason_against_image(of_size))
+        reason = reason_against_image(resized[0])
+        localized = self._localize(described, description, end, pixels.shape[1::-1], reason)
         if route is None:
             return localized
         located = route(localized.prediction, self.there[:end])

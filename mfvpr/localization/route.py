@@ -1,8 +1,8 @@
 """Localization along a drive: the causal filter of `mfvpr.reranking.drives` over the rows of a map.
 
-route = Route(Drive())
-for image in images:                       # in their order; later images are not used
-    located = route(known.localize(image), known.there)
+route = Route()
+for image in images:  # in their order
+    located = known.localize(image, route=route).located
 """
 
 import math

@@ -106,10 +106,9 @@ def _write_top_predictions(folder: Path, evaluation: EvaluationReport) -> None:
     for place, (ranked, *parts) in enumerate(zip(evaluation.ranked.systems[name], *values, strict=True)):
         is_correct, positives = evaluation.is_correct(name, place), evaluation.positives[place]
         lines = []
-        for image, row, score, reason, *both, query in zip(
-            evaluation.sequences[place].images.names, ranked.rows[:, 0], ranked.scores[:, 0], *parts,
-            range(len(ranked.rows)), strict=True,
-        ):  # fmt: skip
+        names = evaluation.sequences[place].images.names
+        for query, (image, reason, *both) in enumerate(zip(names, *parts, strict=True)):
+            row, score = ranked.rows[query, 0], ranked.scores[query, 0]
             candidate = database[row] if row >= 0 else ""
             predictions = [NO_PLACE, candidate] if reason else [candidate, ""]
             numbers = ["" if np.isnan(score) else format_number(score)]

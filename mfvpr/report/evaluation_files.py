@@ -107,27 +107,26 @@ def write_changes(folder: Path, evaluation: EvaluationReport) -> None:
     """
     sequences = {name: score.base for name, score in evaluation.ranked.system.final_scores.items()
                  if isinstance(score.step, DriveFilter)}  # fmt: skip
-    names = evaluation.ranked.dataset.database.names
-    lines = [
-        [name, sequence.name, sequence.images.names[query], *(cells[query] for cells in (*before, *after))]
-        for name, base in sequences.items()
-        for place, sequence in enumerate(evaluation.sequences)
-        for before, after in [[_first_predictions(evaluation, system, place, names) for system in (base, name)]]
-        for query in range(len(sequence.images))
-        if before[0][query] != after[0][query]
-    ]
+    lines = []
+    for name, base in sequences.items():
+        for place, sequence in enumerate(evaluation.sequences):
+            before, after = (_first_predictions(evaluation, system, place) for system in (base, name))
+            lines += [
+                [name, sequence.name, image, *alone, *together]
+                for image, alone, together in zip(sequence.images.names, before, after, strict=True)
+                if alone[0] != together[0]
+            ]
     if sequences:
         header = ["system", "sequence", "query", "before", "correct_before", "after", "correct_after"]
         write_csv(folder / "changes.csv", header, lines)
 
 
-def _first_predictions(
-    evaluation: EvaluationReport, system: str, place: int, names: Sequence[str]
-) -> tuple[list[str], list[str]]:
-    """Names of the first predictions of a sequence's queries, and whether they are correct."""
+def _first_predictions(evaluation: EvaluationReport, system: str, place: int) -> list[tuple[str, str]]:
+    """Name of the first prediction of each query of a sequence, and whether it is correct: 1, 0, or empty."""
     rows, correct = evaluation.ranked.systems[system][place].rows[:, 0], evaluation.is_correct(system, place)
     flags = [""] * len(rows) if correct is None else [str(int(flag)) for flag in correct[:, 0]]
-    return [names[int(row)] if row >= 0 else "" for row in rows], flags
+    names = evaluation.ranked.dataset.database.names
+    return [(names[int(row)] if row >= 0 else "", flag) for row, flag in zip(rows, flags, strict=True)]
 
 
 class Difference(NamedTuple):

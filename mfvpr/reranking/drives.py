@@ -32,18 +32,17 @@ from mfvpr.utils.errors import InputError
 # Chosen on synthetic streets (`dataset=streets_seasons`), as the defaults of `Drive`.
 SPEEDS = tuple(range(-8, 9))  # rows from one image to the next that are learned
 _SHARPNESS = 2  # a candidate's part is its score above the mean to this power
-_STEADY, _ANY = (
-    0.95,
-    0.02,
-)  # probabilities that the speed stays, and that it becomes any other; else it changes by a few
+_ANY = 0.02  # probability that the speed becomes any other
+_STEADY = 0.95  # otherwise, probability that it stays; else it changes by a few rows
 _BESIDE = 1.0  # rows, standard deviation: candidates speak for the rows next to them
 _MOST_ODDS = 50.0  # of a correct prediction: images may look like those of another place
 _REACH = 4  # standard deviations of the motion
 _MOST_ROWS, _MOST_SPREAD = 10_000, 100  # rows from one image to the next
 
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
-# on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`).
-STREETS = Confidence(("margin", "height"), 5, (1.289, 1.853), (0.998, 0.662), (0.746, 3.311), 0.471)
+# on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
+# `python -m experiments.sequences --fit`.
+STREETS = Confidence(("margin", "height"), 5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Drive:
 
     def __post_init__(self) -> None:
         advance = self.advance or 0.0
-        if wrong := [value for value in vars(self).values() if not isinstance(value, int | float | None)]:
+        if wrong := [each for each in vars(self).values() if not isinstance(each, int | float | None)]:
             raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
         if not (abs(advance) <= _MOST_ROWS and 1 / _MOST_ROWS <= self.spread <= _MOST_SPREAD):
             raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected at most {_MOST_ROWS} "

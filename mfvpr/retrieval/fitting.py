@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from mfvpr.features.extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.storage.disk import lock_store
 from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.types import with_parts
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.whitening import Whitening
@@ -37,12 +38,7 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
         fitting = tool.whitening
         whitening = cache.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
-    if not is_dataclass(tool) or isinstance(tool, type):
-        return tool
-    parts = {part.name: getattr(tool, part.name) for part in fields(tool) if part.init}
-    fitted_parts = {name: fit_to_database(part, database, cache) for name, part in parts.items()}
-    changed = {name: part for name, part in fitted_parts.items() if part is not parts[name]}
-    return replace(tool, **changed) if changed else tool
+    return with_parts(tool, lambda part: fit_to_database(part, database, cache))
 
 
 def whitening_recipe(

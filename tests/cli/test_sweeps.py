@@ -14,6 +14,7 @@ from mfvpr.reranking import DriveFilter, Fusion, Ranked
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import rankings
+from mfvpr.tuning.sweeps.drives import DriveRanking
 
 pytestmark = pytest.mark.thorough
 
@@ -85,7 +86,7 @@ def test_choosing_for_a_sequence_sees_nothing_of_the_reported_half(dataset):
     swept = mfvpr.sweep(dataset, system, cache=cache, sigma=[5, 22.5], split="both", thresholds=[1])
     rng, protocol = np.random.default_rng(0), swept.outcome.protocol
     rows, scores = np.tile(np.arange(number), (number, 1)), rng.uniform(size=(number, number))
-    ranking = rankings.DriveRanking(DriveFilter("smoothed"), number, halves=protocol.halves)
+    ranking = DriveRanking(DriveFilter("smoothed"), number, halves=protocol.halves)
     for view, half in enumerate(protocol.halves, start=1):
         assert np.isin(swept.outcome.rows[view][:, half.tune], [-1, *np.flatnonzero(half.allowed)]).all()
         changed = scores.copy()

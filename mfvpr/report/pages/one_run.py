@@ -189,7 +189,7 @@ def _sequence_section(run: Run) -> Iterator[Section]:
     """Queries whose prediction a sequence changes."""
     if (table := run.tables.get("changes.csv")) and table.rows:
         words = {"1": "correct", "0": "incorrect", "": ""}
-        rows = [[*cells[:3], cells[3], words[cells[4]], cells[5], words[cells[6]]] for cells in table.rows]
+        rows = [[*cells[:4], words[cells[4]], cells[5], words[cells[6]]] for cells in table.rows]
         columns = ["system", "sequence", "query", "alone", "", "with the other queries", ""]
         tables = {"Changed predictions": Table(columns, rows, len(columns))}
         yield Section(

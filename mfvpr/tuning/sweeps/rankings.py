@@ -19,16 +19,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.selection import Half
 from mfvpr.evaluation.validation import require_finite
 from mfvpr.matching.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
 from mfvpr.reranking import grids, ranking
 from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
 from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
 from mfvpr.reranking.results import Ranked
-from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.scoring.scorer import check_host, on_host
+from mfvpr.tuning.sweeps.drives import DriveRanking
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, group_by_program
 from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
 from mfvpr.utils.arrays import read_arrays, write_arrays
@@ -41,32 +39,6 @@ SETTINGS_PER_BLOCK = 64
 _ALONE = "alone"  # the c of a score that is not fused
 _STEP = 1.0  # seconds of the settings that one batch is scored with, about
 _MEASURED = 64  # settings x batches: less work is done before its time is measured
-
-
-@dataclass(frozen=True)
-class DriveRanking:
-    """A drive filter for the queries of a sweep, and what it needs of their data set.
-
-    `halves` are those that the views after the first are of: of a half, only the queries to choose on are ranked, among
-    the rows that choosing may see.
-    """
-
-    drive_filter: DriveFilter
-    num_rows: int
-    excluded: Positives | None = None
-    halves: Sequence[Half] = ()
-
-    def rows(self, ranked: Ranked, view: int) -> Int[np.ndarray, "queries candidates"]:
-        """Rows of a view's rankings, -1 where none are ranked."""
-        shape = len(ranked.rows), self.num_rows
-        excluded = np.zeros(shape, bool) if self.excluded is None else self.excluded.dense()
-        if not view:
-            return self.drive_filter(ranked, self.num_rows, excluded).rows
-        half, rows = self.halves[view - 1], np.full_like(ranked.rows, -1)
-        excluded, tuned = excluded[half.tune] | ~half.allowed, Ranked(ranked.rows[half.tune], ranked.scores[half.tune])
-        ranking = self.drive_filter(tuned, self.num_rows, excluded).rows
-        rows[half.tune, : ranking.shape[1]] = ranking
-        return rows
 
 
 @dataclass(frozen=True)
