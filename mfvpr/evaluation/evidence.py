@@ -15,6 +15,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -48,9 +49,10 @@ _SCORER = HistogramOfShifts(weight=RatioWeight())
 
 def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason | None:
     """Why a query, at the size of the extractor, cannot be used; None = it may be."""
-    if np.mean((pixels >= 250).all(axis=2)) > _MOST_WHITE:
+    brightness = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    if np.mean(brightness >= 250) > _MOST_WHITE:
         return "overexposed"
-    brightness = pixels.mean(axis=2)
+    brightness = brightness.astype(np.float32)
     rows, columns = (max(1, round(side / 80)) for side in brightness.shape)
     pairs = (brightness[rows:], brightness[:-rows]), (brightness[:, columns:], brightness[:, :-columns])
     correlations = np.array([_correlation(*pair) for pair in pairs])
@@ -67,8 +69,9 @@ def _reason_against_query(images: ImageFolder, row: int, extractor: Extractor | 
 
 def _correlation(first: np.ndarray, second: np.ndarray) -> float:
     """Correlation of two images of one size; NaN if one of them is plain."""
-    deviations = first.std() * second.std()
-    return float(np.mean((first - first.mean()) * (second - second.mean())) / deviations) if deviations else np.nan
+    first, second = ((values - values.mean()).ravel() for values in (first, second))
+    variances = np.vdot(first, first) * np.vdot(second, second)
+    return float(np.vdot(first, second) / np.sqrt(variances)) if variances else np.nan
 
 
 def strength(features: Features) -> float:

@@ -24,7 +24,7 @@ from mfvpr.utils.progress import Track, no_progress
 
 Image = Path | str | ArrayLike
 Described = tuple[Features, np.ndarray]
-Pixels = UInt8[np.ndarray, "height width 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 @dataclass(frozen=True)

@@ -18,14 +18,11 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.evaluation import Confidence
-from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.stages import explain
-from mfvpr.evaluation.system import noise_image
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
-from mfvpr.localization import Map, Prediction
+from mfvpr.localization import Map
 from mfvpr.localization import matching as map_matching
 from mfvpr.localization.resident import Resident
-from mfvpr.localization.strength import MapStrength
 from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import maps as map_store
@@ -42,14 +39,6 @@ pytestmark = pytest.mark.thorough
 
 SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
 SURE = Confidence(("margin", "height"), 1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
-
-
-@pytest.fixture(scope="module")
-def folder(dataset, tmp_path_factory):
-    """A map of the database, whose places are rows."""
-    folder = tmp_path_factory.mktemp("maps") / "map"
-    Map(folder, map_system(SIFT, VLAD)).build(dataset.database, list(range(len(dataset.database))))
-    return folder
 
 
 def opened(folder, *, scorer=None, candidates=5, **options):
@@ -443,51 +432,6 @@ def test_images_may_be_what_numpy_converts(dataset, folder):
         np.testing.assert_array_equal(known.describing.image(image)[1], expected)
 
 
-def without_place(reason, image):
-    return Prediction(None, (), 0.0, None, None, None, None, reason, image.shape[1])
-
-
-@pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])
-def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
-    rng, values = np.random.default_rng(0), {"black": 0, "gray": 90, "dark noise": 5}
-    image = np.full((480, 640, 3), values.get(kind, 0), np.uint8)
-    if kind == "dark noise":
-        image += rng.integers(0, 5, image.shape, np.uint8)
-    if kind == "lens cap":  # with a little light at its rim
-        image[:, :40] = np.arange(40, 0, -1)[:, None]
-    prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
-    assert (prediction, matches) == (without_place("too few features", image), None)
-    assert prediction.as_json()["reason"] == "too few features"
-
-
-def test_strong_features_with_few_matches_have_no_place(folder):
-    image = np.zeros((120, 160, 3), np.uint8)
-    image[40:60, 70:95] = 255
-    prediction, (features, _), matches = opened(folder, confidence=SURE).localize_with_evidence(image)
-    assert 0 < len(features.scores) < LEAST_MATCHES
-    assert (prediction, matches) == (without_place("too few matches", image), None)
-
-
-@pytest.mark.parametrize("grain", [1, 3])
-def test_noise_has_no_place_whatever_the_confidence(folder, grain):
-    image = noise_image((160, 120), seed=7, grain=grain)
-    prediction = opened(folder, confidence=replace(SURE, bias=100.0)).localize(image)
-    assert prediction == without_place("no better than noise", image)
-
-
-def test_the_strength_of_a_map_is_of_a_few_of_its_rows():
-    rows, read = Unsteady(), []
-    mean = MapStrength(rows)
-    rows.features = lambda wanted: (read.extend(wanted), Unsteady().features(wanted))[1]
-    assert mean(0) == 0
-    assert mean(50) == np.mean(range(50))
-    assert mean(1000) == np.mean(range(0, 1000, 16))
-    assert len(read) == len({*read}) < 110
-    count, rows.counts = len(read), lambda wanted: np.where(np.array(wanted) == 16, -1, 1)
-    assert mean(1000) == np.mean([0, *range(32, 1000, 16)])  # a row that was damaged, and is gone
-    assert len(read) == count
-
-
 @dataclass(frozen=True)
 class Constant:
     """Both features and a global descriptor, of few pixels."""
@@ -518,25 +462,6 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
         known.add(dataset.queries.paths[0], "a query", name="q")
         for image in (*dataset.database.paths, dataset.queries.paths[0]):
             assert len(known.localize(image).alternatives) == 3
-
-
-@dataclass(frozen=True)
-class Bright(Constant):
-    """Keypoints as strong as the image is bright."""
-
-    def describe(self, image):
-        vector, (features,) = super().describe(image)
-        return Description(vector, (replace(features, scores=np.full(9, image.max() / 255, np.float32)),))
-
-
-def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
-    rng, known = np.random.default_rng(0), Map(tmp_path / "map", map_system(Bright(), Bright(), candidates=3))
-    images = [rng.integers(0, 2 if row < 3 else 256, (3, 4, 3), np.uint8) for row in range(8)]
-    images = [image.repeat(4, axis=0).repeat(4, axis=1) for image in images]
-    for row, image in enumerate(images):
-        known.add(image, row, name=str(row))
-    assert known.localize(images[0]).reason == "too few features"
-    assert known.localize_with_evidence(images[0], before=3).prediction.place == 0
 
 
 @pytest.mark.slow
