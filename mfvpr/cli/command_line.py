@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import partial
 from typing import Any
 
 import hydra
@@ -68,7 +68,7 @@ def run(config: str) -> None:
             with interruptible, words, _frozen_imports(), cluster as started:
                 job(settings | {"multirun": multirun_job, "command": command, "cluster": started})
 
-    register_resolvers(cache(lambda line: tell(f"note: {line}")))  # once, though Hydra composes twice
+    register_resolvers(partial(_note_once, set()))  # Hydra composes twice
     name, job_path = PROGRAMS[config]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of printing and exiting with 1
     typed = sys.argv[1:]
@@ -85,6 +85,12 @@ def run(config: str) -> None:
         quoted = [quote(argument, several=bool(multirun)) for argument in arguments if argument not in _MULTIRUN]
         sys.argv[1:] = multirun[:1] + quoted  # Hydra takes no settings before --multirun
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
+
+
+def _note_once(told: set[str], line: str) -> None:
+    if line not in told:
+        told.add(line)
+        tell(f"note: {line}")
 
 
 def _set_up_jax(compiled: bool) -> None:

@@ -105,6 +105,11 @@ def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tupl
     return (other, rounded) if shape[0] > shape[1] else (rounded, other)
 
 
+def gray(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
+    """Brightness of an image, 0 to 255."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
 def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an image (RGB) in the format of the path's suffix."""
     Image.fromarray(image).save(path)

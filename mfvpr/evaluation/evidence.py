@@ -15,12 +15,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.images import resize, write_image
+from mfvpr.datasets.images import gray, resize, write_image
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.evaluation import RankedDataset, Reason
 from mfvpr.evaluation.sequence_matching import match_sequence
@@ -49,7 +48,7 @@ _SCORER = HistogramOfShifts(weight=RatioWeight())
 
 def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason | None:
     """Why a query, at the size of the extractor, cannot be used; None = it may be."""
-    brightness = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    brightness = gray(pixels)
     if np.mean(brightness >= 250) > _MOST_WHITE:
         return "overexposed"
     brightness = brightness.astype(np.float32)
