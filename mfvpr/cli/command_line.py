@@ -87,9 +87,9 @@ def run(config: str) -> None:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=config)(task)()
 
 
-def _note_once(told: set[str], line: str) -> None:
-    if line not in told:
-        told.add(line)
+def _note_once(lines: set[str], line: str) -> None:
+    if line not in lines:
+        lines.add(line)
         tell(f"note: {line}")
 
 
