@@ -103,6 +103,14 @@ def mfvpr_entries(data: Data) -> list[Entry]:
     def both(query: Features, candidates: Features) -> jax.Array:
         return mfvpr.score_candidates(histogram, _match(query, candidates))
 
+    def rounded_product(query: Features, candidates: Features) -> jax.Array:
+        query_columns = query.descriptors.astype(jnp.bfloat16).T
+
+        def product(descriptors: jax.Array) -> jax.Array:
+            return jnp.matmul(descriptors.astype(jnp.bfloat16), query_columns, preferred_element_type=jnp.float32)
+
+        return jax.lax.map(product, candidates.descriptors)
+
     def wait(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
         return lambda: jax.block_until_ready(function(*inputs, **options))
 
@@ -110,9 +118,16 @@ def mfvpr_entries(data: Data) -> list[Entry]:
     return [
         (MATCHING, "bare product (JAX)", wait(jax.jit(product), *images)),
         (MATCHING, "bare product (JAX), not stored", wait(jax.jit(sum_of_product), *images)),
+        (MATCHING, "bare product (JAX), bfloat16", wait(jax.jit(rounded_product), *images)),
         (MATCHING, "mfvpr", wait(mfvpr.match_candidates, *images)),
+        (MATCHING, "mfvpr, float32", wait(mfvpr.match_candidates, *images, product="float32")),
         (MATCHING, "mfvpr, under jit", wait(jax.jit(mfvpr.match_candidates), *images)),
         (MATCHING, "mfvpr, with ratio", wait(mfvpr.match_candidates, *images, with_ratio=True)),
+        (
+            MATCHING,
+            "mfvpr, with ratio, float32",
+            wait(mfvpr.match_candidates, *images, with_ratio=True, product="float32"),
+        ),
         (BOTH, "mfvpr", wait(jax.jit(both), *images)),
         (HISTOGRAM, "mfvpr", wait(score, mfvpr.HistogramOfShifts(), data.matches)),
         (ANCHOR, "mfvpr", wait(score, mfvpr.AnchorPoints(), data.matches)),

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.matching.nearest_neighbors import at_least_one, distance_ratio, make_matches, ready, slot_numbers
-from mfvpr.matching.similarity import nearest
+from mfvpr.matching.similarity import lines_of, nearest
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.types import Features, Matches, short_repr, value
 from mfvpr.utils.errors import InputError
@@ -73,7 +73,7 @@ class LightGlueMatcher:
                 raise InputError(f"LightGlue: expected descriptors of {self.dimension} dimensions, got {got}; take the "
                                  "features that its weights are for")  # fmt: skip
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
-        best1, best0 = nearest(assigned, axis=1), nearest(assigned, axis=0)
+        best1, best0 = nearest(lines_of(assigned, axis=1)), nearest(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)
         mutual = best0.index[best1.index] == slot_numbers(features0)
         real = mutual & (confidence > self.filter_threshold) & (best1.similarity > -jnp.inf)

@@ -9,7 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from mfvpr.matching.nearest_neighbors import CrossCheck, filter_matches, match, pairs_at_once, with_concrete_sizes
+from mfvpr.matching.checked import Rounded
+from mfvpr.matching.nearest_neighbors import (
+    CrossCheck,
+    Product,
+    choose_product,
+    filter_matches,
+    match,
+    match_rounded,
+    pairs_at_once,
+    prepare_query,
+    with_concrete_sizes,
+)  # fmt: skip
 from mfvpr.types import Array, Features, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array, compiled, is_concrete
@@ -27,6 +38,8 @@ class Matcher(Protocol):
     included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
     needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs
     that are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
+    An optional method `prepare(queries, candidates)` returns what stands in for the queries if pairs are matched one by
+    one: arrays with a leading axis for the queries.
     """
 
     def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
@@ -38,7 +51,7 @@ class NearestNeighborMatcher:
 
         matcher = mfvpr.NearestNeighborMatcher(cross_check="mutual", max_distance=0.7, max_matches=500)
 
-    `chunk_size` is that of `match_candidates`; it changes only memory and the last bits.
+    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory and the last bits.
     """
 
     recipe_name: ClassVar[str] = "Matching"  # in stored recipes
@@ -47,10 +60,19 @@ class NearestNeighborMatcher:
     max_distance: float | None = None
     max_matches: int | None = field(default=None, metadata={"static": True})
     chunk_size: int | None = field(default=None, metadata={"static": True})
+    product: Product | None = field(default=None, metadata={"static": True, "recipe": False})
 
-    def __call__(self, features0: Features, features1: Features) -> Matches:
+    def prepare(self, queries: Features, candidates: Features) -> Features | Rounded:
+        """The queries, or what products of bfloat16 need of them."""
+        product = choose_product(self.product, queries, candidates, self.cross_check, chunk_size=1)
+        return queries if product == "float32" else jax.vmap(prepare_query)(queries)
+
+    def __call__(self, features0: Features | Rounded, features1: Features) -> Matches:
         """Matches of one pair, with the slots `[K]` of `match`."""
-        matches = match(features0, features1, cross_check=self.cross_check, with_ratio=True)
+        if isinstance(features0, Rounded):
+            matches = match_rounded(features0, features1, with_ratio=True)
+        else:
+            matches = match(features0, features1, cross_check=self.cross_check, with_ratio=True)
         return filter_matches(matches, max_distance=self.max_distance, max_matches=self.max_matches)
 
 
@@ -100,10 +122,13 @@ def _require_rows(pairs: Int[Array, "pairs 2"], queries: Features, candidates: F
 def _match_pairs(
     queries: Features, candidates: Features, pairs: Array, count: Array, matcher: Matcher, *, chunk_size: int
 ) -> Matches:
+    prepare = getattr(matcher, "prepare", None)
+    sides = queries if prepare is None or chunk_size > 1 else prepare(queries, candidates), candidates
+
     def match_pair(pair: Array) -> Matches:
         query, candidate = (
             jax.tree.map(lambda field: jnp.asarray(field)[row], features)  # noqa: B023
-            for features, row in ((queries, pair[0]), (candidates, pair[1]))
+            for features, row in zip(sides, pair, strict=True)
         )
         return matcher(query, candidate)
 

@@ -22,25 +22,50 @@ class Nearest(NamedTuple):
     similarity: Float[Array, " lines"]
 
 
-def nearest(similarity: Float[Array, "rows columns"], axis: int) -> Nearest:
-    """Nearest neighbors of the rows (axis 1) or columns (axis 0)."""
+class Lines(NamedTuple):
+    """Rows (axis 1) or columns (axis 0) of a similarity matrix, in blocks."""
+
+    blocks: Float[Array, "_ _ _"]  # `[rows, blocks, entries]`, or `[blocks, entries, columns]`
+    maxima: Float[Array, "_ _"]  # of the blocks: `[rows, blocks]`, or `[blocks, columns]`
+    axis: int
+    removed: Int[Array, " lines"] | None = None  # an entry of every line that does not count
+
+    @property
+    def length(self) -> int:
+        """Entries of a block."""
+        return self.blocks.shape[self.axis + 1]
+
+
+def lines_of(similarity: Float[Array, "rows columns"], axis: int) -> Lines:
+    """Rows (axis 1) or columns (axis 0)."""
     blocks = _blocks(similarity, axis)
-    return _find_largest(blocks, jnp.max(blocks, axis=axis + 1), axis)
+    return Lines(blocks, jnp.max(blocks, axis=axis + 1), axis)
 
 
-def nearest_two(similarity: Float[Array, "rows columns"]) -> tuple[Nearest, Nearest]:
-    """The nearest and the second nearest neighbor of every row."""
-    blocks = _blocks(similarity, 1)
-    maxima = jnp.max(blocks, axis=2)
-    best = _find_largest(blocks, maxima, 1)
-    block, place = jnp.divmod(best.index, blocks.shape[2])
-    same_block = _without(_take_block(blocks, block, 1), place)
-    other_block = _find_largest(blocks, _without(maxima, block), 1)
-    top = jnp.max(same_block, axis=1)
-    index = block * blocks.shape[2] + _first_true(same_block == top[:, None], 1)
-    is_nearer = (top > other_block.similarity) | ((top == other_block.similarity) & (index < other_block.index))
-    second = Nearest(jnp.where(is_nearer, index, other_block.index), jnp.maximum(top, other_block.similarity))
-    return best, second
+def nearest(lines: Lines) -> Nearest:
+    """Nearest neighbors of all lines."""
+    largest = jnp.max(lines.maxima, axis=lines.axis)
+    block = _first_true(lines.maxima == jnp.expand_dims(largest, lines.axis), lines.axis)
+    place = _first_true(_take_block(lines, block) == jnp.expand_dims(largest, lines.axis), lines.axis)
+    return Nearest(block * lines.length + place, largest)
+
+
+def without(lines: Lines, index: Int[Array, " lines"]) -> Lines:
+    """All entries but one of every line."""
+    lines, block = lines._replace(removed=index), index // lines.length
+    numbers = jnp.expand_dims(jnp.arange(lines.maxima.shape[lines.axis], dtype=jnp.int32), 1 - lines.axis)
+    rest = jnp.max(_take_block(lines, block), axis=lines.axis, keepdims=True)
+    return lines._replace(maxima=jnp.where(numbers == jnp.expand_dims(block, lines.axis), rest, lines.maxima))
+
+
+def count_from(lines: Lines, neighbors: Nearest, threshold: Float[Array, " lines"]) -> Int[Array, " lines"]:
+    """Number of entries of at least the threshold, which is not above the nearest neighbor.
+
+    Of a block without the nearest neighbor, only the largest entry is counted: the number is right if it is 1.
+    """
+    threshold = jnp.expand_dims(threshold, lines.axis)
+    entries = _take_block(lines, neighbors.index // lines.length) >= threshold
+    return jnp.sum(lines.maxima >= threshold, axis=lines.axis) + jnp.sum(entries, axis=lines.axis) - 1
 
 
 def _first_true(hits: Array, axis: int) -> Array:
@@ -72,20 +97,12 @@ def _blocks(similarity: Array, axis: int) -> Array:
     return similarity.reshape(*similarity.shape[:axis], *parts, *similarity.shape[axis + 1 :])
 
 
-def _find_largest(blocks: Array, maxima: Array, axis: int) -> Nearest:
-    """Largest entries, by the `maxima` of the blocks; -inf leaves a block out."""
-    largest = jnp.max(maxima, axis=axis, keepdims=True)
-    block = _first_true(maxima == largest, axis)
-    place = _first_true(_take_block(blocks, block, axis) == largest, axis)
-    return Nearest(block * blocks.shape[axis + 1] + place, jnp.squeeze(largest, axis))
-
-
-def _take_block(blocks: Array, index: Array, axis: int) -> Array:
-    """One block of every row or column."""
-    return jnp.squeeze(jnp.take_along_axis(blocks, jnp.expand_dims(index, (axis, axis + 1)), axis=axis), axis)
-
-
-def _without(values: Float[Array, "rows columns"], place: Int[Array, " rows"]) -> Float[Array, "rows columns"]:
-    """`values` with -inf at one `place` of every row."""
-    columns = jnp.arange(values.shape[1], dtype=jnp.int32)
-    return jnp.where(columns[None] == place[:, None], -jnp.inf, values)
+def _take_block(lines: Lines, block: Int[Array, " lines"]) -> Float[Array, "_ _"]:
+    """One block of every line, -inf at the entry that was removed."""
+    axis = lines.axis
+    entries = jnp.squeeze(jnp.take_along_axis(lines.blocks, jnp.expand_dims(block, (axis, axis + 1)), axis=axis), axis)
+    if lines.removed is None:
+        return entries
+    places = jnp.expand_dims(jnp.arange(lines.length, dtype=jnp.int32), 1 - axis)
+    removed = jnp.expand_dims(lines.removed - block * lines.length, axis)
+    return jnp.where(places == removed, -jnp.inf, entries)

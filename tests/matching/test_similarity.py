@@ -1,15 +1,24 @@
 """Nearest neighbors in blocks, against the sort of all: sizes that come out even and that do not, ties, nothing."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 
-from mfvpr.matching.similarity import nearest, nearest_two
+from mfvpr.matching.similarity import count_from, lines_of, nearest, without
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
-nearest_of = jax.jit(nearest, static_argnames="axis")
-two_of = jax.jit(nearest_two)
+
+@partial(jax.jit, static_argnames="axis")
+def two_of(values, axis):
+    """The nearest and the second nearest of all lines, and the number of entries that are at least as near."""
+    lines = lines_of(values, axis)
+    first = nearest(lines)
+    rest = without(lines, first.index)
+    second = nearest(rest)
+    return first, second, count_from(lines, first, first.similarity), count_from(lines, first, second.similarity)
 
 
 def make(rows, columns, kind):
@@ -40,7 +49,13 @@ def assert_neighbors(index, largest, values, place):
 @pytest.mark.parametrize(("rows", "columns"), [(0, 5), (1, 1), (3, 2), (7, 31), (40, 64), (65, 97), (60, 8)])
 def test_neighbors_are_those_of_a_stable_sort(rows, columns, kind):
     values = make(rows, columns, kind)
-    assert_neighbors(*nearest_of(values, 1), values, 0)
-    assert_neighbors(*nearest_of(values, 0), values.T, 0)
-    for place, neighbors in enumerate(two_of(values)):
-        assert_neighbors(*neighbors, values, place)
+    for axis, lines in ((1, values), (0, values.T)):
+        *neighbors, first, second = two_of(values, axis)
+        for place, neighbor in enumerate(neighbors):
+            assert_neighbors(*neighbor, lines, place)
+        largest, next_largest = (np.asarray(side.similarity)[:, None] for side in neighbors)
+        at_first, at_second = (lines >= largest).sum(1), (lines >= next_largest).sum(1)
+        has_neighbor = next_largest[:, 0] > -np.inf
+        np.testing.assert_array_equal((first == 1)[has_neighbor], (at_first == 1)[has_neighbor])
+        assert (np.asarray(second)[has_neighbor] >= 2).all()
+        assert (np.asarray(second) <= at_second)[has_neighbor].all()

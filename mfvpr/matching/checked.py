@@ -1,0 +1,210 @@
+"""Mutual nearest neighbors by products of bfloat16, at half the cost of float32, checked where rounding could matter.
+
+Let x, y be descriptors of D dimensions, and x', y' what bfloat16 makes of them. With u = 2^-24, a float32 sum of D
+products in any order is off by at most g |x'| |y'|, g = D u / (1 - D u) (Higham, Accuracy and Stability of Numerical
+Algorithms, 2002, section 3.1), and by Cauchy and Schwarz
+
+    |x'.y' - x.y| <= |x - x'| |y| + |x'| |y - y'|.
+
+A checked product is a float32 product in a fixed order (`checked_product`), off by less than 32 u |x| |y|. The sum e of
+these bounds, with the largest |y| and |y - y'| of the other image, holds for all products of x. Let m be the largest
+rounded product of x, and c the largest checked one, of the neighbor y:
+
+    x'.y' >= c - e >= (checked product of the keypoint with m) - e >= m - 2 e.
+
+So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
+checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
+differ by less than its rounding. If a keypoint has more than `ROUNDS` of them, float32 matches the pair.
+
+The bounds themselves are computed in float32: the constants below are generous enough for that, and for numbers below
+2^-126, which may be taken for 0.
+"""
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import BFloat16, Bool, Float, Int
+
+from mfvpr.matching.similarity import Lines, Nearest, count_from, even_size, lines_of, nearest, without
+from mfvpr.types import Array, Features
+
+ROUNDS = 16  # products that are checked of a keypoint
+GROUP = 64  # keypoints that are checked at the same time
+_PARTS = 8  # of a checked product
+_SMALL = 2.0**-126
+_CPUINFO = Path("/proc/cpuinfo")
+
+
+class Rounded(NamedTuple):
+    """Features of an image, and their descriptors in bfloat16, padded to whole blocks of products."""
+
+    features: Features
+    descriptors: BFloat16[Array, "*_"]  # `[N, D]`, or `[D, N]` of a query
+    norm: Float[Array, "*_"]  # of the float32 descriptors; 0 for padding and NaN
+    residual: Float[Array, "*_"]  # norm of what rounding takes away
+
+
+class Neighbors(NamedTuple):
+    """Neighbors of the query's keypoints, of use where `real`."""
+
+    match: Int[Array, " keypoints0"]
+    real: Bool[Array, " keypoints0"]
+    nearest: Int[Array, " keypoints0"]
+    second: Int[Array, " keypoints0"]  # the nearest of the others
+    has_second: Bool[Array, " keypoints0"]
+
+
+class _Direction(NamedTuple):
+    """Products of every keypoint of an image with all of the other image."""
+
+    products: Float[Array, "keypoints1 keypoints0"]
+    axis: int  # 0 = of the query, 1 = of the candidate
+    descriptors: Float[Array, "own _"]
+    other_descriptors: Float[Array, "other _"]
+    lines: Lines
+    nearest: Nearest
+    window: Float[Array, " own"]  # 2 e
+
+    @property
+    def threshold(self) -> Float[Array, " own"]:
+        return self.nearest.similarity - self.window
+
+    @property
+    def is_close(self) -> Bool[Array, " own"]:
+        """Whether several keypoints may be the nearest."""
+        several = count_from(self.lines, self.nearest, self.threshold) > 1
+        return several & (self.nearest.similarity > -jnp.inf)
+
+
+@cache
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 faster than float32, as far as is known (Linux, x86-64)."""
+    return _CPUINFO.exists() and "avx512_bf16" in _CPUINFO.read_text()
+
+
+def round_query(features: Features) -> Rounded:
+    """Round a query, best once for all of its candidates: transposed, the product is fast."""
+    rounded = round_candidate(features)
+    return rounded._replace(descriptors=rounded.descriptors.T)
+
+
+def round_candidate(features: Features) -> Rounded:
+    """Round a candidate."""
+    rounded = features.descriptors.astype(jnp.bfloat16)
+    lost = features.descriptors - rounded.astype(jnp.float32)
+    missing = even_size(len(rounded)) - len(rounded)
+    norm, residual = (jnp.pad(_norm(rows, features.mask), (0, missing)) for rows in (features.descriptors, lost))
+    return Rounded(features, jnp.pad(rounded, ((0, missing), (0, 0))), norm, residual)
+
+
+def _norm(rows: Float[Array, "rows _"], real: Bool[Array, " rows"]) -> Float[Array, " rows"]:
+    """Norms, slightly above; 0 for padding and NaN, infinite beyond the range of float32."""
+    norm = jnp.sqrt(jnp.sum(rows * rows, axis=1) + rows.shape[1] * _SMALL)
+    return jnp.where(real & ~jnp.isnan(norm), norm, 0.0)
+
+
+def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -> tuple[Neighbors, Bool[Array, ""]]:
+    """Mutual nearest neighbors, with slots of whole blocks, and whether all that could matter was checked."""
+    products = jnp.matmul(candidate.descriptors, query.descriptors, preferred_element_type=jnp.float32)
+    real = (candidate.norm > 0)[:, None] & (query.norm > 0)[None] & jnp.isfinite(products)
+    products = jnp.where(real, products, -jnp.inf)
+    columns = jnp.arange(products.shape[1], dtype=jnp.int32)
+    to1, to0 = _direction(products, 0, query, candidate), _direction(products, 1, candidate, query)
+    # A keypoint without a product that is close to both largest ones has no match.
+    close_to_both = products >= jnp.maximum(to1.threshold[None], to0.threshold[:, None])
+    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0))
+    has_neighbor = to1.nearest.similarity > -jnp.inf
+    may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
+    is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
+    index0, settled0 = _settle(to0, to0.is_close & is_chosen)
+    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
+    if not with_second:
+        return Neighbors(index1, is_match, index1, index1, is_match), settled
+    lines = without(to1.lines, index1)
+    rest = to1._replace(lines=lines, nearest=nearest(lines))
+    second, settled2 = _settle(rest, rest.is_close & is_match, removed=index1)
+    return Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf), settled & settled2
+
+
+def _direction(products: Array, axis: int, own: Rounded, other: Rounded) -> _Direction:
+    lines, descriptors = lines_of(products, axis), other.features.descriptors
+    dimensions = descriptors.shape[1]
+    rounding = (dimensions + 32) * 2.0**-24
+    norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
+    rounded = own.norm + own.residual
+    bound = own.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
+    window = 2.0002 * bound + 4 * dimensions * _SMALL
+    return _Direction(products, axis, own.features.descriptors, descriptors, lines, nearest(lines), window)
+
+
+def _settle(
+    direction: _Direction, wanted: Bool[Array, " own"], *, removed: Int[Array, " own"] | None = None
+) -> tuple[Int[Array, " own"], Bool[Array, ""]]:
+    """Nearest neighbors, by checked products where `wanted`, and whether none has too many of them.
+
+    `removed` are keypoints of the other image that do not count.
+    """
+    axis, count, total = direction.axis, len(wanted), direction.products.shape[direction.axis]
+    size = min(GROUP, count)
+    slots = jnp.nonzero(wanted, size=count + size, fill_value=count)[0].astype(jnp.int32)
+    numbers = jnp.expand_dims(jnp.arange(total, dtype=jnp.int32), 1 - axis)
+
+    def across(values: Array) -> Array:
+        return jnp.expand_dims(values, axis)
+
+    def settle_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        start, index, _ = state
+        places = jax.lax.dynamic_slice_in_dim(slots, start, size)
+        own = jnp.minimum(places, count - 1)
+        products = jnp.take(direction.products, own, axis=1 - axis)
+        if removed is not None:
+            products = jnp.where(numbers == across(removed[own]), -jnp.inf, products)
+        threshold = jnp.where(places < count, direction.threshold[own], jnp.inf)
+        is_close = jax.lax.optimization_barrier(products >= across(threshold))
+        descriptors = direction.descriptors[own]
+
+        def next_after(number: Array) -> Array:
+            return jnp.min(jnp.where(is_close & (numbers > across(number)), numbers, total), axis=axis)
+
+        def check(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            number, largest, best, rounds = state
+            product = checked_product(descriptors, direction.other_descriptors[jnp.minimum(number, total - 1)])
+            is_larger = (number < total) & (product > largest)
+            best = jnp.where(is_larger, number, best)
+            return next_after(number), jnp.where(is_larger, product, largest), best, rounds + 1
+
+        first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
+        number, _, best, _ = jax.lax.while_loop(
+            lambda state: (state[0] < total).any() & (state[3] < ROUNDS),
+            check, (first, lowest, index[own], jnp.int32(0)),
+        )  # fmt: skip
+        return start + size, index.at[places].set(best, mode="drop"), (number == total).all()
+
+    _, index, settled = jax.lax.while_loop(
+        lambda state: (state[0] < jnp.sum(wanted)) & state[2],
+        settle_group, (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
+    )  # fmt: skip
+    return index, settled
+
+
+def checked_product(rows0: Float[Array, "rows _"], rows1: Float[Array, "rows _"]) -> Float[Array, " rows"]:
+    """Products of rows in float32, summed in an order that is the same everywhere.
+
+    The products of the dimensions, padded with zeros to 8 * 2^n, are split into 8 equal parts. These are added one
+    after the other, then the first half of the sums to the second until one is left.
+    """
+    length = _PARTS * (1 << max(0, -(-rows0.shape[1] // _PARTS) - 1).bit_length())
+    products = jnp.pad(rows0 * rows1, ((0, 0), (0, length - rows0.shape[1])))
+    # Without the barriers, a product and a sum could become one operation that rounds once.
+    parts = jax.lax.optimization_barrier(products).reshape(len(products), _PARTS, -1)
+    sums = parts[:, 0]
+    for part in range(1, _PARTS):
+        sums = sums + parts[:, part]
+    sums = jax.lax.optimization_barrier(sums)
+    while sums.shape[1] > 1:
+        half = sums.shape[1] // 2
+        sums = sums[:, :half] + sums[:, half:]
+    return sums[:, 0]
