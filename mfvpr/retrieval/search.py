@@ -53,12 +53,18 @@ class ExactSearch:
             raise InputError(f"excluded: expected rows for {len(queries)} queries and {len(database)} database images, "
                              f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
         chunk_size = self._chunk_size(len(queries), min(len(database), ROWS))
-        shortlists = []
-        for part in _parts(len(queries), chunk_size):
-            allowed = None if excluded is None else repeat_last(~excluded.dense(part), chunk_size)
-            shortlist = _shortlist(repeat_last(queries[part], chunk_size), database, num_candidates, allowed)
-            shortlists.append(jax.tree.map(lambda field: field[: part.stop - part.start], shortlist))  # noqa: B023
-        return jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists)
+        shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
+        for rows in _parts(len(database), ROWS):
+            on_device = jax.device_put(database[rows])  # once for all chunks
+            for part in _parts(len(queries), chunk_size):
+                mask = None if excluded is None else repeat_last(~excluded.dense(part)[:, rows], chunk_size)
+                chunk = repeat_last(queries[part], chunk_size)
+                shortlist = retrieve(chunk, on_device, num_candidates=num_candidates, mask=mask)
+                best = shortlists.get(part.start)
+                shortlist = shortlist if best is None else _best(best, shortlist, rows.start)
+                shortlists[part.start] = jax.tree.map(np.asarray, shortlist)  # waits: one chunk at a time
+        joined = jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists.values())
+        return jax.tree.map(lambda field: field[: len(queries)], joined)
 
     def _chunk_size(self, num_queries: int, num_rows: int) -> int:
         """Queries at a time, at least 2, with similarities to `num_rows` rows that fit."""
@@ -143,18 +149,6 @@ def _project(
     whitened = jnp.matmul(rows - mean[None], components.T, precision=jax.lax.Precision.HIGHEST)[: len(descriptors)]
     lengths = jnp.linalg.norm(whitened, axis=1, keepdims=True)
     return whitened / jnp.where(lengths > 0, lengths, 1)
-
-
-def _shortlist(
-    queries: Queries, database: Database, num_candidates: int, allowed: Bool[np.ndarray, "queries database"] | None
-) -> Shortlist:
-    """Shortlist of a chunk of queries, `ROWS` of the database at a time; the first row wins a tie."""
-    best: Shortlist | None = None
-    for part in _parts(len(database), ROWS):
-        mask = None if allowed is None else allowed[:, part]
-        shortlist = retrieve(queries, database[part], num_candidates=num_candidates, mask=mask)
-        best = shortlist if best is None else _best(best, shortlist, part.start)
-    return jax.tree.map(np.asarray, best)
 
 
 @compiled

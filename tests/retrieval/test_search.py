@@ -64,6 +64,19 @@ def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_
         np.testing.assert_array_equal(shortlist.scores, together.scores)
 
 
+@pytest.mark.parametrize("rows", [1, 7, 30])
+def test_parts_of_the_database_change_nothing(rows, monkeypatch):
+    rng = np.random.default_rng(3)
+    queries, database = unit(rng.normal(size=(11, 8))), unit(rng.normal(size=(30, 8)))
+    excluded = Positives.from_rows([rng.permutation(30)[: row % 5] for row in range(11)], 30)
+    search = ExactSearch(1e-9 * 8 * 4 * rows)  # parts of 4 queries
+    expected = retrieve(queries, database, num_candidates=6, mask=~excluded.dense(slice(0, 11)))
+    monkeypatch.setattr(retrieval, "ROWS", rows)
+    shortlist = search.shortlist(queries, database, 6, excluded=excluded)
+    np.testing.assert_array_equal(shortlist.indices, expected.indices)
+    np.testing.assert_allclose(shortlist.scores, expected.scores, atol=1e-6)
+
+
 @pytest.mark.optimized
 def test_a_whitened_query_has_the_same_bits_alone_and_in_company():
     rng = np.random.default_rng(1)
