@@ -43,15 +43,17 @@ _OUTPUT = (
 
 
 class Conv3x3(nnx.Module):
-    """3 x 3 convolution that keeps the size: `kernel` `[3, 3, C, D]`, `bias` `[D]`; zeros outside.
+    """3 x 3 convolution that keeps the size: `kernel` `[3, 3, C, D]`, `bias` `[D]` or none; zeros outside.
 
     `dilation` is the distance between the kernel's columns and rows.
     """
 
-    def __init__(self, inputs: int, outputs: int, *, dilation: int = 1, precision: str, rngs: nnx.Rngs) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, *, dilation: int = 1, use_bias: bool = True, precision: str, rngs: nnx.Rngs
+    ) -> None:
         initial = nnx.initializers.he_normal()
         self.kernel = nnx.Param(initial(rngs.params(), (3, 3, inputs, outputs), jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32)) if use_bias else None
         self.dilation = dilation
         self.precision = precision
 
@@ -67,7 +69,7 @@ class Conv3x3(nnx.Module):
 
         is_wide = x.shape[-1] >= _WIDE
         product = lax.platform_dependent(x, kernel, cpu=fast, default=direct) if is_wide else direct(x, kernel)
-        return product + self.bias[...][None, None, None]
+        return product if self.bias is None else product + self.bias[...][None, None, None]
 
 
 def winograd(

@@ -3,11 +3,14 @@
 Batch normalization uses its running statistics, since the network only extracts features.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from flax import nnx
 from jax import lax
 from jaxtyping import Float
 
+from mfvpr.networks.convolution import Conv3x3
 from mfvpr.networks.imagenet import Images
 from mfvpr.types import Array
 
@@ -35,7 +38,10 @@ class Bottleneck(nnx.Module):
         outputs = _EXPANSION * width
         self.conv1 = PointwiseConv(inputs, width, precision=precision, rngs=rngs)
         self.bn1 = _norm(width, rngs=rngs)
-        self.conv2 = _conv(width, width, 3, stride=stride, precision=precision, rngs=rngs)
+        if stride == 1:
+            self.conv2 = Conv3x3(width, width, use_bias=False, precision=precision, rngs=rngs)
+        else:
+            self.conv2 = _conv(width, width, 3, stride=stride, precision=precision, rngs=rngs)
         self.bn2 = _norm(width, rngs=rngs)
         self.conv3 = PointwiseConv(width, outputs, precision=precision, rngs=rngs)
         self.bn3 = _norm(outputs, rngs=rngs)
@@ -48,7 +54,7 @@ class Bottleneck(nnx.Module):
         shortcut = self.shortcut_bn(self.shortcut(x)) if self.has_projection else x
         x = nnx.relu(self.bn1(self.conv1(x)))
         x = nnx.relu(self.bn2(self.conv2(x)))
-        return _compute_once(nnx.relu(self.bn3(self.conv3(x)) + shortcut))
+        return _compute_once(lambda x, shortcut: nnx.relu(self.bn3(x) + shortcut), self.conv3(x), shortcut)
 
 
 class ResNet50(nnx.Module):
@@ -93,15 +99,15 @@ def _norm(channels: int, *, rngs: nnx.Rngs) -> nnx.BatchNorm:
     return nnx.BatchNorm(channels, use_running_average=True, epsilon=1e-5, rngs=rngs)
 
 
-def _compute_once(x: Array) -> Array:
-    """`x`, computed only once on a CPU.
+def _compute_once(function: Callable[[Array, Array], Array], x: Array, y: Array) -> Array:
+    """Result of a function of two maps of one size, computed only once on a CPU.
 
     XLA's CPU compiler recomputes a cheap sum for each of its uses, and thus the whole chain of residuals, which doubles
     MixVPR's time. It removes `optimization_barrier` before this step, but keeps a condition, here one that is true for
     every number and for NaN. The compilers of other platforms do not need it.
     """
 
-    def behind_condition(x: Array) -> Array:
-        return lax.cond(x[(0,) * x.ndim] * 0 != 1, lambda x: x, jnp.negative, x)
+    def behind_condition(x: Array, y: Array) -> Array:
+        return lax.cond(x[(0,) * x.ndim] * 0 != 1, function, lax.sub, x, y)
 
-    return lax.platform_dependent(x, cpu=behind_condition, default=lambda x: x)
+    return lax.platform_dependent(x, y, cpu=behind_condition, default=function)
