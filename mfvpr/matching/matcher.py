@@ -20,7 +20,7 @@ from mfvpr.matching.nearest_neighbors import (
     pairs_at_once,
     prepare_query,
     with_concrete_sizes,
-)  # fmt: skip
+)
 from mfvpr.types import Array, Features, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array, compiled, is_concrete

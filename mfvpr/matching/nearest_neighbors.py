@@ -19,7 +19,7 @@ from mfvpr.matching.checked import (
     mutual_neighbors,
     round_candidate,
     round_query,
-)  # fmt: skip
+)
 from mfvpr.matching.similarity import even_size, lines_of, nearest, without
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 from mfvpr.utils import ragged
@@ -155,15 +155,19 @@ def choose_product(
     product: Product | None, queries: Features, candidates: Features, cross_check: CrossCheck, chunk_size: int
 ) -> Product:
     """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster."""
-    is_single = jax.eval_shape(at_least_single, queries.descriptors).dtype == jnp.float32
-    lengths = {np.shape(side.descriptors)[-1] for side in (queries, candidates)}
-    has_slots = 0 not in (queries.mask.shape[-1], candidates.mask.shape[-1])
+    sides = queries, candidates
+    lengths = {np.shape(side.descriptors)[-1] for side in sides}
+    if product is None:
+        is_faster = min(lengths) >= LEAST_DIMENSIONS and device_of(sides).platform == "cpu" and has_bfloat16()
+        if not is_faster:
+            return "float32"
+    else:
+        require_word("product", product, Product)
+    is_single = all(jax.eval_shape(at_least_single, side.descriptors).dtype == jnp.float32 for side in sides)
+    has_slots = all(side.mask.shape[-1] for side in sides)
     is_possible = cross_check == "mutual" and chunk_size == 1 and is_single and has_slots and len(lengths) == 1
     if product is None:
-        is_faster = min(lengths) >= LEAST_DIMENSIONS and has_bfloat16()
-        on_processor = device_of((queries, candidates)).platform == "cpu"
-        return "bfloat16" if is_possible and is_faster and on_processor else "float32"
-    require_word("product", product, Product)
+        return "bfloat16" if is_possible else "float32"
     if product == "bfloat16" and not is_possible:
         raise ValueError("product=bfloat16: expected cross_check=mutual, chunk_size=1, single precision, images "
                          "with slots, and descriptors of one length; leave product out")  # fmt: skip
