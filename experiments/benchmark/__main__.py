@@ -14,6 +14,7 @@ PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
+    "search": "nearest global descriptors of 1, 20 and 100 queries among 10,000 and 100,000 (5 rounds; 6 GB)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",

@@ -7,6 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+from experiments.benchmark import search
 from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.checkpoints.networks import NETWORKS, Network
 from mfvpr.checkpoints.tables import SELAVPR
@@ -97,6 +98,14 @@ def test_report_has_everyone(contest):
     remarks = "\n".join(written["remarks"])
     for wanted in ("detection adds", "aliked-n16 features, batch 2: keypoints per image: mfvpr", "RTX 2080 Ti"):
         assert wanted in remarks
+
+
+def test_all_searches_give_the_same_rows(monkeypatch):
+    monkeypatch.setattr(search, "QUERIES", (1, 3))
+    results = {(step, name): call() for step, name, call in search.search_entries(200, 24)}
+    for (step, _), rows in results.items():
+        assert rows.shape == (int(step.split()[0]), search.CANDIDATES)
+        np.testing.assert_array_equal(rows, results[step, "NumPy"])
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
