@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import BFloat16, Bool, Float, Int
 
-from mfvpr.matching.similarity import Lines, Nearest, count_from, even_size, lines_of, nearest, without
+from mfvpr.matching.similarity import Lines, Nearest, count_from, entries_from, even_size, lines_of, nearest, without
 from mfvpr.types import Array, Features
 
 ROUNDS = 16  # products that are checked of a keypoint
@@ -60,8 +60,6 @@ class Neighbors(NamedTuple):
 class _Direction(NamedTuple):
     """Products of every keypoint of an image with all of the other image."""
 
-    products: Float[Array, "keypoints1 keypoints0"]
-    axis: int  # 0 = of the query, 1 = of the candidate
     descriptors: Float[Array, "own _"]
     other_descriptors: Float[Array, "other _"]
     lines: Lines
@@ -125,7 +123,7 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
         return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
     rest = to1._replace(lines=lines, nearest=nearest(lines))
-    second, settled2 = _settle(rest, rest.is_close & is_match, removed=index1)
+    second, settled2 = _settle(rest, rest.is_close & is_match)
     return Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf), settled & settled2
 
 
@@ -137,51 +135,36 @@ def _direction(products: Array, axis: int, own: Rounded, other: Rounded) -> _Dir
     rounded = own.norm + own.residual
     bound = own.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
     window = 2.0002 * bound + 4 * dimensions * _SMALL
-    return _Direction(products, axis, own.features.descriptors, descriptors, lines, nearest(lines), window)
+    return _Direction(own.features.descriptors, descriptors, lines, nearest(lines), window)
 
 
-def _settle(
-    direction: _Direction, wanted: Bool[Array, " own"], *, removed: Int[Array, " own"] | None = None
-) -> tuple[Int[Array, " own"], Bool[Array, ""]]:
-    """Nearest neighbors, by checked products where `wanted`, and whether none has too many of them.
-
-    `removed` are keypoints of the other image that do not count.
-    """
-    axis, count, total = direction.axis, len(wanted), direction.products.shape[direction.axis]
+def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Array, " own"], Bool[Array, ""]]:
+    """Nearest neighbors, by checked products where `wanted`, and whether none has too many of them."""
+    count = len(wanted)
     size = min(GROUP, count)
     slots = jnp.nonzero(wanted, size=count + size, fill_value=count)[0].astype(jnp.int32)
-    numbers = jnp.expand_dims(jnp.arange(total, dtype=jnp.int32), 1 - axis)
-
-    def across(values: Array) -> Array:
-        return jnp.expand_dims(values, axis)
 
     def settle_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, index, _ = state
         places = jax.lax.dynamic_slice_in_dim(slots, start, size)
         own = jnp.minimum(places, count - 1)
-        products = jnp.take(direction.products, own, axis=1 - axis)
-        if removed is not None:
-            products = jnp.where(numbers == across(removed[own]), -jnp.inf, products)
         threshold = jnp.where(places < count, direction.threshold[own], jnp.inf)
-        is_close = jax.lax.optimization_barrier(products >= across(threshold))
+        next_after, end = entries_from(direction.lines, own, threshold)
         descriptors = direction.descriptors[own]
-
-        def next_after(number: Array) -> Array:
-            return jnp.min(jnp.where(is_close & (numbers > across(number)), numbers, total), axis=axis)
 
         def check(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             number, largest, best, rounds = state
-            product = checked_product(descriptors, direction.other_descriptors[jnp.minimum(number, total - 1)])
-            is_larger = (number < total) & (product > largest)
+            product = checked_product(descriptors, direction.other_descriptors[number])
+            is_larger = (number < end) & (product > largest)
             best = jnp.where(is_larger, number, best)
             return next_after(number), jnp.where(is_larger, product, largest), best, rounds + 1
 
         first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
         number, _, best, _ = jax.lax.while_loop(
-            lambda state: (state[0] < total).any() & (state[3] < ROUNDS),
+            lambda state: (state[0] < end).any() & (state[3] < ROUNDS),
             check, (first, lowest, index[own], jnp.int32(0)),
         )  # fmt: skip
-        return start + size, index.at[places].set(best, mode="drop"), (number == total).all()
+        return start + size, index.at[places].set(best, mode="drop"), (number == end).all()
 
     _, index, settled = jax.lax.while_loop(
         lambda state: (state[0] < jnp.sum(wanted)) & state[2],

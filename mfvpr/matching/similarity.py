@@ -4,6 +4,7 @@ Each direction reads the matrix once, for the maximum of every block of about 30
 largest maximum again: several times faster than `argmax` on XLA's CPU backend.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -66,6 +67,34 @@ def count_from(lines: Lines, neighbors: Nearest, threshold: Float[Array, " lines
     threshold = jnp.expand_dims(threshold, lines.axis)
     entries = _take_block(lines, neighbors.index // lines.length) >= threshold
     return jnp.sum(lines.maxima >= threshold, axis=lines.axis) + jnp.sum(entries, axis=lines.axis) - 1
+
+
+def entries_from(
+    lines: Lines, places: Int[Array, " some"], threshold: Float[Array, " some"]
+) -> tuple[Callable[[Array], Array], int]:
+    """Function that finds the next entry of at least the threshold in some lines, and the number that stands for none.
+
+    It takes the numbers `[some]` of the entries before; -1 finds the first.
+    """
+    maxima = lines.maxima[places] if lines.axis else lines.maxima[:, places].T  # [some, blocks]
+    blocks, number_in_block = jnp.arange(maxima.shape[1], dtype=jnp.int32), jnp.arange(lines.length, dtype=jnp.int32)
+    end = maxima.shape[1] * lines.length
+    has_entry = maxima >= threshold[:, None]
+
+    def first_in(block: Array, number: Array) -> Array:
+        values = lines.blocks[places, block] if lines.axis else lines.blocks[block, :, places]  # [some, entries]
+        numbers = block[:, None] * lines.length + number_in_block[None]
+        is_next = (values >= threshold[:, None]) & (numbers > number[:, None])
+        if lines.removed is not None:
+            is_next &= numbers != lines.removed[places, None]
+        return jnp.min(jnp.where(is_next, numbers, end), axis=1)
+
+    def next_after(number: Array) -> Array:
+        block = number // lines.length
+        later = jnp.min(jnp.where(has_entry & (blocks[None] > block[:, None]), blocks[None], len(blocks)), axis=1)
+        return jnp.minimum(first_in(block, number), first_in(later, number))
+
+    return next_after, end
 
 
 def _first_true(hits: Array, axis: int) -> Array:
