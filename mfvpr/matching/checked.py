@@ -1,4 +1,4 @@
-"""Mutual nearest neighbors by products of bfloat16, at half the cost of float32, checked where rounding could matter.
+"""Mutual nearest neighbors by products of bfloat16, checked where rounding could matter.
 
 Let x, y be descriptors of D dimensions, and x', y' what bfloat16 makes of them. With u = 2^-24, a float32 sum of D
 products in any order is off by at most g |x'| |y'|, g = D u / (1 - D u) (Higham, Accuracy and Stability of Numerical
@@ -16,8 +16,8 @@ So the neighbor is among the keypoints with rounded products of at least m - 2 e
 checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
 differ by less than its rounding. If a keypoint has more than `ROUNDS` of them, float32 matches the pair.
 
-The bounds themselves are computed in float32: the constants below are generous enough for that, and for numbers below
-2^-126, which may be taken for 0.
+The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
+2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
 """
 
 from functools import cache
@@ -34,7 +34,7 @@ from mfvpr.types import Array, Features
 ROUNDS = 16  # products that are checked of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
 _PARTS = 8  # of a checked product
-_SMALL = 2.0**-126
+_SMALL, _LARGE = 2.0**-126, 2.0**126
 _CPUINFO = Path("/proc/cpuinfo")
 
 
@@ -43,7 +43,7 @@ class Rounded(NamedTuple):
 
     features: Features
     descriptors: BFloat16[Array, "*_"]  # `[N, D]`, or `[D, N]` of a query
-    norm: Float[Array, "*_"]  # of the float32 descriptors; 0 for padding and NaN
+    norm: Float[Array, "*_"]  # of the float32 descriptors; 0 for padding, NaN and infinity
     residual: Float[Array, "*_"]  # norm of what rounding takes away
 
 
@@ -94,14 +94,15 @@ def round_candidate(features: Features) -> Rounded:
     rounded = features.descriptors.astype(jnp.bfloat16)
     lost = features.descriptors - rounded.astype(jnp.float32)
     missing = even_size(len(rounded)) - len(rounded)
-    norm, residual = (jnp.pad(_norm(rows, features.mask), (0, missing)) for rows in (features.descriptors, lost))
+    norms = [_norm(rows) for rows in (features.descriptors, lost)]
+    is_number = features.mask & ~jnp.isnan(norms[0]) & ~jnp.isnan(norms[1])  # rounding takes NaN away from infinity
+    norm, residual = (jnp.pad(jnp.where(is_number, norm, 0.0), (0, missing)) for norm in norms)
     return Rounded(features, jnp.pad(rounded, ((0, missing), (0, 0))), norm, residual)
 
 
-def _norm(rows: Float[Array, "rows _"], real: Bool[Array, " rows"]) -> Float[Array, " rows"]:
-    """Norms, slightly above; 0 for padding and NaN, infinite beyond the range of float32."""
-    norm = jnp.sqrt(jnp.sum(rows * rows, axis=1) + rows.shape[1] * _SMALL)
-    return jnp.where(real & ~jnp.isnan(norm), norm, 0.0)
+def _norm(rows: Float[Array, "rows _"]) -> Float[Array, " rows"]:
+    """Norms above 0, infinite beyond the range of float32."""
+    return jnp.sqrt(jnp.sum(rows * rows, axis=1) + rows.shape[1] * _SMALL)
 
 
 def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -> tuple[Neighbors, Bool[Array, ""]]:
@@ -118,7 +119,9 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
     is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
     index0, settled0 = _settle(to0, to0.is_close & is_chosen)
+    longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
     is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
+    settled &= longest0 * longest1 < _LARGE  # not NaN either
     if not with_second:
         return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
@@ -134,7 +137,7 @@ def _direction(products: Array, axis: int, own: Rounded, other: Rounded) -> _Dir
     norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
     rounded = own.norm + own.residual
     bound = own.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
-    window = 2.0002 * bound + 4 * dimensions * _SMALL
+    window = 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
     return _Direction(own.features.descriptors, descriptors, lines, nearest(lines), window)
 
 

@@ -38,8 +38,8 @@ class Matcher(Protocol):
     included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
     needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs
     that are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
-    An optional method `prepare(queries, candidates)` returns what stands in for the queries if pairs are matched one by
-    one: arrays with a leading axis for the queries.
+    An optional method `prepare(queries, candidates, chunk_size)` returns what stands in for the queries, once for all
+    their pairs: arrays with a leading axis for the queries.
     """
 
     def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
@@ -62,9 +62,9 @@ class NearestNeighborMatcher:
     chunk_size: int | None = field(default=None, metadata={"static": True})
     product: Product | None = field(default=None, metadata={"static": True, "recipe": False})
 
-    def prepare(self, queries: Features, candidates: Features) -> Features | Rounded:
+    def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Features | Rounded:
         """The queries, or what products of bfloat16 need of them."""
-        product = choose_product(self.product, queries, candidates, self.cross_check, chunk_size=1)
+        product = choose_product(self.product, queries, candidates, self.cross_check, chunk_size)
         return queries if product == "float32" else jax.vmap(prepare_query)(queries)
 
     def __call__(self, features0: Features | Rounded, features1: Features) -> Matches:
@@ -123,7 +123,7 @@ def _match_pairs(
     queries: Features, candidates: Features, pairs: Array, count: Array, matcher: Matcher, *, chunk_size: int
 ) -> Matches:
     prepare = getattr(matcher, "prepare", None)
-    sides = queries if prepare is None or chunk_size > 1 else prepare(queries, candidates), candidates
+    sides = queries if prepare is None else prepare(queries, candidates, chunk_size), candidates
 
     def match_pair(pair: Array) -> Matches:
         query, candidate = (

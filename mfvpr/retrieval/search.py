@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mfvpr.datasets.positives import Positives
 from mfvpr.types import Array, Shortlist
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import at_least_single, compiled, device_of, free_bytes, masked
+from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked
 from mfvpr.utils.ragged import repeat_last
 from mfvpr.utils.whitening import Whitening, fit_whitening
 
@@ -55,7 +55,7 @@ class ExactSearch:
         chunk_size = self._chunk_size(len(queries), min(len(database), ROWS))
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
         for rows in _parts(len(database), ROWS):
-            on_device = jax.device_put(database[rows])  # once for all chunks
+            on_device = jax.device_put(as_array(database[rows]))  # once for all chunks
             for part in _parts(len(queries), chunk_size):
                 mask = None if excluded is None else repeat_last(~excluded.dense(part)[:, rows], chunk_size)
                 chunk = repeat_last(queries[part], chunk_size)

@@ -129,7 +129,7 @@ def test_neighbors_of_bfloat16_alone_are_wrong(kind):
 
 def test_the_bound_holds_and_is_needed(monkeypatch):
     """With no room for rounding, neighbors are wrong."""
-    monkeypatch.setattr(checked, "_norm", lambda rows, real: jnp.where(real, 1e-6, 0.0))
+    monkeypatch.setattr(checked, "_norm", lambda rows: jnp.full(len(rows), 1e-6))
     wrong = 0
     for seed in range(4):
         query, candidate = make_pair("positive", seed, (400, 500))
@@ -166,6 +166,30 @@ def test_too_many_close_products_are_left_to_float32(with_ratio):
     assert np.flatnonzero(matches.mask[0]).tolist() == [0]
     for name, values in per_match(in_single).items():
         np.testing.assert_array_equal(np.asarray(getattr(matches, name))[0, 0], np.asarray(values)[0, 0])
+
+
+@pytest.mark.parametrize("kind", ["infinite", "far too long", "rounded to infinity", "overflow"])
+def test_numbers_out_of_range_match_as_in_float32(kind):
+    rng = np.random.default_rng(1)
+    query, candidate = make_features(rng, 40, dimension=256), make_features(rng, 12, capacity=16, dimension=256)
+    candidate.descriptors[:12] = unit(query.descriptors[:12] + 0.03 * rng.normal(size=(12, 256)))
+    candidate.descriptors[12:] = 5 * query.descriptors.sum(axis=0)  # padding
+    if kind == "infinite":
+        candidate.descriptors[11, 5] = np.inf
+    elif kind == "far too long":
+        query.descriptors[3] *= 1e20
+    elif kind == "rounded to infinity":
+        query.descriptors[3, 0] = 3.4e38
+    else:
+        query.descriptors[3], candidate.descriptors[:2] = 1.1513e18, np.array([[1.1513e18], [0.5757e18]])
+    batch = stack([candidate])
+    rounded = rounded_once(query, batch, True)
+    in_single = mfvpr.match_candidates(query, batch, with_ratio=True, product="float32")
+    mask = np.asarray(in_single.mask)
+    assert mask.sum() >= 2
+    np.testing.assert_array_equal(rounded.mask, mask)
+    for name, values in per_match(in_single).items():
+        np.testing.assert_array_equal(np.asarray(getattr(rounded, name))[mask], np.asarray(values)[mask])
 
 
 def test_features_of_images_match_as_in_float32_by_candidates_and_by_pairs():
@@ -223,3 +247,6 @@ def test_bfloat16_is_taken_for_long_descriptors_where_it_is_faster(monkeypatch):
         mfvpr.match_candidates(long, stack([long]), cross_check="none", product="bfloat16")
     with pytest.raises(ValueError, match="expected one of bfloat16, float32"):
         mfvpr.match_candidates(long, stack([long]), product="half")
+    pairs = np.zeros((2, 2), np.int32)
+    with pytest.raises(ValueError, match="chunk_size=1"):
+        match_pairs(*[stack([long])] * 2, pairs, 2, mfvpr.NearestNeighborMatcher(product="bfloat16", chunk_size=2))
