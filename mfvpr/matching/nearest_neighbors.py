@@ -28,7 +28,7 @@ from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, device
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
 Product = Literal["bfloat16", "float32"]
-LEAST_DIMENSIONS = 256  # with fewer, checking takes the time that products of bfloat16 save
+LEAST_DIMENSIONS = 256  # with fewer, products of bfloat16 gain little
 MEMORY_SHARE = 1 / 256  # of a device's memory, for the similarity matrices that exist at the same time
 
 
