@@ -20,8 +20,6 @@ The bounds themselves are computed in float32, off by a share of at most 4 g, wh
 2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
 """
 
-from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -35,7 +33,6 @@ ROUNDS = 16  # products that are checked of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
 _PARTS = 8  # of a checked product
 _SMALL, _LARGE = 2.0**-126, 2.0**126
-_CPUINFO = Path("/proc/cpuinfo")
 
 
 class Rounded(NamedTuple):
@@ -56,12 +53,16 @@ class Neighbors(NamedTuple):
     second: Int[Array, " keypoints0"]  # the nearest of the others
     has_second: Bool[Array, " keypoints0"]
 
+    def of(self, features: Features) -> "Neighbors":
+        """Neighbors of the slots of these features, without those that fill up the last block of products."""
+        return Neighbors(*(values[: features.mask.shape[-1]] for values in self))
+
 
 class _Direction(NamedTuple):
     """Products of every keypoint of an image with all of the other image."""
 
     descriptors: Float[Array, "own _"]
-    other_descriptors: Float[Array, "other _"]
+    other_descriptors: Float[Array, "_ _"]
     lines: Lines
     nearest: Nearest
     window: Float[Array, " own"]  # 2 e
@@ -75,12 +76,6 @@ class _Direction(NamedTuple):
         """Whether several keypoints may be the nearest."""
         several = count_from(self.lines, self.nearest, self.threshold) > 1
         return several & (self.nearest.similarity > -jnp.inf)
-
-
-@cache
-def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 faster than float32, as far as is known (Linux, x86-64)."""
-    return _CPUINFO.exists() and "avx512_bf16" in _CPUINFO.read_text()
 
 
 def round_query(features: Features) -> Rounded:
@@ -106,7 +101,7 @@ def _norm(rows: Float[Array, "rows _"]) -> Float[Array, " rows"]:
 
 
 def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -> tuple[Neighbors, Bool[Array, ""]]:
-    """Mutual nearest neighbors, with slots of whole blocks, and whether all that could matter was checked."""
+    """Mutual nearest neighbors, and whether all that could matter was checked."""
     products = jnp.matmul(candidate.descriptors, query.descriptors, preferred_element_type=jnp.float32)
     real = (candidate.norm > 0)[:, None] & (query.norm > 0)[None] & jnp.isfinite(products)
     products = jnp.where(real, products, -jnp.inf)
@@ -123,22 +118,23 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
     settled &= longest0 * longest1 < _LARGE  # not NaN either
     if not with_second:
-        return Neighbors(index1, is_match, index1, index1, is_match), settled
+        return Neighbors(index1, is_match, index1, index1, is_match).of(query.features), settled
     lines = without(to1.lines, index1)
     rest = to1._replace(lines=lines, nearest=nearest(lines))
     second, settled2 = _settle(rest, rest.is_close & is_match)
-    return Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf), settled & settled2
+    neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
+    return neighbors.of(query.features), settled & settled2
 
 
-def _direction(products: Array, axis: int, own: Rounded, other: Rounded) -> _Direction:
+def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
     lines, descriptors = lines_of(products, axis), other.features.descriptors
     dimensions = descriptors.shape[1]
     rounding = (dimensions + 32) * 2.0**-24
     norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
-    rounded = own.norm + own.residual
-    bound = own.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
+    rounded = image.norm + image.residual
+    bound = image.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
     window = 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
-    return _Direction(own.features.descriptors, descriptors, lines, nearest(lines), window)
+    return _Direction(image.features.descriptors, descriptors, lines, nearest(lines), window)
 
 
 def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Array, " own"], Bool[Array, ""]]:
@@ -150,10 +146,10 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
     def settle_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, index, _ = state
         places = jax.lax.dynamic_slice_in_dim(slots, start, size)
-        own = jnp.minimum(places, count - 1)
-        threshold = jnp.where(places < count, direction.threshold[own], jnp.inf)
-        next_after, end = entries_from(direction.lines, own, threshold)
-        descriptors = direction.descriptors[own]
+        keypoints = jnp.minimum(places, count - 1)
+        threshold = jnp.where(places < count, direction.threshold[keypoints], jnp.inf)
+        next_after, end = entries_from(direction.lines, keypoints, threshold)
+        descriptors = direction.descriptors[keypoints]
 
         def check(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             number, largest, best, rounds = state
@@ -165,7 +161,7 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
         first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
         number, _, best, _ = jax.lax.while_loop(
             lambda state: (state[0] < end).any() & (state[3] < ROUNDS),
-            check, (first, lowest, index[own], jnp.int32(0)),
+            check, (first, lowest, index[keypoints], jnp.int32(0)),
         )  # fmt: skip
         return start + size, index.at[places].set(best, mode="drop"), (number == end).all()
 

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.matching.checked import (
     Neighbors,
     Rounded,
-    has_bfloat16,
     mutual_neighbors,
     round_candidate,
     round_query,
@@ -24,7 +23,16 @@ from mfvpr.matching.similarity import even_size, lines_of, nearest, without
 from mfvpr.types import Array, Features, Matches, per_keypoint, per_match
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import at_least_single, compiled, device_bytes, device_of, is_concrete, masked, safe_sqrt
+from mfvpr.utils.numerics import (
+    at_least_single,
+    compiled,
+    device_bytes,
+    device_of,
+    has_bfloat16,
+    is_concrete,
+    masked,
+    safe_sqrt,
+)
 
 CrossCheck = Literal["mutual", "opencv_legacy", "none", "candidate"]
 Product = Literal["bfloat16", "float32"]
@@ -80,10 +88,8 @@ def match_rounded(query: Rounded, candidate: Features, *, with_ratio: bool) -> M
 
 
 def _matches_of(features0: Features, features1: Features, neighbors: Neighbors, *, with_ratio: bool) -> Matches:
-    """Matches of `ready` features, for neighbors with slots of whole blocks."""
-    neighbors = Neighbors(*(values[: features0.mask.shape[-1]] for values in neighbors))
-    of_ratio = neighbors.nearest, neighbors.second, neighbors.has_second
-    ratio = _distance_ratio(features0, features1, *of_ratio) if with_ratio else None
+    """Matches of `ready` features."""
+    ratio = _distance_ratio(features0, features1, neighbors) if with_ratio else None
     return make_matches(features0, features1, neighbors.match, neighbors.real, ratio=ratio)
 
 
@@ -302,20 +308,20 @@ def _distance(
 
 def distance_ratio(features0: Features, features1: Features) -> Float[Array, " keypoints0"]:
     """Ratio as in `match`, for features that are `ready`."""
-    neighbors = _neighbors(features0, features1, "none", with_second=True)
-    return _matches_of(features0, features1, neighbors, with_ratio=True).ratio
+    return _distance_ratio(features0, features1, _neighbors(features0, features1, "none", with_second=True))
 
 
-def _distance_ratio(
-    features0: Features, features1: Features, nearest1: Array, second1: Array, has_second: Array
-) -> Float[Array, " keypoints0"]:
-    closest, second = (_distance(features0, features1, index, has_second) for index in (nearest1, second1))
+def _distance_ratio(features0: Features, features1: Features, neighbors: Neighbors) -> Float[Array, " keypoints0"]:
+    has_second = neighbors.has_second
+    closest, second = (
+        _distance(features0, features1, index, has_second) for index in (neighbors.nearest, neighbors.second)
+    )
     differ = has_second & (closest < second)  # False if both are 0, and if rounding swaps two equal distances
     return jnp.where(differ, closest / jnp.where(differ, second, 1.0), 1.0)
 
 
 def _neighbors(features0: Features, features1: Features, cross_check: CrossCheck, *, with_second: bool) -> Neighbors:
-    """Neighbors by products of single precision, with slots of whole blocks."""
+    """Neighbors by products of single precision."""
     similarity = _similarity(_pad_to_blocks(features0), _pad_to_blocks(features1))
     rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
     lines = lines_of(similarity, axis=1)
@@ -330,4 +336,5 @@ def _neighbors(features0: Features, features1: Features, cross_check: CrossCheck
         picked = jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf)
         match, largest = nearest(lines_of(picked, axis=1))
         real = jnp.isfinite(largest)
-    return Neighbors(match, real, nearest1.index, second1.index, second1.similarity > -jnp.inf)
+    neighbors = Neighbors(match, real, nearest1.index, second1.index, second1.similarity > -jnp.inf)
+    return neighbors.of(features0)

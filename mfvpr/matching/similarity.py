@@ -70,19 +70,19 @@ def count_from(lines: Lines, neighbors: Nearest, threshold: Float[Array, " lines
 
 
 def entries_from(
-    lines: Lines, places: Int[Array, " some"], threshold: Float[Array, " some"]
+    lines: Lines, places: Int[Array, " chosen"], threshold: Float[Array, " chosen"]
 ) -> tuple[Callable[[Array], Array], int]:
-    """Function that finds the next entry of at least the threshold in some lines, and the number that stands for none.
+    """Function that finds the next entry of at least the threshold in chosen lines, and the number that means none.
 
-    It takes the numbers `[some]` of the entries before; -1 finds the first.
+    It takes the numbers `[chosen]` of the entries before; -1 finds the first.
     """
-    maxima = lines.maxima[places] if lines.axis else lines.maxima[:, places].T  # [some, blocks]
+    maxima = lines.maxima[places] if lines.axis else lines.maxima[:, places].T  # [chosen, blocks]
     blocks, number_in_block = jnp.arange(maxima.shape[1], dtype=jnp.int32), jnp.arange(lines.length, dtype=jnp.int32)
     end = maxima.shape[1] * lines.length
     has_entry = maxima >= threshold[:, None]
 
     def first_in(block: Array, number: Array) -> Array:
-        values = lines.blocks[places, block] if lines.axis else lines.blocks[block, :, places]  # [some, entries]
+        values = lines.blocks[places, block] if lines.axis else lines.blocks[block, :, places]  # [chosen, entries]
         numbers = block[:, None] * lines.length + number_in_block[None]
         is_next = (values >= threshold[:, None]) & (numbers > number[:, None])
         if lines.removed is not None:

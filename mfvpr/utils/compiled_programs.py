@@ -12,10 +12,10 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from mfvpr.utils.errors import require_word
+from mfvpr.utils.numerics import processor_info
 from mfvpr.utils.versions import versions
 
 VARIABLE = "MFVPR_COMPILED"
-_CPUINFO = Path("/proc/cpuinfo")
 _PROCESSOR = r"^(?:vendor_id|cpu family|model|flags|CPU implementer|CPU part|Features|cpu|isa)\s*:.*$"
 
 
@@ -45,7 +45,7 @@ def keep_compiled_programs() -> None:
 def _folder() -> Path:
     """The folder of programs for this processor and these versions."""
     root = os.path.expanduser(os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr")
-    lines = re.findall(_PROCESSOR, _CPUINFO.read_text(), re.MULTILINE) if _CPUINFO.exists() else []
+    lines = re.findall(_PROCESSOR, processor_info(), re.MULTILINE)
     processor = sha256("\n".join(sorted({*lines}) or [platform.node()]).encode()).hexdigest()[:16]
     packages = [f"{name}-{versions()[name]}" for name in ("mfvpr", "jax", "jaxlib")]
     return Path(root, "compiled", "_".join([*packages, platform.machine(), processor]))

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mfvpr.utils import InputError, compiled_programs
+from mfvpr.utils import InputError, compiled_programs, numerics
 from tests.programs import ROOT
 
 PROGRAM = """
@@ -57,7 +57,7 @@ def test_a_folder_that_cannot_be_made_costs_only_the_compilation(tmp_path):
 
 def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path):
     cpuinfo, folders = tmp_path / "cpuinfo", []
-    monkeypatch.setattr(compiled_programs, "_CPUINFO", cpuinfo)
+    monkeypatch.setattr(numerics, "_CPUINFO", cpuinfo)
     for flags in ("fpu avx2", "fpu avx2 avx512f", "fpu avx2"):
         cpuinfo.write_text(f"processor: 0\nmodel : 85\ncpu MHz : {len(folders)}\nflags : {flags}\n" * 2)
         folders.append(compiled_programs._folder())
