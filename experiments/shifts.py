@@ -23,7 +23,7 @@ from mfvpr.datasets.streets import TRUTH
 from mfvpr.datasets.streets.camera import LANE, SPACING, plan_drives
 from mfvpr.datasets.streets.drawing import Drive, draw_drives
 from mfvpr.evaluation import System
-from mfvpr.evaluation.image_sizes import fit_image_size, folders_of
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.stages import dominant_shifts, match
 from mfvpr.report import Table
 from mfvpr.storage import FeatureCache
@@ -50,7 +50,7 @@ def draw(root: Path, seed: int, lane: float, shape: tuple[int, int]) -> Path:
 def measure(street: Path, system: System, cache: FeatureCache) -> Shifts:
     """Shifts of query i in database image i, their intervals (low, high), and true shifts, in shares of the sides."""
     dataset = folder(street / "database", street / "queries", ground_truth="order")
-    system = fit_image_size(system, folders_of(dataset), print)
+    system = system.fit_image_size(folders_of(dataset), print)
     pipeline, scorer = system.pipeline, cast(HistogramOfShifts, system.scorers["histogram"])
     [queries], [database] = (cache.local(images, pipeline.extractor) for images in (dataset.queries, dataset.database))
     rows = np.arange(FRAMES, dtype=np.int32)

@@ -61,7 +61,7 @@ def with_image_size(settings: dict[str, Any]) -> dict[str, Any]:
         return settings
     dataset = dataset_of(settings["dataset"])
     pipeline = assembly.pipeline(settings, dataset)
-    size = size_for_images(pipeline, folders_of(dataset), lambda line: tell(f"warning: {line}"))
+    size = size_for_images(pipeline.image_size_for, folders_of(dataset), lambda line: tell(f"warning: {line}"))
     return {**settings, "features": {**settings["features"], "image_size": [*size]}}
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.image_sizes import fit_image_size, folders_of
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.metrics import count_correct
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
@@ -152,7 +152,7 @@ def rank_dataset(
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
     if cache.root is not None:
         keep_compiled_programs()
-    system = fit_image_size(system, folders_of(dataset), cache.warn)
+    system = system.fit_image_size(folders_of(dataset), cache.warn)
     strengths, size = dict[str, np.ndarray](), len(dataset.database)
     if system.cohort is not None:
         cohort, values = _score_cohort(dataset, system, system.cohort, cache, watch)

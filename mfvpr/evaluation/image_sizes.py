@@ -8,23 +8,16 @@ from contextlib import suppress
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.images import read_size
-from mfvpr.evaluation.system import Pipeline, System
 from mfvpr.utils.errors import InputError
 
 _SAME = 0.02  # relative difference of two aspect ratios that count as the same
 
 Note = Callable[[str], object]
+Size = tuple[int, int]  # (width, height), px
 
 
-def fit_image_size(system: System, folders: Iterable[ImageFolder], note: Note) -> System:
-    """The system at the image size that its pipeline leaves to the images; see `size_for_images`."""
-    if system.pipeline.pixels is None:
-        return system
-    return system.with_image_size(size_for_images(system.pipeline, folders, note))
-
-
-def size_for_images(pipeline: Pipeline, folders: Iterable[ImageFolder], note: Note) -> tuple[int, int]:
-    """The image size (width, height) of a pipeline with `pixels`, px, in the shape of the first image.
+def size_for_images(size_for: Callable[[Size], Size], folders: Iterable[ImageFolder], note: Note) -> Size:
+    """The image size for the shape of the first image, by `Pipeline.image_size_for`.
 
     `note` gets a line if images have another aspect ratio. Images that cannot be read do not count.
     """
@@ -32,7 +25,7 @@ def size_for_images(pipeline: Pipeline, folders: Iterable[ImageFolder], note: No
     if not shapes:
         raise InputError("image_size: expected images to take the shape from, got none that can be read")
     first = next(iter(shapes.values()))
-    size = pipeline.image_size_for(first)
+    size = size_for(first)
     aspect = first[0] / first[1]
     other = [path for path, (width, height) in shapes.items() if abs(width / height / aspect - 1) > _SAME]
     if other:
@@ -46,7 +39,7 @@ def folders_of(dataset: Dataset) -> list[ImageFolder]:
     return [dataset.database, *(sequence.images for sequence in dataset.sequences)]
 
 
-def _shapes(folder: ImageFolder) -> Iterable[tuple[str, tuple[int, int]]]:
+def _shapes(folder: ImageFolder) -> Iterable[tuple[str, Size]]:
     """Names and sizes (width, height) of the images that can be read."""
     for name, path in zip(folder.names, folder.paths, strict=True):
         with suppress(InputError):

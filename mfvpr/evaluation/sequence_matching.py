@@ -48,7 +48,9 @@ class _Work:
         """Learn the parts that depend on the database."""
         cache = replace(cache, watch=cache.watch or watch)
         if pipeline.pixels is not None:
-            pipeline = pipeline.with_image_size(size_for_images(pipeline, folders_of(dataset), cache.warn))
+            pipeline = pipeline.with_image_size(
+                size_for_images(pipeline.image_size_for, folders_of(dataset), cache.warn)
+            )
         with watch("features"):
             pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, dataset.database, cache))
         with watch("retrieval"):

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.evaluation.image_sizes import fit_image_size, folders_of
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.sequence_matching import match_rows, matches_recipe
 from mfvpr.evaluation.system import Pipeline, System
 from mfvpr.features.extractor import Aggregated, Extractor, Source
@@ -63,7 +63,7 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
     """Do the part of a shard, and say in one line what is done, and what to do next."""
     if cache.root is None:
         raise InputError(f"shard={shard}: expected a cache with a root, the folder that all shards fill")
-    system = fit_image_size(system, folders_of(dataset), cache.warn)
+    system = system.fit_image_size(folders_of(dataset), cache.warn)
     database, pipeline, sequences = dataset.database, system.pipeline, dataset.sequences
     if system.cohort is not None:
         sequences = (cohort_sequence(cache.recipes.contents(database), system.cohort), *sequences)

@@ -1,6 +1,6 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -8,8 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
+from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.image_sizes import size_for_images
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
@@ -146,6 +148,12 @@ class System:
         if settings is not None:
             settings = {**settings, "features": {**settings["features"], "image_size": [*size]}}
         return replace(self, pipeline=self.pipeline.with_image_size(size), settings=settings)
+
+    def fit_image_size(self, folders: Iterable[ImageFolder], note: Callable[[str], object]) -> "System":
+        """The system at the image size that its pipeline leaves to the images; see `size_for_images`."""
+        if self.pipeline.pixels is None:
+            return self
+        return self.with_image_size(size_for_images(self.pipeline.image_size_for, folders, note))
 
     def warm_up(self, image_size: tuple[int, int]) -> None:
         """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.

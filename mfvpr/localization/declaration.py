@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.evaluation.image_sizes import Note, fit_image_size
+from mfvpr.evaluation.image_sizes import Note
 from mfvpr.evaluation.system import System
 from mfvpr.storage.manifest import MANIFEST
 from mfvpr.storage.maps import has_rows
@@ -51,7 +51,7 @@ def read_system(folder: Path) -> System:
 
 
 def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: Note) -> System:
-    """The system at the image size of the map in a folder; in a new one, at that of the images, see `fit_image_size`.
+    """The system at the image size of the map in a folder; in a new one, at that of the images, see `System`.
 
     Raises `InputError` if a new map has no images to take the shape from, or as `read_declaration`.
     """
@@ -66,7 +66,7 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
     if images is None:
         raise InputError("image_size: expected the images of a new map, whose shape decides, got none. Use "
                          "`Map.create`, or a system with features.image_size=[WIDTH,HEIGHT].")  # fmt: skip
-    return fit_image_size(system, [images], note)
+    return system.fit_image_size([images], note)
 
 
 def check_declaration(folder: Path, system: System) -> None:

@@ -14,9 +14,9 @@ from mfvpr.matching.match_set import MatchSet, Scales, batches, partition, queri
 from mfvpr.reranking.grids import score_settings
 from mfvpr.reranking.ranking import BIN_STEP, Scores, fuse_scales
 from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, check_host, on_host, require_scores, score_pairs
+from mfvpr.scoring.scorer import Scorer, check_host, on_host, require_scores, score_pairs, with_static_functions
 from mfvpr.types import Array, Matches, Shortlist
-from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context, with_static_functions
+from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 from mfvpr.utils.threads import ordered_map
 

@@ -16,7 +16,7 @@ from mfvpr.matching.nearest_neighbors import filter_matches
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import numbers_by_name, whole_numbers, with_capacity, with_parameters
-from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs
+from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs, with_static_functions
 from mfvpr.scoring.weight_registry import named_weight
 from mfvpr.scoring.weights import ChosenWeight, Weight, match_weights
 from mfvpr.types import Array, Matches
@@ -27,7 +27,6 @@ from mfvpr.utils.numerics import (
     holds_function,
     is_concrete,
     knows_own_context,
-    with_static_functions,
 )
 
 WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a match counts

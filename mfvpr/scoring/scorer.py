@@ -1,14 +1,18 @@
 """The contract of a scorer: matches of one pair -> a score."""
 
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Float
 
 from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
+
+Tree = TypeVar("Tree")
 
 
 class Scorer(Protocol):
@@ -45,6 +49,11 @@ def check_host(scorer: Any) -> None:
     if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
         raise InputError(f"{type(scorer).__name__}: expected a class with score_pairs that is a value; decorate it "
                          "with @mfvpr.value")  # fmt: skip
+
+
+def with_static_functions(scorers: Tree) -> Tree:
+    """Scorers with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
+    return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, scorers)
 
 
 def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:

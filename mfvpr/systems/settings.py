@@ -4,12 +4,10 @@ Hydra checks which settings exist; the values are checked here.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-from mfvpr.systems.rules import Rule, any_of, either, list_of, number, one_of, or_list, pattern, whole
+from typing import Any, NamedTuple
 
 _INSTALLED = Path(__file__).parent / "conf"  # in a wheel; in a clone, it stands beside the package
 CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"
@@ -17,6 +15,70 @@ CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"
 
 class SettingsError(Exception):
     """One line for a setting that cannot be used: its name, the expected value, and its value."""
+
+
+class Rule(NamedTuple):
+    """A test of a setting's value, and what it expects in words."""
+
+    holds: Callable[[Any], bool]
+    expected: str
+
+
+def pattern(regex: str, expected: str) -> Rule:
+    """Text that matches a regular expression."""
+    return Rule(lambda value: isinstance(value, str) and bool(re.fullmatch(regex, value)), expected)
+
+
+def one_of(*choices: Any) -> Rule:
+    """One of some words, numbers, flags or null."""
+    words = ("null" if choice is None else str(choice).lower() if isinstance(choice, bool) else str(choice)
+             for choice in choices)  # fmt: skip
+    return Rule(
+        lambda value: any(type(value) is type(choice) and value == choice for choice in choices),
+        "one of " + ", ".join(words),
+    )
+
+
+def number(low: float, high: float) -> Rule:
+    """A number in a range, its ends included."""
+    return Rule(
+        lambda value: type(value) in (int, float) and low <= value <= high,
+        f"a number from {low:g} to {high:g}",
+    )
+
+
+def whole(low: int, high: int) -> Rule:
+    """An integer in a range, its ends included."""
+    return Rule(
+        lambda value: type(value) is int and low <= value <= high,
+        f"a whole number from {low} to {high}",
+    )
+
+
+def list_of(rule: Rule, length: int = 0) -> Rule:
+    """A list of values that a rule allows, of a given length, or of any above 0."""
+
+    def holds(value: Any) -> bool:
+        has_length = isinstance(value, list) and (len(value) == length if length else bool(value))
+        return has_length and all(map(rule.holds, value))
+
+    return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
+
+
+def any_of(expected: str, *rules: Rule) -> Rule:
+    """A value that one of several rules allows."""
+    return Rule(lambda value: any(rule.holds(value) for rule in rules), expected)
+
+
+def either(rule: Rule, *choices: Any) -> Rule:
+    """A value that a rule allows, or one of some choices."""
+    other = one_of(*choices)
+    return any_of(f"{rule.expected}, or {other.expected.removeprefix('one of ')}", rule, other)
+
+
+def or_list(rule: Rule) -> Rule:
+    """A value that a rule allows, or a list of such values."""
+    return any_of(f"{rule.expected}, or a list of them", rule, list_of(rule))
 
 
 _MAX_SHOWN = 200  # characters of a value in an error

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Num, Shaped
 
@@ -172,7 +171,7 @@ def compiled(function: Function, **options: Any) -> Function:
     """`jax.jit` for functions of many pairs; the classes of all nodes of the arguments choose the program as well.
 
     With a plain function among the arguments, such as a user's scorer, it runs op by op: a cached program would keep
-    the values of the closure from the first call. `with_static_functions` allows compilation for many calls in a row.
+    the values of the closure from the first call. Scorers that are called often: see `with_static_functions`.
     """
     programs: dict[tuple[type, ...], Any] = {}
 
@@ -204,11 +203,6 @@ def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
 def holds_function(tree: Any) -> bool:
     """Whether a leaf is a plain function, such as a user's scorer."""
     return any(map(callable, jax.tree.leaves(tree)))
-
-
-def with_static_functions(tree: Tree) -> Tree:
-    """`tree` with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
-    return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, tree)
 
 
 def is_concrete(tree: Any) -> bool:

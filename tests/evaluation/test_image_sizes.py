@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr import InputError
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import match_sequence
-from mfvpr.evaluation.image_sizes import fit_image_size, folders_of
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils.fingerprints import recipe_of
@@ -31,9 +31,9 @@ FIXED = system_of(Sift(max_keypoints=60, image_size=SIZE))
 
 def test_the_first_image_decides_for_all_stages(dataset):
     lines = []
-    fitted = fit_image_size(AUTO, folders_of(dataset), lines.append)
+    fitted = AUTO.fit_image_size(folders_of(dataset), lines.append)
     assert recipe_of(fitted.pipeline) == recipe_of(FIXED.pipeline)
-    assert fit_image_size(FIXED, folders_of(dataset), lines.append) is FIXED
+    assert FIXED.fit_image_size(folders_of(dataset), lines.append) is FIXED
     assert not lines
 
 
@@ -51,7 +51,7 @@ def test_images_of_another_shape_are_named_once(small_street, tmp_path):
     Image.new("RGB", (50, 90)).save(tmp_path / "mixed/0004.png")
     Image.new("RGB", (1001, 750)).save(tmp_path / "mixed/0005.png")  # the same but for rounding
     lines, folder = [], image_folder(tmp_path / "mixed")
-    fitted = fit_image_size(AUTO, [folder, folder], lines.append)
+    fitted = AUTO.fit_image_size([folder, folder], lines.append)
     assert fitted.pipeline.extractor.image_size == SIZE
     [line] = lines
     assert "160 x 120 px, but 1 of 9 have another aspect ratio" in line
@@ -61,7 +61,7 @@ def test_images_of_another_shape_are_named_once(small_street, tmp_path):
 def test_no_image_has_no_shape(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="expected images to take the shape from"):
-        fit_image_size(AUTO, [image_folder(tmp_path)], print)
+        AUTO.fit_image_size([image_folder(tmp_path)], print)
 
 
 def test_a_warm_up_knows_the_shape():

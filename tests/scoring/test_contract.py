@@ -26,8 +26,8 @@ from mfvpr import (
     score_grid,
 )
 from mfvpr.scoring.parameters import with_capacity
+from mfvpr.scoring.scorer import with_static_functions
 from mfvpr.utils import InputError
-from mfvpr.utils.numerics import with_static_functions
 from tests.builders import SIZE, per_match, random_matches, stack
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 from tests.scoring import batches

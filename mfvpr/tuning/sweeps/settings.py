@@ -11,8 +11,8 @@ from jaxtyping import Int, Shaped
 from mfvpr.reranking import grids
 from mfvpr.reranking.grids import WEIGHTINGS
 from mfvpr.scoring import parameters
+from mfvpr.scoring.scorer import with_static_functions
 from mfvpr.scoring.weights import ChosenWeight
-from mfvpr.utils.numerics import with_static_functions
 
 Setting = Mapping[str, Any]
 
