@@ -31,6 +31,7 @@ from mfvpr.types import Array, Features
 
 ROUNDS = 16  # products that are checked of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
+_SAMPLE, _FEW = 16, 2.5  # keypoints that are looked at before, and the most products that each may have to check
 _PARTS = 8  # of a checked product
 _SMALL, _LARGE = 2.0**-126, 2.0**126
 
@@ -102,9 +103,7 @@ def _norm(rows: Float[Array, "rows _"]) -> Float[Array, " rows"]:
 
 def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -> tuple[Neighbors, Bool[Array, ""]]:
     """Mutual nearest neighbors, and whether all that could matter was checked."""
-    products = jnp.matmul(candidate.descriptors, query.descriptors, preferred_element_type=jnp.float32)
-    real = (candidate.norm > 0)[:, None] & (query.norm > 0)[None] & jnp.isfinite(products)
-    products = jnp.where(real, products, -jnp.inf)
+    products = _products(query, candidate)
     columns = jnp.arange(products.shape[1], dtype=jnp.int32)
     to1, to0 = _direction(products, 0, query, candidate), _direction(products, 1, candidate, query)
     # A keypoint without a product that is close to both largest ones has no match.
@@ -126,15 +125,42 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     return neighbors.of(query.features), settled & settled2
 
 
+def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
+    """Whether the products of a few keypoints differ enough for `mutual_neighbors`; a guess, which saves time.
+
+    Without it, images whose descriptors are equal or nearly equal would cost both kinds of products.
+    """
+    step = max(1, len(query.norm) // _SAMPLE)
+    sample = query._replace(
+        descriptors=query.descriptors[:, ::step], norm=query.norm[::step], residual=query.residual[::step]
+    )
+    products = _products(sample, candidate)
+    largest = jnp.max(products, axis=0)
+    possible = jnp.sum(products >= (largest - _window(sample, candidate))[None], axis=0)
+    checks = jnp.minimum(possible, ROUNDS + 1).astype(jnp.float32)
+    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _FEW, 0.0)) <= 0
+
+
+def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 keypoints0"]:
+    """Rounded products, -inf for padding and for descriptors that are not finite."""
+    products = jnp.matmul(candidate.descriptors, query.descriptors, preferred_element_type=jnp.float32)
+    real = (candidate.norm > 0)[:, None] & (query.norm > 0)[None] & jnp.isfinite(products)
+    return jnp.where(real, products, -jnp.inf)
+
+
 def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
-    lines, descriptors = lines_of(products, axis), other.features.descriptors
-    dimensions = descriptors.shape[1]
+    lines, window = lines_of(products, axis), _window(image, other)
+    return _Direction(image.features.descriptors, other.features.descriptors, lines, nearest(lines), window)
+
+
+def _window(image: Rounded, other: Rounded) -> Float[Array, " own"]:
+    """2 e for each keypoint of `image`."""
+    dimensions = image.features.descriptors.shape[1]
     rounding = (dimensions + 32) * 2.0**-24
     norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
     rounded = image.norm + image.residual
     bound = image.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
-    window = 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
-    return _Direction(image.features.descriptors, descriptors, lines, nearest(lines), window)
+    return 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
 
 
 def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Array, " own"], Bool[Array, ""]]:

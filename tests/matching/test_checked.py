@@ -28,6 +28,12 @@ rounded_once = jax.jit(
 )
 
 
+@pytest.fixture(autouse=True)
+def check_every_pair(monkeypatch):
+    """Pairs that the guess would leave to float32 are checked as well."""
+    monkeypatch.setattr(nearest_neighbors, "tells_apart", lambda *_: True)
+
+
 def numpy_products(rows0, rows1):
     """Float32 products of all rows, in the order that `checked_product` documents."""
     length = 8
@@ -169,6 +175,20 @@ def test_too_many_close_products_are_left_to_float32(noise, with_ratio):
     np.testing.assert_array_equal(matches.mask, mask)
     for name, values in per_match(in_single).items():
         np.testing.assert_array_equal(np.asarray(getattr(matches, name))[mask], np.asarray(values)[mask])
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
+def test_equal_and_nearly_equal_images_are_told_before_they_are_multiplied(kind):
+    query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))
+    if kind == "equal":
+        query.descriptors[:], candidate.descriptors[:] = query.descriptors[0], query.descriptors[0]
+    if kind == "three times":
+        for side in (query, candidate):
+            side.descriptors[:] = side.descriptors[np.arange(len(side.mask)) // 3 * 3]
+    if kind == "all padding":
+        query.mask[:] = False
+    tells_apart = checked.tells_apart(prepare_query(query), checked.round_candidate(nearest_neighbors.ready(candidate)))
+    assert tells_apart == (kind not in ("twins", "near twins", "equal", "three times"))
 
 
 @pytest.mark.parametrize("kind", ["infinite", "far too long", "rounded to infinity", "overflow"])
