@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
+from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -13,7 +14,8 @@ from jaxtyping import Num
 from mfvpr.features.extractor import Description
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import device_bytes
+from mfvpr.utils.numerics import device_bytes, knows_own_context
+from mfvpr.utils.threads import ordered_map
 
 
 class NetworkExtractor:
@@ -76,18 +78,25 @@ def in_batches(
 ) -> list[Any]:
     """Results of `program` for each image, NumPy.
 
-    A device without memory of its own takes images one by one, which keeps activations in the processor's caches (a
-    batch of 8 is no faster there); elsewhere the last batch is filled up, so that there is one program.
+    A device without memory of its own takes images one by one, which keeps activations in the processor's caches, and
+    two at the same time, since a network leaves some of the cores idle. Elsewhere the last batch is filled up, so that
+    there is one program.
 
     Raises:
         InputError: floating-point images of 0 to 1, in which every network here sees black.
     """
     if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
         raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")
-    size = 1 if device_bytes(()) is None else batch_size
-    results = []
-    for start in range(0, len(images), size):
+    on_host = device_bytes(()) is None
+    size = 1 if on_host else batch_size
+
+    def run(start: int) -> list[Any]:
         batch = images[start : start + size]
         outputs = jax.tree.map(np.asarray, program(ragged.repeat_last(batch, size)))
-        results += [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
-    return results
+        return [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
+
+    starts = range(0, len(images), size)
+    first = map(run, starts[:1])  # compiles
+    together = on_host and len(starts) > 2 and knows_own_context()
+    rest = ordered_map(run, starts[1:], workers=2) if together else map(run, starts[1:])
+    return [result for results in chain(first, rest) for result in results]
