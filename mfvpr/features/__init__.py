@@ -1,8 +1,8 @@
 """Images -> keypoints, descriptors and global descriptors.
 
 Read first: extractor (the protocols), sift (the shortest extractor), network (what the extractors with a network
-share), then the others; vlad (global descriptors from local ones), feature_set (features on demand), extraction
-(threads and batches).
+share, and their batches), then the others; vlad (global descriptors from local ones), feature_set (features on
+demand), extraction (folders of images, on threads).
 """
 
 import lazy_loader

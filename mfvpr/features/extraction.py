@@ -31,6 +31,8 @@ def describe_folder(
     Images that are not used are added to `bad`, row -> reason: images whose description is not finite, and with
     `skip_bad` images that cannot be read. Without `skip_bad` these raise an `InputError`.
     """
+    if extractor.batch_size < 1:
+        raise InputError(f"batch_size={extractor.batch_size}: expected a whole number above 0")
     images = _readable_images(folder, rows, extractor, skip_bad, bad, track)
     while batch := list(itertools.islice(images, extractor.batch_size)):
         batch_rows, arrays = zip(*batch, strict=True)

@@ -1,4 +1,4 @@
-"""Run networks: weights are arguments of one compiled program; images and batches have one size."""
+"""Run networks: weights are arguments of one compiled program; images have one size."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -78,8 +78,8 @@ def in_batches(
 ) -> list[Any]:
     """Results of `program` for each image, NumPy.
 
-    A device without memory of its own takes images one by one, which keeps activations in the processor's caches, and
-    two at the same time, since a network leaves some of the cores idle. Elsewhere the last batch is filled up, so that
+    On a CPU `batch_size` has no effect: images run one by one, which keeps activations in the caches, and two at the
+    same time, since a network leaves some of the cores idle. On other devices the last batch is filled up, so that
     there is one program.
 
     Raises:

@@ -14,7 +14,7 @@ rounded product of x, and c the largest checked one, of the neighbor y:
 
 So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
 checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
-differ by less than its rounding. If a keypoint has more than `ROUNDS` of them, float32 matches the pair.
+differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair.
 
 The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
 2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
@@ -29,10 +29,11 @@ from jaxtyping import BFloat16, Bool, Float, Int
 from mfvpr.matching.similarity import Lines, Nearest, count_from, entries_from, even_size, lines_of, nearest, without
 from mfvpr.types import Array, Features
 
-ROUNDS = 16  # products that are checked of a keypoint
+MOST_CHECKS = 16  # of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
-_SAMPLE, _FEW = 16, 2.5  # keypoints that are looked at before, and the most products that each may have to check
-_PARTS = 8  # of a checked product
+_SAMPLE = 16  # keypoints of the query by which `tells_apart` guesses
+_WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
+_PARTS = 8  # into which the dimensions of a checked product are split
 _SMALL, _LARGE = 2.0**-126, 2.0**126
 
 
@@ -115,7 +116,7 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     index0, settled0 = _settle(to0, to0.is_close & is_chosen)
     longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
     is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
-    settled &= longest0 * longest1 < _LARGE  # not NaN either
+    settled &= longest0 * longest1 < _LARGE  # False for NaN
     if not with_second:
         return Neighbors(index1, is_match, index1, index1, is_match).of(query.features), settled
     lines = without(to1.lines, index1)
@@ -126,7 +127,7 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
 
 
 def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
-    """Whether the products of a few keypoints differ enough for `mutual_neighbors`; a guess, which saves time.
+    """Whether products differ enough for `mutual_neighbors`: a guess by a few keypoints, which saves time.
 
     Without it, images whose descriptors are equal or nearly equal would cost both kinds of products.
     """
@@ -137,8 +138,8 @@ def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
     products = _products(sample, candidate)
     largest = jnp.max(products, axis=0)
     possible = jnp.sum(products >= (largest - _window(sample, candidate))[None], axis=0)
-    checks = jnp.minimum(possible, ROUNDS + 1).astype(jnp.float32)
-    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _FEW, 0.0)) <= 0
+    checks = jnp.minimum(possible, MOST_CHECKS + 1).astype(jnp.float32)
+    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _WORTHWHILE_CHECKS, 0.0)) <= 0
 
 
 def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 keypoints0"]:
@@ -178,15 +179,15 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
         descriptors = direction.descriptors[keypoints]
 
         def check(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-            number, largest, best, rounds = state
+            number, largest, best, checks = state
             product = checked_product(descriptors, direction.other_descriptors[number])
             is_larger = (number < end) & (product > largest)
             best = jnp.where(is_larger, number, best)
-            return next_after(number), jnp.where(is_larger, product, largest), best, rounds + 1
+            return next_after(number), jnp.where(is_larger, product, largest), best, checks + 1
 
         first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
         number, _, best, _ = jax.lax.while_loop(
-            lambda state: (state[0] < end).any() & (state[3] < ROUNDS),
+            lambda state: (state[0] < end).any() & (state[3] < MOST_CHECKS),
             check, (first, lowest, index[keypoints], jnp.int32(0)),
         )  # fmt: skip
         return start + size, index.at[places].set(best, mode="drop"), (number == end).all()

@@ -22,7 +22,7 @@ from mfvpr.matching.nearest_neighbors import (
     with_concrete_sizes,
 )
 from mfvpr.types import Array, Features, Matches, value
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import as_array, compiled, is_concrete
 
 
@@ -38,8 +38,11 @@ class Matcher(Protocol):
     included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
     needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs
     that are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
-    An optional method `prepare(queries, candidates, chunk_size)` returns what stands in for the queries, once for all
-    their pairs: arrays with a leading axis for the queries.
+
+    An optional method `prepare(queries, candidates, chunk_size)` does once per query what would be done for each of its
+    pairs. It takes Features `[B, N0]` and `[S, N1]`, and returns what the matcher then takes in place of a query's
+    Features: arrays with the leading axis B. A matcher must take plain Features as well, with which
+    other functions call it, as `NearestNeighborMatcher` does.
     """
 
     def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
@@ -51,7 +54,8 @@ class NearestNeighborMatcher:
 
         matcher = mfvpr.NearestNeighborMatcher(cross_check="mutual", max_distance=0.7, max_matches=500)
 
-    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory and the last bits.
+    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory and
+    matches that differ by less than the rounding of float32.
     """
 
     recipe_name: ClassVar[str] = "Matching"  # in stored recipes
@@ -61,6 +65,11 @@ class NearestNeighborMatcher:
     max_matches: int | None = field(default=None, metadata={"static": True})
     chunk_size: int | None = field(default=None, metadata={"static": True})
     product: Product | None = field(default=None, metadata={"static": True, "recipe": False})
+
+    def __post_init__(self) -> None:
+        require_word("cross_check", self.cross_check, CrossCheck)
+        if self.product is not None:
+            require_word("product", self.product, Product)
 
     def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Features | Rounded:
         """The queries, or what products of bfloat16 need of them."""

@@ -175,15 +175,18 @@ def choose_product(
             return "float32"
     else:
         require_word("product", product, Product)
-    is_single = all(jax.eval_shape(at_least_single, side.descriptors).dtype == jnp.float32 for side in sides)
-    has_slots = all(side.mask.shape[-1] for side in sides)
-    is_possible = cross_check == "mutual" and chunk_size == 1 and is_single and has_slots and len(lengths) == 1
-    if product is None:
-        return "bfloat16" if is_possible else "float32"
-    if product == "bfloat16" and not is_possible:
-        raise ValueError("product=bfloat16: expected cross_check=mutual, chunk_size=1, single precision, images "
-                         "with slots, and descriptors of one length; leave product out")  # fmt: skip
-    return product
+    dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
+    conditions = {
+        "cross_check=mutual": cross_check == "mutual",
+        "chunk_size=1": chunk_size == 1,
+        "descriptors in single or half precision": dtypes == {jnp.dtype(jnp.float32)},
+        "images with slots": all(side.mask.shape[-1] for side in sides),
+        "descriptors of one length": len(lengths) == 1,
+    }
+    missing = [condition for condition, holds in conditions.items() if not holds]
+    if product == "bfloat16" and missing:
+        raise ValueError(f"product=bfloat16: expected {' and '.join(missing)}; leave product out")
+    return product or ("float32" if missing else "bfloat16")
 
 
 def filter_matches(

@@ -178,7 +178,8 @@ def retrieve(
 
     Args:
         query_descriptors: unit length.
-        database_descriptors: unit length.
+        database_descriptors: unit length. For several calls, put them on the device once (`jax.device_put`): with
+            NumPy's arrays every call copies them.
         num_candidates: if there are fewer database images, the shortlist ends in -1.
         mask: False for database images that must not appear (for that query); another shape raises an `InputError`.
 

@@ -1,6 +1,6 @@
 """Systems from settings: checked values become an extractor, a retrieval, a matcher, scorers and their fusion.
 
-Read first: settings (checks), assembly (settings -> System), rules (of values).
+Read first: settings (rules and checks), assembly (settings -> System).
 """
 
 import lazy_loader
