@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -96,7 +95,7 @@ def in_batches(
         return [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
 
     starts = range(0, len(images), size)
-    first = map(run, starts[:1])  # compiles
+    batches = [run(start) for start in starts[:1]]  # compiles
     together = on_host and len(starts) > 2 and knows_own_context()
-    rest = ordered_map(run, starts[1:], workers=2) if together else map(run, starts[1:])
-    return [result for results in chain(first, rest) for result in results]
+    batches += ordered_map(run, starts[1:], workers=2) if together else [run(start) for start in starts[1:]]
+    return [result for results in batches for result in results]
