@@ -1,6 +1,7 @@
 """Read and write shortlists and rankings of other programs.
 
-Lists of image pairs are hloc's `query database` and kapture's `query, reference, score`.
+Lists of image pairs are hloc's `query database` and kapture's `query, reference, score`. VPR-methods-evaluation writes
+a folder of predictions, a text file for each query.
 """
 
 import re
@@ -24,6 +25,7 @@ Candidates = dict[int, float | None]  # database rows and scores of one query, b
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
 _SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
+_QUERY, _PREDICTIONS, _POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
 
 
 class Pair(NamedTuple):
@@ -42,8 +44,8 @@ def read_shortlist(
     Args:
         path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and optional `scores` `[Q, K]`, in the
             order of `query_names` and `database_names`. Other suffixes: lines of text, `query database` as hloc, or
-            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions; # begins a comment. A query's best
-            candidate comes first.
+            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions; # begins a comment. A folder:
+            `preds` of VPR-methods-evaluation. A query's best candidate comes first.
         query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
         database_names: `[N]` likewise.
         num_candidates: C; None = the largest number of a query's candidates.
@@ -67,14 +69,15 @@ def read_with_entries(
     Only names with additional folders are entries: a file name alone may mean a query and a database image.
     """
     path = Path(path)
-    require_file(path)
+    if not path.is_dir():
+        require_file(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
     queries, database = {}, {}
     if path.suffix.lower() == ".npz":
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
-        names = _read_pairs(path, query_names, database_names)
+        names = _read_predictions(path) if path.is_dir() else _read_pairs(path, query_names, database_names)
         queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
         database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
@@ -181,6 +184,32 @@ def _read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence
         stripped = printable(line.strip())
         if stripped and (pair := _pair(f"{path}: line {number}", stripped, sides, ends)):
             pairs.append(pair)
+    return pairs
+
+
+def _read_predictions(folder: Path) -> list[Pair]:
+    """Read the pairs of a folder of predictions. Positives are not read: the data set has its own ground truth."""
+    pairs, files = [], dict[str, Path]()
+    for path in sorted(folder.glob("*.txt")):
+        with reading(path, mend="expected a text file of predictions"):
+            text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+        parts: dict[str, list[str]] = {heading: [] for heading in ("", _QUERY, _PREDICTIONS, _POSITIVES)}
+        heading = ""
+        for line in filter(None, map(str.strip, text.split("\n"))):
+            if line in parts:
+                heading = line
+            else:
+                parts[heading].append(printable(line))
+        if parts[""] or len(parts[_QUERY]) != 1 or not parts[_PREDICTIONS]:
+            raise InputError(f"{path}: expected one path below {_QUERY!r}, and one or more below {_PREDICTIONS!r}, as "
+                             "VPR-methods-evaluation writes them")  # fmt: skip
+        [query] = parts[_QUERY]
+        if (other := files.setdefault(query, path)) != path:
+            raise InputError(f"{path}: expected another query than in {other.name}, got {shorten(query)} again; "
+                             "remove the files of older runs")  # fmt: skip
+        pairs += [Pair(query, database) for database in parts[_PREDICTIONS]]
+    if not files:
+        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
     return pairs
 
 

@@ -51,6 +51,44 @@ def test_pairs_of_kapture_and_of_patch_netvlad(tmp_path):
     assert shortlist.indices.tolist() == [[1, 0], [-1, -1], [-1, -1]]
 
 
+def write_predictions(folder, number, query, predictions, positives=()):
+    """A file of VPR-methods-evaluation; it has no positives if the data set has no labels."""
+    folder.mkdir(exist_ok=True)
+    parts = ["Query path:", f"{query}\n", "Predictions paths:", "\n".join(predictions) + "\n"]
+    parts += ["Positives paths:", "\n".join(positives) + "\n"] if positives else []
+    (folder / f"{number:03d}.txt").write_text("\n".join(parts))
+    return folder
+
+
+@pytest.mark.parametrize("positives", [(), ("/set/d/x, y.jpg",)])
+def test_predictions_of_vpr_methods_evaluation(tmp_path, positives):
+    """Only wrongly predicted queries may have a file."""
+    write_predictions(tmp_path / "preds", 2, "/set/q/my query.jpg", ["/set/d/my place.jpg"], positives)
+    folder = write_predictions(tmp_path / "preds", 0, "/set/q/1.jpg", ["/set/d/2.jpg", "/set/d/1.jpg"], positives)
+    (folder / "000.jpg").write_bytes(b"a picture of the predictions")
+    assert read_shortlist(folder, QUERIES, DATABASE).indices.tolist() == EXPECTED
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        ([], "expected text files of predictions, one for each query, got none"),
+        ([""], "000.txt: expected one path below 'Query path:'"),
+        (["q/1.jpg d/1.jpg\n"], "000.txt: expected one path below 'Query path:'"),
+        (["Query path:\nq/1.jpg\n\nPredictions paths:\n"], "one or more below 'Predictions paths:'"),
+        (["Query path:\nq/1.jpg\nq/2.jpg\n\nPredictions paths:\nd/1.jpg\n"], "expected one path below 'Query path:'"),
+        (["Query path:\nq/1.jpg\n\nPredictions paths:\nd/1.jpg\n"] * 2, "expected another query than in 000.txt"),
+        (["Query path:\nq/1.jpg\n\nPredictions paths:\nd/9.jpg\n"], "'d/9.jpg', which none of the 4 has"),
+        (["Query path:\nd/1.jpg\n\nPredictions paths:\nd/1.jpg\n"], "'d/1.jpg', which none of the 3 has"),
+    ],
+)
+def test_other_folders_are_one_line(tmp_path, texts, words):
+    for number, text in enumerate(texts):
+        (tmp_path / f"{number:03d}.txt").write_text(text)
+    with one_line_error(None, words):
+        read_shortlist(tmp_path, QUERIES, DATABASE)
+
+
 def test_names_are_told_apart_by_those_that_there_are(tmp_path):
     queries, database = ["a", "a b", "#c"], ["c", "b c d", "d"]
     shortlist = read(tmp_path, "a b c d\n#c d\na b d", queries, database)
@@ -134,7 +172,7 @@ def test_not_a_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.txt")
     os.mkfifo(tmp_path / "pipe.npz")
     pipes = dict.fromkeys(("pipe.txt", "pipe.npz"), "a pipe or device")
-    for name, got in ({"p.txt": "nothing", "p.npz": "nothing", ".": "a folder"} | pipes).items():
+    for name, got in ({"p.txt": "nothing", "p.npz": "nothing"} | pipes).items():
         with pytest.raises(InputError, match=f"expected a file, got {got}"):
             read_shortlist(tmp_path / name, QUERIES, DATABASE)
 
