@@ -20,7 +20,7 @@ from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_file, write_text
 
-PairLayout = Literal["hloc", "kapture"]
+PairLayout = Literal["hloc", "kapture", "preds"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
@@ -105,7 +105,8 @@ def write_shortlist(
         shortlist: `[Q, C]`.
         query_names: `[Q]`.
         database_names: `[N]`.
-        layout: of lines. `hloc`: no scores; `kapture`: scores with all digits of float32.
+        layout: of text. `hloc`: no scores; `kapture`: scores with all digits of float32; `preds`: a new folder `path`
+            of VPR-methods-evaluation's predictions, without scores and positives.
 
     Raises:
         InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
@@ -129,6 +130,13 @@ def write_shortlist(
         for name in names:
             if name != name.strip() or "\n" in name or "\r" in name:
                 raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
+    if layout == "preds":
+        _write_predictions(
+            path,
+            [[database_names[row] for row in rows[real]] for rows, real in zip(indices, mask, strict=True)],
+            query_names,
+        )
+        return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
         names = (query_names[query], database_names[int(indices[query, position])])
@@ -211,6 +219,16 @@ def _read_predictions(folder: Path) -> list[Pair]:
     if not files:
         raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
     return pairs
+
+
+def _write_predictions(folder: Path, predictions: Sequence[Sequence[str]], query_names: Sequence[str]) -> None:
+    """Write a file for each query that has predictions; its number is the query's row."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
+    folder.mkdir(parents=True, exist_ok=True)
+    for row, (query, names) in enumerate(zip(query_names, predictions, strict=True)):
+        if names:
+            write_text(folder / f"{row:03d}.txt", "\n".join([_QUERY, query, "", _PREDICTIONS, *names]) + "\n")
 
 
 def _ends(name: str) -> tuple[str, str]:

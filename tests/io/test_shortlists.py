@@ -183,7 +183,7 @@ def shortlists():
     return st.tuples(rows, st.integers(0, 2**32 - 1))
 
 
-@pytest.mark.parametrize("file, layout", [("p.txt", "hloc"), ("p.txt", "kapture"), ("p.npz", "hloc")])
+@pytest.mark.parametrize("file, layout", [("p.txt", "hloc"), ("p.txt", "kapture"), ("p.npz", "hloc"), ("p", "preds")])
 @given(shortlists())
 def test_written_and_read(tmp_path_factory, file, layout, drawn):
     rows, seed = drawn
@@ -197,7 +197,7 @@ def test_written_and_read(tmp_path_factory, file, layout, drawn):
     np.testing.assert_array_equal(shortlist.indices, indices)
     np.testing.assert_array_equal(shortlist.mask, mask)
     ranks = np.where(mask, depth - np.arange(depth), 0)
-    expected = ranks if (file, layout) == ("p.txt", "hloc") else np.where(mask, scores, 0)
+    expected = ranks if (file, layout) in (("p.txt", "hloc"), ("p", "preds")) else np.where(mask, scores, 0)
     np.testing.assert_array_equal(shortlist.scores, expected)
     assert [child.name for child in path.parent.iterdir()] == [file]
 
@@ -229,6 +229,10 @@ def test_what_cannot_be_written(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             write_shortlist(path, shortlist, *names)
+    with pytest.raises(InputError, match="expected a new or an empty folder"):
+        write_shortlist(
+            write_predictions(tmp_path / "preds", 0, "q", ["d"]), shortlist, QUERIES[:1], DATABASE, layout="preds"
+        )
     with pytest.raises(InputError, match=r"layout='csv': .*hloc, kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong, ascending = (shortlist_of([[0, 1]], [[0.5, score]]) for score in (np.nan, 0.7))
