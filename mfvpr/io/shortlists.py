@@ -131,11 +131,9 @@ def write_shortlist(
             if name != name.strip() or "\n" in name or "\r" in name:
                 raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
     if layout == "preds":
-        _write_predictions(
-            path,
-            [[database_names[row] for row in rows[real]] for rows, real in zip(indices, mask, strict=True)],
-            query_names,
-        )
+        predictions = [[database_names[row] for row in rows[real].tolist()]
+                       for rows, real in zip(indices, mask, strict=True)]  # fmt: skip
+        _write_predictions(path, predictions, query_names)
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():

@@ -229,10 +229,6 @@ def test_what_cannot_be_written(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             write_shortlist(path, shortlist, *names)
-    with pytest.raises(InputError, match="expected a new or an empty folder"):
-        write_shortlist(
-            write_predictions(tmp_path / "preds", 0, "q", ["d"]), shortlist, QUERIES[:1], DATABASE, layout="preds"
-        )
     with pytest.raises(InputError, match=r"layout='csv': .*hloc, kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong, ascending = (shortlist_of([[0, 1]], [[0.5, score]]) for score in (np.nan, 0.7))
@@ -243,3 +239,5 @@ def test_what_cannot_be_written(tmp_path):
     assert not list(tmp_path.iterdir())
     write_shortlist(path, ascending, QUERIES[:1], DATABASE)
     assert read_shortlist(path, QUERIES[:1], DATABASE).scores.tolist() == [[2, 1]]
+    with pytest.raises(InputError, match="expected a new or an empty folder"):
+        write_shortlist(tmp_path, ascending, QUERIES[:1], DATABASE, layout="preds")
