@@ -131,7 +131,7 @@ def write_shortlist(
             if name != name.strip() or "\n" in name or "\r" in name:
                 raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
     if layout == "preds":
-        predictions = [[database_names[row] for row in rows[real].tolist()]
+        predictions = [[database_names[int(row)] for row in rows[real]]
                        for rows, real in zip(indices, mask, strict=True)]  # fmt: skip
         _write_predictions(path, predictions, query_names)
         return
