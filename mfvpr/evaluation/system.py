@@ -17,8 +17,7 @@ from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matching.lightglue import LightGlueMatcher
 from mfvpr.matching.match_set import Scales
-from mfvpr.matching.matcher import NEIGHBORS, Matcher, NearestNeighborMatcher
-from mfvpr.matching.nearest_neighbors import CrossCheck
+from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.reranking.ranking import Ties
 from mfvpr.reranking.results import RETRIEVAL
@@ -68,8 +67,6 @@ class Pipeline:
             got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
             raise InputError(f"matcher: expected a function of the features of two images that returns Matches, got "
                              f"{got}; see mfvpr.Matcher")  # fmt: skip
-        if isinstance(self.matcher, NearestNeighborMatcher):
-            require_word("cross_check", self.matcher.cross_check, CrossCheck)
         if isinstance(self.matcher, LightGlueMatcher):
             _check_lightglue(self.matcher, self.extractor)
 

@@ -14,7 +14,8 @@ rounded product of x, and c the largest checked one, of the neighbor y:
 
 So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
 checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
-differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair.
+differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair, and
+at once if `tells_apart` says so.
 
 The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
 2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.

@@ -41,8 +41,8 @@ class Matcher(Protocol):
 
     An optional method `prepare(queries, candidates, chunk_size)` does once per query what would be done for each of its
     pairs. It takes Features `[B, N0]` and `[S, N1]`, and returns what the matcher then takes in place of a query's
-    Features: arrays with the leading axis B. A matcher must take plain Features as well, with which
-    other functions call it, as `NearestNeighborMatcher` does.
+    Features: arrays with the leading axis B. A matcher must take plain Features as well, with which other functions
+    call it, as `NearestNeighborMatcher` does.
     """
 
     def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
@@ -54,8 +54,8 @@ class NearestNeighborMatcher:
 
         matcher = mfvpr.NearestNeighborMatcher(cross_check="mutual", max_distance=0.7, max_matches=500)
 
-    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory and
-    matches that differ by less than the rounding of float32.
+    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory, and
+    which of two neighbors is taken whose products differ by less than the rounding of float32.
     """
 
     recipe_name: ClassVar[str] = "Matching"  # in stored recipes

@@ -82,14 +82,14 @@ def match_rounded(query: Rounded, candidate: Features, *, with_ratio: bool) -> M
     """`match` with products of bfloat16; `cross_check` is `mutual`, and both images have slots."""
     candidate = ready(candidate)
     fixed_query, fixed = jax.lax.stop_gradient((query, candidate))
-    fixed_candidate = round_candidate(fixed)
+    rounded = round_candidate(fixed)
     in_single = partial(_neighbors, fixed_query.features, fixed, "mutual", with_second=with_ratio)
 
     def in_bfloat16() -> Neighbors:
-        neighbors, settled = mutual_neighbors(fixed_query, fixed_candidate, with_second=with_ratio)
+        neighbors, settled = mutual_neighbors(fixed_query, rounded, with_second=with_ratio)
         return jax.lax.cond(settled, lambda: neighbors, in_single)
 
-    neighbors = jax.lax.cond(tells_apart(fixed_query, fixed_candidate), in_bfloat16, in_single)
+    neighbors = jax.lax.cond(tells_apart(fixed_query, rounded), in_bfloat16, in_single)
     return _matches_of(query.features, candidate, neighbors, with_ratio=with_ratio)
 
 

@@ -12,7 +12,6 @@ import mfvpr
 from mfvpr.datasets import FrameTruth, image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
-from mfvpr.matching import NearestNeighborMatcher
 from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
@@ -99,7 +98,6 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each of"),
         ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "scorer: expected real number"),
-        ({"matcher": NearestNeighborMatcher(cross_check="x")}, "cross_check='x': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "retrieval_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
          r"cosine .*1, got 3"),
