@@ -9,7 +9,7 @@ from mfvpr.cli.console import Progress, tell
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
-from mfvpr.evaluation.image_sizes import folders_of, size_for_images
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matching import MatchSet, Scales
@@ -61,7 +61,7 @@ def with_image_size(settings: dict[str, Any]) -> dict[str, Any]:
         return settings
     dataset = dataset_of(settings["dataset"])
     pipeline = assembly.pipeline(settings, dataset)
-    size = size_for_images(pipeline.image_size_for, folders_of(dataset), lambda line: tell(f"warning: {line}"))
+    size = pipeline.size_for_images(folders_of(dataset), lambda line: tell(f"warning: {line}"))
     return {**settings, "features": {**settings["features"], "image_size": [*size]}}
 
 

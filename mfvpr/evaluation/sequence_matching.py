@@ -11,7 +11,7 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.image_sizes import folders_of, size_for_images
+from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.system import Pipeline
 from mfvpr.evaluation.validation import image_warnings, validate_candidates
 from mfvpr.features.feature_set import FeatureSet
@@ -48,9 +48,7 @@ class _Work:
         """Learn the parts that depend on the database."""
         cache = replace(cache, watch=cache.watch or watch)
         if pipeline.pixels is not None:
-            pipeline = pipeline.with_image_size(
-                size_for_images(pipeline.image_size_for, folders_of(dataset), cache.warn)
-            )
+            pipeline = pipeline.with_image_size(pipeline.size_for_images(folders_of(dataset), cache.warn))
         with watch("features"):
             pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, dataset.database, cache))
         with watch("retrieval"):

@@ -1,6 +1,6 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.image_sizes import size_for_images
+from mfvpr.evaluation.image_sizes import Note, size_for_images
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
@@ -74,6 +74,10 @@ class Pipeline:
         """Size of about `pixels` in the shape of an image of `shape`, both (width, height)."""
         assert self.pixels is not None
         return shape_size(shape, self.pixels, getattr(self.extractor, "side_multiple", 1))
+
+    def size_for_images(self, folders: Iterable[ImageFolder], note: Note) -> tuple[int, int]:
+        """Size that `pixels` leaves to the images, see `mfvpr.evaluation.image_sizes`."""
+        return size_for_images(self.image_size_for, folders, note)
 
     def with_image_size(self, size: tuple[int, int]) -> "Pipeline":
         """The pipeline with an extractor of another image size (width, height), px, in the retrieval as well."""
@@ -146,11 +150,11 @@ class System:
             settings = {**settings, "features": {**settings["features"], "image_size": [*size]}}
         return replace(self, pipeline=self.pipeline.with_image_size(size), settings=settings)
 
-    def fit_image_size(self, folders: Iterable[ImageFolder], note: Callable[[str], object]) -> "System":
-        """The system at the image size that its pipeline leaves to the images; see `size_for_images`."""
+    def fit_image_size(self, folders: Iterable[ImageFolder], note: Note) -> "System":
+        """The system at the image size that its pipeline leaves to the images."""
         if self.pipeline.pixels is None:
             return self
-        return self.with_image_size(size_for_images(self.pipeline.image_size_for, folders, note))
+        return self.with_image_size(self.pipeline.size_for_images(folders, note))
 
     def warm_up(self, image_size: tuple[int, int]) -> None:
         """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.

@@ -1,4 +1,4 @@
-"""Images of a network run two at a time on a processor, without a trace in the results."""
+"""Images of a network run two at a time on a CPU, with the results of one at a time."""
 
 import threading
 

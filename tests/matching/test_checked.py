@@ -177,8 +177,20 @@ def test_too_many_close_products_are_left_to_float32(noise, with_ratio):
         np.testing.assert_array_equal(np.asarray(getattr(matches, name))[mask], np.asarray(values)[mask])
 
 
+def assert_as_in_float32(query, candidate, monkeypatch):
+    """Whatever the guess says, matches are those of float32."""
+    in_single = nearest_neighbors.match(query, candidate, with_ratio=True)
+    mask = np.asarray(in_single.mask)
+    with monkeypatch.context() as patch:
+        for guess in (checked.tells_apart, lambda *_: jnp.bool_(False)):
+            patch.setattr(nearest_neighbors, "tells_apart", guess)
+            rounded = match_rounded(prepare_query(query), candidate, with_ratio=True)
+            np.testing.assert_array_equal(rounded.mask, mask)
+            np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
+
+
 @pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
-def test_equal_and_nearly_equal_images_are_told_before_they_are_multiplied(kind):
+def test_a_guess_leaves_equal_and_nearly_equal_images_to_float32(kind, monkeypatch):
     query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))
     if kind == "equal":
         query.descriptors[:], candidate.descriptors[:] = query.descriptors[0], query.descriptors[0]
@@ -187,6 +199,7 @@ def test_equal_and_nearly_equal_images_are_told_before_they_are_multiplied(kind)
             side.descriptors[:] = side.descriptors[np.arange(len(side.mask)) // 3 * 3]
     if kind == "all padding":
         query.mask[:] = False
+    assert_as_in_float32(query, candidate, monkeypatch)
     tells_apart = checked.tells_apart(prepare_query(query), checked.round_candidate(nearest_neighbors.ready(candidate)))
     assert tells_apart == (kind not in ("twins", "near twins", "equal", "three times"))
 
