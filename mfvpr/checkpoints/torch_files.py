@@ -3,10 +3,8 @@
 Only ordered dictionaries, tensors, parameters and the notes of a training may be called by name; notes are skipped.
 """
 
-import io
 import math
 import os
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -16,6 +14,7 @@ import numpy as np
 
 from mfvpr.io.containers import shorten
 from mfvpr.io.formats.pickles import MEND, DataUnpickler, Name, file_size, name_error, natural_number, of_type
+from mfvpr.io.formats.torch_archives import open_torch_archive
 from mfvpr.utils.errors import InputError
 
 Order = Literal["little", "big"]
@@ -99,19 +98,11 @@ def _natural_numbers(values: Any) -> tuple[int, ...]:
 
 
 def read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
-    """Read a zip file: a pickle, and one entry for the values of each storage, uncompressed, with checksums."""
-    with zipfile.ZipFile(file) as archive:
-        entries = archive.infolist()
-        names = [entry.filename for entry in entries]
-        packed = any(entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1 for entry in entries)
-        if packed or len(set(names)) < len(names) or sum(entry.file_size for entry in entries) > file_size(file):
-            raise InputError("expected each entry of the zip file once and uncompressed; use the official file")
-        if broken := archive.testzip():
-            raise InputError(f"this checkpoint is damaged, by the checksum of {shorten(broken)}; download it again")
-        (pickle,) = (name for name in names if name.split("/")[1:] == ["data.pkl"])
-        folder = pickle.removesuffix("data.pkl")
-        order = _ORDERS[archive.read(f"{folder}byteorder") if f"{folder}byteorder" in names else b"little"]
-        content = _TensorUnpickler(io.BytesIO(archive.read(pickle))).load()
+    """Read a zip file with the values of each storage."""
+    with open_torch_archive(file) as (archive, folder, pickle):
+        has_order = f"{folder}byteorder" in archive.namelist()
+        order = _ORDERS[archive.read(f"{folder}byteorder") if has_order else b"little"]
+        content = _TensorUnpickler(pickle).load()
         return _arrays(content, order, lambda storage: archive.read(f"{folder}data/{storage.key}"))
 
 

@@ -96,7 +96,7 @@ class ImportedFeatures:
             raise InputError(f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} "
                              f"numbers, got {got}; has the file changed since it was opened?")  # fmt: skip
         size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
-        _require_inside(where, keypoints, size)
+        require_inside(where, keypoints, size)
         descriptors = with_length(f"{where}: descriptors", descriptors.reshape(shape), self._lengths)
         return Features(
             keypoints=np.ascontiguousarray(keypoints),
@@ -259,7 +259,7 @@ def _image_size(
     return size
 
 
-def _require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
+def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
     """Raise an InputError for keypoints in another image size, or as (y, x); float16 may round outwards."""
     margin = np.maximum(2.0, 0.01 * size)
     outside = ((keypoints < -margin) | (keypoints > size - 1 + margin)).any(axis=1)

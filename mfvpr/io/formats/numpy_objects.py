@@ -58,7 +58,9 @@ class Array:
         return view.astype(dtype.newbyteorder("="), copy=False)
 
 
-class _ArrayUnpickler(DataUnpickler):
+class ArrayUnpickler(DataUnpickler):
+    """Unpickler of `Array` among plain data."""
+
     def call(self, name: Name, arguments: tuple) -> Any:
         match str(name), arguments:
             case (
@@ -99,7 +101,7 @@ def read_objects(file: BinaryIO, expected: str) -> list[Any]:
         LookupError, TypeError, ValueError: the file is damaged.
     """
     shape = _header_shape(file, expected)
-    content = _ArrayUnpickler(file).load()
+    content = ArrayUnpickler(file).load()
     if file.read(1):
         raise ValueError("bytes after the pickle")
     match content:

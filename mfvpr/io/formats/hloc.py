@@ -1,0 +1,62 @@
+"""Read the matches of hloc's HDF5 files: a group `IMAGE/IMAGE` for each pair, with `-` for each `/` of the names."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mfvpr.io.containers import shorten
+from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader
+from mfvpr.io.h5 import H5File
+from mfvpr.utils.errors import InputError
+
+_NUMBERS = ("matches0", "matching_scores0")  # of a matcher of features
+_POINTS = ("keypoints0", "keypoints1", "scores")  # of a dense matcher, in the px of the image files
+
+
+class HlocPairs(PairReader):
+    """Reader of an hloc file of matches; names have `/` for each `-`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._file = path, H5File(path)
+        for group in self._file.images:
+            if group.count("/") != 1:
+                raise InputError(f"{path}: {shorten(group)}: expected groups IMAGE/IMAGE of matches, as hloc writes "
+                                 "them since 2021; give matches*.h5, not feats*.h5, or match again")  # fmt: skip
+        self._groups = {tuple(map(self.written, group.split("/"))): group for group in self._file.images}
+        if len(self._groups) < len(self._file.images):
+            raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
+        self.images = tuple(dict.fromkeys(name for pair in self._groups for name in pair))
+        [arrays] = self._file.shapes([self._file.images[0]], ())
+        self.by_number = "keypoints0" not in arrays
+
+    def __contains__(self, pair: Pair) -> bool:
+        return pair in self._groups
+
+    def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
+        groups = [self._groups[pair] for pair in pairs]
+        for group, arrays in zip(groups, self._file.arrays(groups, _NUMBERS + _POINTS), strict=True):
+            required = _NUMBERS[:1] if self.by_number else _POINTS[:2]
+            if missing := [name for name in required if name not in arrays]:
+                raise InputError(f"{self.path}: {shorten(group)}: expected {' and '.join(required)}, got no "
+                                 f"{missing[0]}; match again")  # fmt: skip
+            if not self.by_number:
+                yield FileMatches(*(arrays.get(name) for name in _POINTS))
+                continue
+            numbers, scores = arrays["matches0"], arrays.get("matching_scores0")
+            yield _numbered(f"{self.path}: {shorten(group)}", numbers, scores)
+
+    def written(self, name: str) -> str:
+        return name.replace("-", "/")
+
+
+def _numbered(where: str, numbers: np.ndarray, scores: np.ndarray | None) -> FileMatches:
+    """Matches from the number of each keypoint's partner, -1 = none."""
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or (scores is not None and scores.shape != numbers.shape):
+        got = f"{numbers.dtype}{list(numbers.shape)} and {'none' if scores is None else list(scores.shape)}"
+        raise InputError(f"{where}: expected matches0 [N] of integers and matching_scores0 [N], got {got}")
+    if (numbers < -1).any():
+        raise InputError(f"{where}: expected numbers of keypoints from 0, or -1, got {numbers.min()}; hloc writes int16, "
+                         "so match at most 32768 keypoints")  # fmt: skip
+    first = np.flatnonzero(numbers >= 0)
+    return FileMatches(first, numbers[first], None if scores is None else scores[first])

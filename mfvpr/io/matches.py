@@ -1,0 +1,274 @@
+"""Read matches that other programs computed.
+
+    files = open_matches("matches.h5", Images(query_names, features=queries), Images(database_names, features=database))
+    matches = files.read(3, [14, 15])  # of query 3 with two database images
+
+Matches are numbers of keypoints (hloc, kapture, COLMAP), or points (dense matchers of hloc, vismatch, `.npz`).
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from mfvpr.io.checks import as_float32
+from mfvpr.io.containers import choose_reader, shorten
+from mfvpr.io.features import ImportedFeatures, require_inside
+from mfvpr.io.formats.colmap import ColmapPairs
+from mfvpr.io.formats.hloc import HlocPairs
+from mfvpr.io.formats.kapture import KapturePairs
+from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
+from mfvpr.io.formats.result_files import ResultFiles
+from mfvpr.io.names import match_names
+from mfvpr.types import Features, Matches
+from mfvpr.utils.errors import InputError
+
+_ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
+
+
+class Images(NamedTuple):
+    """Images of one side.
+
+    names: relative POSIX paths, as `ImageFolder.names`, matched as in `names.match_names`.
+    paths: full paths, which are tried before the names; () = none.
+    size: size of the image file of a row; None = unknown.
+    features: of these images, for files of matches without keypoints.
+    """
+
+    names: Sequence[str]
+    paths: Sequence[str] = ()
+    size: Callable[[int], Size] | None = None
+    features: ImportedFeatures | None = None
+
+
+class ImportedMatches:
+    """Matches in files of another program, made by `open_matches`.
+
+    Attributes:
+        path: file or folder.
+        names: names in the file of queries and database images; None = the file lacks the image.
+        has_distances: whether distances are those of descriptors; if not, all are 0.
+        has_scores: whether scores are those of keypoints; if not, all are 1.
+    """
+
+    def __init__(
+        self, reader: PairReader, sides: tuple[Images, Images], image_size: Size | None, confidences: bool
+    ) -> None:
+        self.path, self._reader, self._sides = reader.path, reader, sides
+        self._image_size, self._confidences = image_size, confidences
+        self._weighted: dict[bool, str] = {}  # whether pairs have confidences -> the first such pair
+        self.names = _names(reader, sides)
+        features = [side.features for side in sides]
+        self.has_distances = all(each is not None and each.dimension > 0 for each in features)
+        self.has_scores = all(each is not None and each.scored for each in features)
+
+    def contains(self, query: int, candidate: int) -> bool:
+        """Whether the file has matches of a pair, in either order; they may be none."""
+        return self._stored(query, candidate) is not None
+
+    def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
+        """Matches `[n]` of a query with each candidate, NumPy, without padding; None = the file lacks the pair.
+
+        Raises:
+            InputError: matches are damaged, beyond the keypoints or the images, or confidences beyond 0 to 1.
+        """
+        stored = {row: pair for row in candidates if (pair := self._stored(query, row)) is not None}
+        names = [pair for pair, _ in stored.values()]
+        contents = zip(stored.items(), self._reader.read(names), strict=True)
+        matches = {row: raw.exchanged() if is_exchanged else raw for (row, (_, is_exchanged)), raw in contents}
+        convert = self._by_number if self._reader.by_number else self._by_point
+        return list(map(convert(query, matches).get, candidates))
+
+    def _stored(self, query: int, candidate: int) -> tuple[Pair, bool] | None:
+        """Names of a pair in the file's order, and whether that is candidate, query."""
+        first, second = self.names[0][query], self.names[1][candidate]
+        if first is None or second is None:
+            return None
+        if (first, second) in self._reader:
+            return (first, second), False
+        return ((second, first), True) if not self._reader.sided and (second, first) in self._reader else None
+
+    def _by_number(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
+        if not matches:
+            return {}
+        [features0] = self._features(0, [query]).values()
+        features1 = self._features(1, list(matches))
+        return {row: self._join(query, row, raw, features0, features1[row]) for row, raw in matches.items()}
+
+    def _features(self, side: int, rows: list[int]) -> dict[int, Features]:
+        """Features of images of a side, by row."""
+        images = self._sides[side]
+        if images.features is not None:
+            return dict(images.features.read(rows))
+        features = {}
+        for row in rows:
+            name = str(self.names[side][row])
+            points = self._reader.keypoints(name)
+            assert points is not None  # see `_open`
+            size = self._reader.image_size(name) or self._size(side, row, None)
+            where = f"{self.path}: {shorten(name)}"
+            points = as_float32(f"{where}: keypoints", points)
+            require_inside(where, points, np.array(size, np.float32))
+            features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=np.float32(size))
+        return features
+
+    def _join(
+        self, query: int, row: int, raw: FileMatches, features0: Features, features1: Features
+    ) -> Matches:
+        """Matches from the numbers of keypoints."""
+        where = self._where(query, row)
+        numbers = []
+        for values, features in ((raw.first, features0), (raw.second, features1)):
+            if values.size and not 0 <= values.min() <= values.max() < len(features.mask):
+                raise InputError(f"{where}: expected numbers of {len(features.mask)} keypoints, got {values.min()} to "
+                                 f"{values.max()}; give the features that were matched")  # fmt: skip
+            numbers.append(values.astype(np.int32))
+        descriptors0, descriptors1 = features0.descriptors[numbers[0]], features1.descriptors[numbers[1]]
+        distance = np.zeros(len(numbers[0]), np.float32)
+        if self.has_distances:
+            distance = np.linalg.norm(descriptors0 - descriptors1, axis=1)
+        return Matches(
+            points0=features0.keypoints[numbers[0]],
+            points1=features1.keypoints[numbers[1]],
+            distance=distance,
+            scores0=features0.scores[numbers[0]],
+            scores1=features1.scores[numbers[1]],
+            mask=np.ones(len(distance), bool),
+            image_size0=features0.image_size,
+            image_size1=features1.image_size,
+            confidence=self._confidence(where, raw),
+            index0=numbers[0],
+            index1=numbers[1],
+            count0=np.int32(len(features0.mask)),
+            count1=np.int32(len(features1.mask)),
+        )
+
+    def _by_point(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
+        return {row: self._at_points(query, row, raw) for row, raw in matches.items()}
+
+    def _at_points(self, query: int, row: int, raw: FileMatches) -> Matches:
+        """Matches from points."""
+        where, points, sizes = self._where(query, row), [], []
+        for side, (image, values) in enumerate(((query, raw.first), (row, raw.second))):
+            values = as_float32(f"{where}: points", values, "fiu")
+            values = values.reshape(0, 2) if not values.size else values
+            if values.ndim != 2 or values.shape[1] != 2 or len(values) != len(raw.first):
+                got = f"{list(raw.first.shape)} and {list(raw.second.shape)}"
+                raise InputError(f"{where}: expected as many points (x, y) [M, 2] in both images, got {got}")
+            size = np.array(self._size(side, image, raw.sizes and raw.sizes[side]), np.float32)
+            require_inside(where, values, size)
+            points.append(values)
+            sizes.append(size)
+        ones = np.ones(len(points[0]), np.float32)
+        confidence = self._confidence(where, raw)
+        return Matches(*points, 0 * ones, ones, ones, ones > 0, *sizes, confidence=confidence)
+
+    def _confidence(self, where: str, raw: FileMatches) -> Float32[np.ndarray, " matches"]:
+        """Confidences of matches; 1 if the file has none."""
+        number = len(raw.first)
+        if not self._confidences or not number:
+            return np.ones(number, np.float32)
+        self._weighted.setdefault(raw.confidence is not None, where)
+        if len(self._weighted) == 2:
+            raise InputError(f"{self._weighted[False]}: expected confidences of all pairs or of none, got none; ignore "
+                             "them with confidences=False")  # fmt: skip
+        if raw.confidence is None:
+            return np.ones(number, np.float32)
+        values = as_float32(f"{where}: confidences", raw.confidence, "fiu")
+        if values.shape != (number,) or values.min() < -_ROUNDING or values.max() > 1 + _ROUNDING:
+            got = f"{list(values.shape)}" if values.shape != (number,) else f"{values.min():g} to {values.max():g}"
+            raise InputError(f"{where}: expected {number} confidences from 0 to 1, got {got}; ignore them with "
+                             "confidences=False")  # fmt: skip
+        return np.clip(values, 0, 1)
+
+    def _size(self, side: int, row: int, stored: Size | None) -> Size:
+        """Size of the image that points are in; an InputError if nobody knows it."""
+        if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
+            raise InputError(f"{self.path}: expected the image_size that was given, {list(self._image_size)}, got "
+                             f"{list(stored)}")  # fmt: skip
+        if (size := stored or self._image_size) is not None:
+            return size
+        size_of = self._sides[side].size
+        if size_of is None or not self._reader.in_image_files:
+            raise InputError(f"{self.path}: expected the size of the images that the points are in, got none; set "
+                             "image_size=[W,H]")  # fmt: skip
+        return size_of(row)
+
+    def _where(self, query: int, row: int) -> str:
+        return f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"
+
+
+def open_matches(
+    path: Path | str,
+    queries: Images,
+    database: Images,
+    *,
+    image_size: Size | None = None,
+    verified: bool = False,
+    confidences: bool = True,
+) -> ImportedMatches:
+    """Open the matches of queries with database images; reads names, and no matches.
+
+    Args:
+        path: hloc's `matches*.h5`; COLMAP's `.db`; a kapture folder; or a folder with a file for each pair, `.npz`, or
+            `.torch` of vismatch.
+        queries: names of the queries, and what is known of them.
+        database: likewise; hloc's matches of features need the `features` of both sides.
+        image_size: (width, height) of the images that points are in, px, if the file does not tell.
+        verified: matches that fit a geometric model: COLMAP's `two_view_geometries`, vismatch's inliers.
+        confidences: whether matches have the confidences of the file; if not, or without any, all are 1.
+
+    Raises:
+        InputError: the file is missing, damaged or has another format; names are ambiguous; there is no pair of a query
+            and a database image; or features are missing.
+    """
+    reader = _open(Path(path), queries, database, verified)
+    if reader.by_number and not isinstance(reader, ColmapPairs | KapturePairs):
+        if queries.features is None or database.features is None:
+            raise InputError(f"{path}: expected the features that were matched, got none; give hloc's feats*.h5")
+    elif queries.features is not None or database.features is not None:
+        raise InputError(f"{path}: expected no features, since the file has its points; leave them out")
+    return ImportedMatches(reader, (queries, database), image_size, confidences)
+
+
+def _open(path: Path, queries: Images, database: Images, verified: bool) -> PairReader:
+    if path.is_dir() and not KapturePairs.fits(path):
+        return ResultFiles(path, (queries.names, database.names), verified)
+    if path.suffix.lower() == ".db":
+        return ColmapPairs(path, verified)
+    if verified:
+        raise InputError(f"{path}: expected COLMAP's .db or vismatch's results with verified=True")
+    if path.is_dir():
+        return KapturePairs(path)
+    return choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})(path)
+
+
+def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str | None], list[str | None]]:
+    """Names in the file of the images of each side."""
+    names = tuple(_names_of_side(reader, images) for images in sides)
+    both = {*filter(None, names[0])} & {*filter(None, names[1])}
+    is_shared = both and not reader.sided and [*sides[0].paths] != [*sides[1].paths]
+    for name in sorted(both) if is_shared else ():
+        images = [side.paths[each.index(name)] if side.paths else side.names[each.index(name)]
+                  for side, each in zip(sides, names, strict=True)]  # fmt: skip
+        if images[0] != images[1]:
+            raise InputError(f"{reader.path}: expected one image for each name, got {shorten(name)} for the query "
+                             f"{shorten(images[0], 200)} and the database image {shorten(images[1], 200)}; give the "
+                             "prefixes of both folders, with which the file has them")  # fmt: skip
+    for side, each in zip(("queries", "database images"), names, strict=True):
+        if not any(each):
+            raise InputError(f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, such "
+                             f"as {shorten(reader.images[0])}; give the prefix of their folder")  # fmt: skip
+    return names[0], names[1]
+
+
+def _names_of_side(reader: PairReader, images: Images) -> list[str | None]:
+    """Names in the file by full paths, or if no image has such a name, by names."""
+    for names in (images.paths, images.names):
+        if names:
+            matched = match_names(reader.path, [*map(reader.written, names)], reader.images)
+            if any(matched):
+                return matched
+    return [None] * len(images.names)
