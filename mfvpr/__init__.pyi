@@ -8,6 +8,7 @@ from .types import Features, Matches, Ranking, Shortlist
 from .retrieval.search import retrieve
 
 # matches of two images, and of a query with its candidates
+from .matching.host import HostMatcher
 from .matching.lightglue import LightGlueMatcher
 from .matching.matcher import Matcher, NearestNeighborMatcher, match_pairs
 from .matching.nearest_neighbors import compact, filter_matches, match, match_candidates
@@ -69,6 +70,7 @@ __all__ = [
     "Ranking",
     "Shortlist",
     "retrieve",
+    "HostMatcher",
     "LightGlueMatcher",
     "Matcher",
     "NearestNeighborMatcher",

@@ -17,7 +17,7 @@ PERMISSIONS = {
     "checkpoints": {"io", "networks", "utils"},
     "datasets": {"io", "utils"},
     "features": {"datasets", "networks", "types", "utils"},
-    "matching": {"features", "networks", "types", "utils"},
+    "matching": {"datasets", "features", "io", "networks", "types", "utils"},
     "storage": {"datasets", "features", "matching", "types", "utils"},
     "retrieval": {"datasets", "features", "io", "storage", "types", "utils"},
     "reranking": {"datasets", "matching", "scoring", "types", "utils"},

@@ -14,7 +14,8 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.system import Pipeline
 from mfvpr.evaluation.validation import image_warnings, validate_candidates
-from mfvpr.features.feature_set import FeatureSet
+from mfvpr.features.extractor import Scale
+from mfvpr.matching.host import PairSource, Side
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
@@ -28,6 +29,7 @@ from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
+TYPICAL_MATCHES = 1000  # assumed matches of a pair of images, for forecasts of disk space
 _REMARKS = "images.json"  # beside the matches: which images are bad
 
 
@@ -49,8 +51,9 @@ class _Work:
         cache = replace(cache, watch=cache.watch or watch)
         if pipeline.pixels is not None:
             pipeline = pipeline.with_image_size(pipeline.size_for_images(folders_of(dataset), cache.warn))
-        with watch("features"):
-            pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, dataset.database, cache))
+        if image_source(pipeline) is None:
+            with watch("features"):
+                pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, dataset.database, cache))
         with watch("retrieval"):
             pipeline = replace(pipeline, retriever=fit_to_database(pipeline.retriever, dataset.database, cache))
         return cls(dataset, sequence, pipeline, cache, watch)
@@ -84,7 +87,7 @@ def match_sequence(
         images = sequence.images
         cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
                      "counts as a failure")  # fmt: skip
-    return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.extractor.scales))
+    return replace(matched, weights=tuple(scale.weight for scale in scales_of(work.pipeline)))
 
 
 def match_rows(
@@ -124,9 +127,13 @@ def _match(
     return matches, remarks
 
 
-def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[FeatureSet, FeatureSet]], dict[str, Any]]:
-    """Features of the queries and of all candidates by scale, and remarks on bad images of both sides."""
+def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Side, Side]], dict[str, Any]]:
+    """What is matched of queries and candidates by scale, and remarks on bad images of both sides."""
     dataset, sequence, extractor = work.dataset, work.sequence, work.pipeline.extractor
+    if (source := image_source(work.pipeline)) is not None:
+        sides = sequence.images, dataset.database
+        remarks = {"queries": retrieved.bad_queries, "database": retrieved.bad_database}
+        return [sides], {**remarks, "warnings": source.open(*sides).warnings(retrieved.candidates)}
     rows = np.unique(retrieved.candidates.indices[retrieved.candidates.mask])
     database = work.cache.local(dataset.database, extractor, rows.tolist(), label="database")
     queries = work.cache.local(sequence.images, extractor, label=f"query {sequence.name}")
@@ -136,6 +143,17 @@ def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Featur
     warnings += image_warnings(sequence.images, queries[0], bad_queries)
     remarks = {"queries": bad_queries, "database": bad_database, "warnings": warnings}
     return list(zip(queries, database, strict=True)), remarks
+
+
+def image_source(pipeline: Pipeline) -> PairSource | None:
+    """The matcher, if it takes images or files instead of features."""
+    matcher = pipeline.matcher
+    return matcher if isinstance(matcher, PairSource) and matcher.inputs == "images" else None
+
+
+def scales_of(pipeline: Pipeline) -> tuple[Scale, ...]:
+    """Scales of the matches."""
+    return pipeline.extractor.scales if image_source(pipeline) is None else (Scale(0, TYPICAL_MATCHES),)
 
 
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
@@ -171,7 +189,9 @@ def matches_recipe(
 ) -> dict[str, Any]:
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matcher."""
     excluded, database = sequence.excluded, dataset.database
-    extractor = fit_to_database(pipeline.extractor, database, cache)
+    extractor = None
+    if image_source(pipeline) is None:
+        extractor = fit_to_database(pipeline.extractor, database, cache)
     return {
         "database": cache.recipes.of_folder(database, extractor),
         "query": cache.recipes.of_folder(sequence.images, extractor),
@@ -189,7 +209,7 @@ def _match_stores(work: _Work, rows: Sequence[int] | None = None) -> Iterator[li
 
     There are none if the cache is in memory.
     """
-    cache, scales, number = work.cache, work.pipeline.extractor.scales, len(work.sequence.images)
+    cache, scales, number = work.cache, scales_of(work.pipeline), len(work.sequence.images)
     if cache.root is None:
         yield []
         return

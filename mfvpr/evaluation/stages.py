@@ -4,8 +4,8 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.features.feature_set import FeatureSet, memory_budget
-from mfvpr.matching import batched
-from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.matching import batched, host
+from mfvpr.matching.host import PairSource, Side
+from mfvpr.matching.match_set import MatchSet, QueryMatches, Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
 from mfvpr.reranking.batched_scoring import score
 from mfvpr.reranking.ranking import BIN_STEP
@@ -37,19 +38,20 @@ STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
 # things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
 SHIFT_FLOOR = 0.03
 WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
+Limits = tuple[float | None, Sequence[Device] | None]  # of memory, GB, and devices
 
 
 def match(
-    queries: FeatureSet, database: FeatureSet, candidates: Shortlist, matcher: Matcher = NEIGHBORS, *,
+    queries: Side, database: Side, candidates: Shortlist, matcher: Matcher | PairSource = NEIGHBORS, *,
     store: MatchStore | None = None, rows: Sequence[int] | None = None, runtime: Runtime = DEFAULT_RUNTIME,
 ) -> MatchSet:  # fmt: skip
     """Match every query with its candidates; matches include their ratio, which some weights use.
 
     Args:
-        queries: Q images.
-        database: M images.
+        queries: features of Q images; or the images, if that is what the matcher takes.
+        database: likewise, of M images.
         candidates: `[Q, C]` rows of the database.
-        matcher: of one pair.
+        matcher: of one pair; one that runs on the host takes no part in a cluster.
         store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
             batches; the result is read from it.
         rows: of the queries that are matched and returned; None = all.
@@ -59,13 +61,12 @@ def match(
         InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
             candidates, and then nothing is written.
     """
-    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
-        raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
-                         f"and {database.dimension} (database); extract all images alike")  # fmt: skip
+    if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
+        _require_same_dimensions(queries, database)
+    on_host = isinstance(matcher, PairSource)
     sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
     if store is None:
-        options = {"memory": runtime.memory, "devices": runtime.devices or [device_of(())]}
-        pairs = batched.match_queries(*sides, requested, matcher, **options)
+        pairs = _match_queries(sides, requested, matcher, (runtime.memory, runtime.devices))
         matched = [query for _, query in runtime.progress("matching")(pairs, len(requested))]
         shape = len(matched), candidates.indices.shape[1]
         counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
@@ -73,6 +74,7 @@ def match(
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
+        runtime = replace(runtime, cluster=None) if on_host else runtime
         here, at_workers = (runtime.memory, runtime.devices), (runtime.memory or WORKER_MEMORY, None)
         shared = sides, matcher, here if runtime.cluster is None else at_workers, store
         for block, counts in runtime.map(_match_rows, shared, missing, "matching", batched.QUERIES):
@@ -84,17 +86,32 @@ def match(
 
 
 def _match_rows(
-    sides: tuple[FeatureSet, FeatureSet, Shortlist], matcher: Matcher,
-    limits: tuple[float | None, Sequence[Device] | None], store: MatchStore, rows: Sequence[int],
-    track: Track = no_progress,
+    sides: tuple[Side, Side, Shortlist], matcher: Matcher | PairSource, limits: Limits, store: MatchStore,
+    rows: Sequence[int], track: Track = no_progress,
 ) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
     """Write the matches of queries to a store within limits of memory and devices; returns rows and numbers."""
-    missing, (memory, devices) = [row for row in rows if not store.done[row]], limits
-    matched = batched.match_queries(*sides, missing, matcher, memory=memory, devices=devices or [device_of(())])
-    tracked = iter(track(matched, len(missing)))
-    while batch := dict(itertools.islice(tracked, STORE_BATCH)):
+    missing = [row for row in rows if not store.done[row]]
+    tracked = iter(track(_match_queries(sides, missing, matcher, limits), len(missing)))
+    together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # which may take minutes for a query
+    while batch := dict(itertools.islice(tracked, together)):
         store.write(batch)
     return rows, store.counts[rows]
+
+
+def _match_queries(
+    sides: tuple[Any, Any, Shortlist], rows: Sequence[int], matcher: Matcher | PairSource, limits: Limits
+) -> Iterator[tuple[int, QueryMatches]]:
+    """(row, matches) of queries, in the order of `rows`."""
+    if isinstance(matcher, PairSource):
+        return host.match_queries(*sides, rows, matcher)
+    memory, devices = limits
+    return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
+
+
+def _require_same_dimensions(queries: FeatureSet, database: FeatureSet) -> None:
+    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
+        raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
+                         f"and {database.dimension} (database); extract all images alike")  # fmt: skip
 
 
 def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:

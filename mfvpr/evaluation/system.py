@@ -15,6 +15,7 @@ from mfvpr.evaluation.image_sizes import Note, size_for_images
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
+from mfvpr.matching.host import PairSource
 from mfvpr.matching.lightglue import LightGlueMatcher
 from mfvpr.matching.match_set import Scales
 from mfvpr.matching.matcher import NEIGHBORS, Matcher
@@ -41,7 +42,8 @@ class Pipeline:
     Attributes:
         extractor: extracts local features, or reads them, see `mfvpr.retrieval.precomputed`.
         retriever: the retrieval, which finds candidates.
-        matcher: matches a pair, see `mfvpr.Matcher`.
+        matcher: matches a pair, see `mfvpr.Matcher`; or a program of your own, see `mfvpr.HostMatcher`; or files, see
+            `mfvpr.retrieval.MatchFiles`.
         candidates: number of candidates of each query.
         pixels: of a resized image, in the shape of the first database image, which decides once; None = the
             `image_size` of the extractor.
@@ -49,7 +51,7 @@ class Pipeline:
 
     extractor: Extractor | Source
     retriever: Retriever
-    matcher: Matcher = NEIGHBORS
+    matcher: Matcher | PairSource = NEIGHBORS
     candidates: int | Literal["all"] = 50
     pixels: int | None = None
 
@@ -63,7 +65,7 @@ class Pipeline:
         if not self.extractor.scales:
             name = type(self.extractor).__name__
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
-        if isinstance(self.matcher, type) or not callable(self.matcher):
+        if isinstance(self.matcher, type) or not (callable(self.matcher) or isinstance(self.matcher, PairSource)):
             got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
             raise InputError(f"matcher: expected a function of the features of two images that returns Matches, got "
                              f"{got}; see mfvpr.Matcher")  # fmt: skip
@@ -169,6 +171,8 @@ class System:
         extractor, candidates = pipeline.extractor, pipeline.candidates
         if isinstance(extractor, Source):
             raise InputError(f"{type(extractor).__name__}: expected an extractor of images, got a reader of features")
+        if isinstance(pipeline.matcher, PairSource) and pipeline.matcher.inputs == "images":
+            raise InputError(f"{type(pipeline.matcher).__name__}: expected a matcher of features, got one of images")
         rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
         shortlist = Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)
         image = resize(noise_image(image_size), extractor.image_size, extractor.interpolation)

@@ -1,6 +1,9 @@
 __all__ = [
+    "Images",
     "ImportedFeatures",
+    "ImportedMatches",
     "open_features",
+    "open_matches",
     "read_global_descriptors",
     "read_shortlist",
     "reranked_shortlist",
@@ -11,4 +14,5 @@ __all__ = [
 
 from .descriptors import read_global_descriptors, write_global_descriptors
 from .features import ImportedFeatures, open_features, write_features
+from .matches import Images, ImportedMatches, open_matches
 from .shortlists import read_shortlist, reranked_shortlist, write_shortlist

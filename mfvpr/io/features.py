@@ -27,7 +27,7 @@ from jaxtyping import Float32, Int32
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import Container, FileEntry, Shapes, choose_reader, shorten
 from mfvpr.io.h5 import H5File, write_h5
-from mfvpr.io.names import match_names, require_all, require_different
+from mfvpr.io.names import match_paths, require_all, require_different
 from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
 from mfvpr.types import Features
 from mfvpr.utils.errors import InputError, require_word
@@ -108,7 +108,13 @@ class ImportedFeatures:
 
 
 def open_features(
-    path: Path | str, names: Sequence[str], *, image_size: Any = None, lengths: Lengths = "unit", partial: bool = False
+    path: Path | str,
+    names: Sequence[str],
+    *,
+    paths: Sequence[str] = (),
+    image_size: Any = None,
+    lengths: Lengths = "unit",
+    partial: bool = False,
 ) -> ImportedFeatures:
     """Open the features of the images `names`; reads only the headers of their arrays.
 
@@ -117,6 +123,7 @@ def open_features(
             or a `.d2-net` (of D2-Net's code) for each image.
         names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Use hloc's paths if they
             begin at a parent folder (`database/1.jpg`).
+        paths: `[M]` full paths of the images, which are tried before the names; () = none.
         image_size: `[2]` or `[M, 2]` (width, height), px, if the files have no `image_size`.
         lengths: of descriptors. `unit`: require unit length within 1 %, and correct rounding; `normalize`: scale to
             unit length; `keep`: do not change them.
@@ -131,7 +138,7 @@ def open_features(
     sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
     readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile}
     container: Container = NpzFolder(path) if path.is_dir() else choose_reader(path, readers)(path)
-    images = match_names(path, names, container.images)
+    images = match_paths(path, names, paths, container.images)
     if not partial or not any(images):
         require_all(path, names, images, "features")
     rows = {image: row for row, image in enumerate(images) if image is not None}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Num
 
 from mfvpr.io.checks import as_float32
 from mfvpr.io.containers import choose_reader, shorten
@@ -21,11 +21,10 @@ from mfvpr.io.formats.hloc import HlocPairs
 from mfvpr.io.formats.kapture import KapturePairs
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
 from mfvpr.io.formats.result_files import ResultFiles
-from mfvpr.io.names import match_names
-from mfvpr.types import Features, Matches
+from mfvpr.io.names import match_paths
+from mfvpr.io.plain_matches import numbered_matches, point_matches
+from mfvpr.types import Features, Matches, Shortlist
 from mfvpr.utils.errors import InputError
-
-_ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
 
 
 class Images(NamedTuple):
@@ -49,6 +48,7 @@ class ImportedMatches:
     Attributes:
         path: file or folder.
         names: names in the file of queries and database images; None = the file lacks the image.
+        numbered: whether matches have numbers of keypoints.
         has_distances: whether distances are those of descriptors; if not, all are 0.
         has_scores: whether scores are those of keypoints; if not, all are 1.
     """
@@ -57,8 +57,9 @@ class ImportedMatches:
         self, reader: PairReader, sides: tuple[Images, Images], image_size: Size | None, confidences: bool
     ) -> None:
         self.path, self._reader, self._sides = reader.path, reader, sides
-        self._image_size, self._confidences = image_size, confidences
-        self._weighted: dict[bool, str] = {}  # whether pairs have confidences -> the first such pair
+        self._image_size, self._use_confidences = image_size, confidences
+        self._first: dict[bool, str] = {}  # with and without confidences, the first pair
+        self.numbered = reader.by_number
         self.names = _names(reader, sides)
         features = [side.features for side in sides]
         self.has_distances = all(each is not None and each.dimension > 0 for each in features)
@@ -78,7 +79,7 @@ class ImportedMatches:
         names = [pair for pair, _ in stored.values()]
         contents = zip(stored.items(), self._reader.read(names), strict=True)
         matches = {row: raw.exchanged() if is_exchanged else raw for (row, (_, is_exchanged)), raw in contents}
-        convert = self._by_number if self._reader.by_number else self._by_point
+        convert = self._numbered if self.numbered else self._at_points
         return list(map(convert(query, matches).get, candidates))
 
     def _stored(self, query: int, candidate: int) -> tuple[Pair, bool] | None:
@@ -90,12 +91,40 @@ class ImportedMatches:
             return (first, second), False
         return ((second, first), True) if not self._reader.sided and (second, first) in self._reader else None
 
-    def _by_number(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
+    def warnings(self, shortlist: Shortlist) -> list[str]:
+        """Warn in one line if pairs of a shortlist are missing; raise an InputError if all are."""
+        pairs = [(query, int(shortlist.indices[query, place])) for query, place in np.argwhere(shortlist.mask).tolist()]
+        missing = [pair for pair in pairs if not self.contains(*pair)]
+        if not missing:
+            return []
+        query, row = missing[0]
+        first = f"{shorten(self._sides[0].names[query])} and {shorten(self._sides[1].names[row])}"
+        if len(missing) == len(pairs):
+            raise InputError(f"{self.path}: expected matches of the {len(pairs)} pairs of the shortlist, got none; the "
+                             f"first is {first}; match these pairs, or check the prefixes")  # fmt: skip
+        return [f"{self.path}: no matches of {len(missing)} of {len(pairs)} pairs of the shortlist, the first {first}; "
+                "they score 0"]  # fmt: skip
+
+    def _numbered(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
+        """Matches from numbers of keypoints, by candidate."""
         if not matches:
             return {}
         [features0] = self._features(0, [query]).values()
         features1 = self._features(1, list(matches))
-        return {row: self._join(query, row, raw, features0, features1[row]) for row, raw in matches.items()}
+        return {row: numbered_matches(where := self._where(query, row), raw.first, raw.second,
+                                      self._confidence(where, raw), features0, features1[row])
+                for row, raw in matches.items()}  # fmt: skip
+
+    def _at_points(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
+        """Matches from points, by candidate."""
+        converted = {}
+        for row, raw in matches.items():
+            where = self._where(query, row)
+            size0, size1 = (self._size(side, image, raw.sizes and raw.sizes[side])
+                            for side, image in enumerate((query, row)))  # fmt: skip
+            confidence = self._confidence(where, raw)
+            converted[row] = point_matches(where, raw.first, raw.second, confidence, size0, size1)
+        return converted
 
     def _features(self, side: int, rows: list[int]) -> dict[int, Features]:
         """Features of images of a side, by row."""
@@ -105,83 +134,23 @@ class ImportedMatches:
         features = {}
         for row in rows:
             name = str(self.names[side][row])
-            points = self._reader.keypoints(name)
-            assert points is not None  # see `_open`
-            size = self._reader.image_size(name) or self._size(side, row, None)
-            where = f"{self.path}: {shorten(name)}"
-            points = as_float32(f"{where}: keypoints", points)
-            require_inside(where, points, np.array(size, np.float32))
-            features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=np.float32(size))
+            size = np.array(self._size(side, row, self._reader.image_size(name)), np.float32)
+            where, points = f"{self.path}: keypoints of {shorten(name)}", self._reader.keypoints(name)
+            assert points is not None  # see `open_matches`
+            points = as_float32(where, points)
+            require_inside(where, points, size)
+            features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
         return features
 
-    def _join(
-        self, query: int, row: int, raw: FileMatches, features0: Features, features1: Features
-    ) -> Matches:
-        """Matches from the numbers of keypoints."""
-        where = self._where(query, row)
-        numbers = []
-        for values, features in ((raw.first, features0), (raw.second, features1)):
-            if values.size and not 0 <= values.min() <= values.max() < len(features.mask):
-                raise InputError(f"{where}: expected numbers of {len(features.mask)} keypoints, got {values.min()} to "
-                                 f"{values.max()}; give the features that were matched")  # fmt: skip
-            numbers.append(values.astype(np.int32))
-        descriptors0, descriptors1 = features0.descriptors[numbers[0]], features1.descriptors[numbers[1]]
-        distance = np.zeros(len(numbers[0]), np.float32)
-        if self.has_distances:
-            distance = np.linalg.norm(descriptors0 - descriptors1, axis=1)
-        return Matches(
-            points0=features0.keypoints[numbers[0]],
-            points1=features1.keypoints[numbers[1]],
-            distance=distance,
-            scores0=features0.scores[numbers[0]],
-            scores1=features1.scores[numbers[1]],
-            mask=np.ones(len(distance), bool),
-            image_size0=features0.image_size,
-            image_size1=features1.image_size,
-            confidence=self._confidence(where, raw),
-            index0=numbers[0],
-            index1=numbers[1],
-            count0=np.int32(len(features0.mask)),
-            count1=np.int32(len(features1.mask)),
-        )
-
-    def _by_point(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
-        return {row: self._at_points(query, row, raw) for row, raw in matches.items()}
-
-    def _at_points(self, query: int, row: int, raw: FileMatches) -> Matches:
-        """Matches from points."""
-        where, points, sizes = self._where(query, row), [], []
-        for side, (image, values) in enumerate(((query, raw.first), (row, raw.second))):
-            values = as_float32(f"{where}: points", values, "fiu")
-            values = values.reshape(0, 2) if not values.size else values
-            if values.ndim != 2 or values.shape[1] != 2 or len(values) != len(raw.first):
-                got = f"{list(raw.first.shape)} and {list(raw.second.shape)}"
-                raise InputError(f"{where}: expected as many points (x, y) [M, 2] in both images, got {got}")
-            size = np.array(self._size(side, image, raw.sizes and raw.sizes[side]), np.float32)
-            require_inside(where, values, size)
-            points.append(values)
-            sizes.append(size)
-        ones = np.ones(len(points[0]), np.float32)
-        confidence = self._confidence(where, raw)
-        return Matches(*points, 0 * ones, ones, ones, ones > 0, *sizes, confidence=confidence)
-
-    def _confidence(self, where: str, raw: FileMatches) -> Float32[np.ndarray, " matches"]:
-        """Confidences of matches; 1 if the file has none."""
-        number = len(raw.first)
-        if not self._confidences or not number:
-            return np.ones(number, np.float32)
-        self._weighted.setdefault(raw.confidence is not None, where)
-        if len(self._weighted) == 2:
-            raise InputError(f"{self._weighted[False]}: expected confidences of all pairs or of none, got none; ignore "
+    def _confidence(self, where: str, raw: FileMatches) -> Num[np.ndarray, " matches"] | None:
+        """Confidences of the file; all pairs or none must have them."""
+        if not self._use_confidences or not len(raw.first):
+            return None
+        self._first.setdefault(raw.confidence is not None, where)
+        if len(self._first) == 2:
+            raise InputError(f"{self._first[False]}: expected confidences of all pairs or of none, got none; ignore "
                              "them with confidences=False")  # fmt: skip
-        if raw.confidence is None:
-            return np.ones(number, np.float32)
-        values = as_float32(f"{where}: confidences", raw.confidence, "fiu")
-        if values.shape != (number,) or values.min() < -_ROUNDING or values.max() > 1 + _ROUNDING:
-            got = f"{list(values.shape)}" if values.shape != (number,) else f"{values.min():g} to {values.max():g}"
-            raise InputError(f"{where}: expected {number} confidences from 0 to 1, got {got}; ignore them with "
-                             "confidences=False")  # fmt: skip
-        return np.clip(values, 0, 1)
+        return raw.confidence
 
     def _size(self, side: int, row: int, stored: Size | None) -> Size:
         """Size of the image that points are in; an InputError if nobody knows it."""
@@ -247,7 +216,10 @@ def _open(path: Path, queries: Images, database: Images, verified: bool) -> Pair
 
 def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str | None], list[str | None]]:
     """Names in the file of the images of each side."""
-    names = tuple(_names_of_side(reader, images) for images in sides)
+    names = tuple(
+        match_paths(reader.path, [*map(reader.written, side.names)], [*map(reader.written, side.paths)], reader.images)
+        for side in sides
+    )
     both = {*filter(None, names[0])} & {*filter(None, names[1])}
     is_shared = both and not reader.sided and [*sides[0].paths] != [*sides[1].paths]
     for name in sorted(both) if is_shared else ():
@@ -259,16 +231,6 @@ def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str |
                              "prefixes of both folders, with which the file has them")  # fmt: skip
     for side, each in zip(("queries", "database images"), names, strict=True):
         if not any(each):
-            raise InputError(f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, such "
-                             f"as {shorten(reader.images[0])}; give the prefix of their folder")  # fmt: skip
+            raise InputError(f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, "
+                             f"such as {shorten(reader.images[0])}; give the prefix of their folder")  # fmt: skip
     return names[0], names[1]
-
-
-def _names_of_side(reader: PairReader, images: Images) -> list[str | None]:
-    """Names in the file by full paths, or if no image has such a name, by names."""
-    for names in (images.paths, images.names):
-        if names:
-            matched = match_names(reader.path, [*map(reader.written, names)], reader.images)
-            if any(matched):
-                return matched
-    return [None] * len(images.names)

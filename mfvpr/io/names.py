@@ -48,6 +48,15 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     return matched
 
 
+def match_paths(path: Path, names: Sequence[str], paths: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
+    """Find images by their full `paths` `[M]`, or if no image has such a name, or () was given, as `match_names`."""
+    foreign = list(foreign)
+    for kind in filter(None, (paths, names)):
+        if any(matched := match_names(path, kind, foreign)):
+            return matched
+    return [None] * len(names)
+
+
 def require_different(path: Path, names: Sequence[str]) -> None:
     """Raise an InputError if two images have the same name, or the same name as text in a file."""
     if twice := [name for name, count in Counter(map(printable, names)).items() if count > 1]:

@@ -31,6 +31,7 @@ from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
+from mfvpr.matching.host import PairSource
 from mfvpr.reranking.confidence import Confidence
 from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
@@ -292,6 +293,10 @@ def _extractor(system: System) -> Extractor:
     if len(extractor.scales) != 1:
         raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
                          f"got {len(extractor.scales)}")  # fmt: skip
+    if isinstance(matcher := system.pipeline.matcher, PairSource):
+        raise InputError(
+            f"{type(matcher).__name__}: a map compiles its matcher; expected a matcher that JAX can compile"
+        )
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.cohort is not None or system.correlated or system.sequences:

@@ -1,5 +1,6 @@
 __all__ = [
     "CrossCheck",
+    "HostMatcher",
     "LightGlueMatcher",
     "MatchSet",
     "Matcher",
@@ -13,6 +14,7 @@ __all__ = [
     "soft_match",
 ]
 
+from .host import HostMatcher
 from .lightglue import LightGlueMatcher
 from .match_set import MatchSet, Scales
 from .matcher import Matcher, NearestNeighborMatcher, match_pairs

@@ -113,7 +113,7 @@ def match_queries(
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
-                matches, counts = _join_candidates(of_query, no_matches, counts0[query].astype(np.int32), keypoints)
+                matches, counts = join_candidates(of_query, no_matches, counts0[query].astype(np.int32), keypoints)
                 yield query, QueryMatches(matches, counts, indices[query], scores[query])
 
 
@@ -143,8 +143,8 @@ def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tu
     return zip(map(tuple, places), map(Pair, split_pairs(real), real.image_size0, real.image_size1), strict=True)
 
 
-def _join_candidates(
-    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"]
+def join_candidates(
+    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"] | None
 ) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
     """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]

@@ -2,6 +2,7 @@ __all__ = [
     "DescriptorFiles",
     "ExactSearch",
     "FeatureFiles",
+    "MatchFiles",
     "Retrieval",
     "RetrievalResult",
     "Retriever",
@@ -13,7 +14,7 @@ __all__ = [
 ]
 
 from .fitting import fit_to_database
-from .precomputed import DescriptorFiles, FeatureFiles, ShortlistFiles
+from .precomputed import DescriptorFiles, FeatureFiles, MatchFiles, ShortlistFiles
 from .retriever import Retrieval, RetrievalResult, Retriever
 from .search import ExactSearch, WhitenedSearch, retrieve
 from .ssm_voting import SsmVoting

@@ -3,17 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar, Literal
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.images import Interpolation, read_size
 from mfvpr.features.extractor import Scale
 from mfvpr.io.checks import Lengths
 from mfvpr.io.descriptors import read_with_entries as read_descriptors
 from mfvpr.io.features import ImportedFeatures, open_features
+from mfvpr.io.matches import Images, ImportedMatches, open_matches
 from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
@@ -111,6 +113,51 @@ class ShortlistFiles:
         if sequence.excluded is not None:
             shortlist = replace(shortlist, mask=shortlist.mask & ~sequence.excluded.contains(shortlist.indices))
         return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
+
+
+@dataclass(frozen=True)
+class MatchFiles:
+    """Matches of another program in place of a matcher, see `mfvpr.io.open_matches`.
+
+        files = {data.queries.root: File("matches.h5")}
+        features = {folder.root: File("feats.h5") for folder in (data.queries, data.database)}
+        pipeline = mfvpr.Pipeline(extractor, retriever, MatchFiles(files, features=features))
+
+    The extractor of the pipeline serves the retrieval alone.
+
+    Attributes:
+        files: by the root of the folder of queries, with the prefix of the queries' names.
+        database_prefix: of the database images' names.
+        features: hloc's features, by the root of the folder of images.
+        image_size: (width, height) of the images that points are in, px, if the files do not tell.
+        verified, confidences: see `mfvpr.io.open_matches`.
+        lengths: of the features' descriptors, see `mfvpr.io.open_features`.
+    """
+
+    files: Mapping[Path, File]
+    database_prefix: str = ""
+    features: Mapping[Path, File] = field(default_factory=dict)
+    image_size: tuple[int, int] | None = None
+    verified: bool = False
+    confidences: bool = True
+    lengths: Lengths = "unit"
+    inputs: ClassVar[Literal["images"]] = "images"
+
+    def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
+        """See `mfvpr.matching.host.PairSource`."""
+        file = _file_of(self.files, queries)
+        sides = self._images(queries, file.prefix), self._images(database, self.database_prefix)
+        options = {"verified": self.verified, "confidences": self.confidences, "image_size": self.image_size}
+        return open_matches(file.path, *sides, **options)
+
+    def _images(self, folder: ImageFolder, prefix: str) -> Images:
+        """Names, sizes and features of a folder's images; full paths identify them if there is no prefix."""
+        paths = () if prefix else [path.absolute().as_posix() for path in folder.paths]
+        names, features = [prefix + name for name in folder.names], None
+        if self.features:
+            file = _file_of(self.features, folder)
+            features = open_features(file.path, names, paths=paths, image_size=self.image_size, lengths=self.lengths)
+        return Images(names, paths, lambda row: read_size(folder.paths[row], orient=folder.orient), features)
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:

@@ -14,7 +14,15 @@ from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.reranking.results import COHORT
-from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, Retriever, ShortlistFiles, WhitenedSearch
+from mfvpr.retrieval import (
+    DescriptorFiles,
+    FeatureFiles,
+    MatchFiles,
+    Retrieval,
+    Retriever,
+    ShortlistFiles,
+    WhitenedSearch,
+)
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
 from mfvpr.scoring import SCORERS, Scorer
@@ -101,14 +109,28 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
 
 
-def matcher(settings: Mapping[str, Any]) -> Matcher:
-    """The matcher of an image pair."""
+def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | MatchFiles:
+    """The matcher of an image pair, or the match files of another program."""
     name, options = settings["name"], _without(settings, "name")
+    if name == "import":
+        return _match_files(options, data)
     weights = options.pop("weights", None)
     if name == "neighbors":
         return NearestNeighborMatcher(**_require_fields(options, NearestNeighborMatcher, "matching=neighbors"))
     options = _require_fields(options, LightGlueMatcher, "matching=lightglue")
     return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
+
+
+def _match_files(settings: Mapping[str, Any], data: Dataset | None) -> MatchFiles:
+    files = {"database": None, "queries": settings["matches"], **settings}
+    features = {"database": settings["features"], "queries": settings["query_features"] or settings["features"]}
+    return MatchFiles(
+        _files("matching", files, data),
+        settings["database_prefix"],
+        {} if features["queries"] is None else _files("matching", {**settings, **features}, data),
+        None if settings["image_size"] is None else tuple(settings["image_size"]),
+        **{name: settings[name] for name in ("verified", "confidences", "lengths")},
+    )
 
 
 def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dict[Path, File]:
@@ -139,7 +161,7 @@ def pipeline(settings: Mapping[str, Any], data: Dataset | None) -> Pipeline:
     retrieval = retriever(settings["retrieval"], local, data)
     size = settings["features"]["image_size"]
     pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
-    return Pipeline(local, retrieval, matcher(settings["matching"]), settings["candidates"], pixels)
+    return Pipeline(local, retrieval, matcher(settings["matching"], data), settings["candidates"], pixels)
 
 
 def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:

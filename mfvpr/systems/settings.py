@@ -100,10 +100,10 @@ RULES: dict[str, Rule] = {
     name: rule
     for names, rule in {
         # choices
-        "widen_index orient multiscale zero_row watch add .compiled": one_of(True, False),
+        "widen_index orient multiscale zero_row watch add verified confidences .compiled": one_of(True, False),
         "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
         "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
-        "matching.name": one_of("neighbors", "lightglue"),
+        "matching.name": one_of("neighbors", "lightglue", "import"),
         "cluster.name": one_of("local", "slurm", "address"),
         "ground_truth": one_of(None, "order", "index", "utm", "label", "none"),  # None: an error, see build.dataset
         "lengths": one_of("unit", "normalize", "keep"),
@@ -124,8 +124,9 @@ RULES: dict[str, Rule] = {
         "inputs": one_of("relative", "absolute"),
         # paths and text
         "root cache database .map": _PATH,
-        "queries .images": or_list(_PATH),
+        "queries matching.matches .images": or_list(_PATH),
         "index_file database_labels query_labels .cache out checkpoints .confidence .data .root": either(_PATH, None),
+        "matching.features query_features": either(_PATH, None),
         "dataset.name": pattern(r"[\w-][\w.-]*", "letters, digits, - and _"),
         "weights": _TEXT,
         "database_prefix query_prefix": either(_TEXT, ""),
@@ -144,6 +145,7 @@ RULES: dict[str, Rule] = {
         "candidates devices": either(_COUNT, "all"),
         "ks": list_of(_COUNT),
         "image_size": list_of(_SIDE, 2),
+        "matching.image_size": either(list_of(_SIDE, 2), None),
         "features.image_size": any_of(
             "[width, height], each a whole number from 16 to 4096, or auto, a number of pixels from 10000, or null",
             list_of(_SIDE, 2),
@@ -242,7 +244,7 @@ def _check_values(settings: Mapping[str, Any], methods: Mapping[str, str]) -> No
 
 
 def _check_report(settings: Mapping[str, Any]) -> None:
-    for group in ("features", "retrieval"):
+    for group in ("features", "retrieval", "matching"):
         if (name := settings[group]["name"]) in ("import", "pairs"):
             raise SettingsError(f"{group}={name}: expected none with report=, since the files are of one data set")
     if settings["split"] != "both":

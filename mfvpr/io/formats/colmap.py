@@ -30,7 +30,9 @@ class ColmapPairs(PairReader):
             rows = database.execute("SELECT image_id, name, camera_id FROM images").fetchall()
             cameras = {row[0]: row[1:] for row in database.execute("SELECT camera_id, width, height FROM cameras")}
             self._pairs = {row[0] for row in database.execute(f"SELECT pair_id FROM {self._table}")}
-        if not all(type(number) is int and isinstance(name, str) and camera in cameras for number, name, camera in rows):
+        if not all(
+            type(number) is int and isinstance(name, str) and camera in cameras for number, name, camera in rows
+        ):
             raise InputError(f"{path}: expected images with a name and a camera of the table cameras; make it again")
         self._numbers = {name: number for number, name, _ in rows}
         self._sizes: dict[str, Size] = {name: cameras[camera] for _, name, camera in rows}
@@ -67,17 +69,21 @@ class ColmapPairs(PairReader):
         """The database, opened read-only; raise an InputError for changes beside it, and for SQLite's errors."""
         for journal in (Path(f"{self.path}{suffix}") for suffix in _JOURNALS):
             if journal.is_file() and journal.stat().st_size:
-                raise InputError(f"{self.path}: expected a closed database, got changes in {journal.name}; close COLMAP")
+                raise InputError(
+                    f"{self.path}: expected a closed database, got changes in {journal.name}; close COLMAP"
+                )
         address = f"file:{quote(str(self.path.absolute()))}?mode=ro&immutable=1"  # writes no file beside it either
-        with reading(self.path, "a COLMAP database", "is it whole, and COLMAP's?"):
-            with closing(sqlite3.connect(address, uri=True)) as database:
-                database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
-                database.execute("PRAGMA trusted_schema = OFF")
-                kinds = dict(database.execute("SELECT name, type FROM sqlite_master"))
-                for table in ("images", "cameras", "keypoints", self._table):
-                    if kinds.get(table) != "table":
-                        raise InputError(f"expected COLMAP's table {table}, got none")
-                yield database
+        with (
+            reading(self.path, "a COLMAP database", "is it whole, and COLMAP's?"),
+            closing(sqlite3.connect(address, uri=True)) as database,
+        ):
+            database.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+            database.execute("PRAGMA trusted_schema = OFF")
+            kinds = dict(database.execute("SELECT name, type FROM sqlite_master"))
+            for table in ("images", "cameras", "keypoints", self._table):
+                if kinds.get(table) != "table":
+                    raise InputError(f"expected COLMAP's table {table}, got none")
+            yield database
 
 
 def _matrix(
@@ -88,9 +94,9 @@ def _matrix(
     content = b"" if data is None else data
     if not (
         isinstance(rows, int) and isinstance(cols, int) and isinstance(content, bytes) and rows >= 0
-        and (cols == columns if columns else cols >= 2 or not rows) and len(content) == rows * cols * dtype.itemsize
+        and (not rows or (cols == columns if columns else cols >= 2)) and len(content) == rows * cols * dtype.itemsize
     ):  # fmt: skip
         size = len(content) if isinstance(content, bytes) else type(data).__name__
-        raise InputError(f"{where}: expected {columns or '2 or more'} columns of {dtype.name}, got {rows} rows of {cols} "
-                         f"in {size} bytes; make it again")  # fmt: skip
+        raise InputError(f"{where}: expected {columns or '2 or more'} columns of {dtype.name}, got {rows} rows of "
+                         f"{cols} in {size} bytes; make it again")  # fmt: skip
     return np.frombuffer(content, dtype).reshape(rows, columns or max(cols, 2))

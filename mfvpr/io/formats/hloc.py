@@ -41,7 +41,7 @@ class HlocPairs(PairReader):
                 raise InputError(f"{self.path}: {shorten(group)}: expected {' and '.join(required)}, got no "
                                  f"{missing[0]}; match again")  # fmt: skip
             if not self.by_number:
-                yield FileMatches(*(arrays.get(name) for name in _POINTS))
+                yield FileMatches(arrays["keypoints0"], arrays["keypoints1"], arrays.get("scores"))
                 continue
             numbers, scores = arrays["matches0"], arrays.get("matching_scores0")
             yield _numbered(f"{self.path}: {shorten(group)}", numbers, scores)
@@ -56,7 +56,7 @@ def _numbered(where: str, numbers: np.ndarray, scores: np.ndarray | None) -> Fil
         got = f"{numbers.dtype}{list(numbers.shape)} and {'none' if scores is None else list(scores.shape)}"
         raise InputError(f"{where}: expected matches0 [N] of integers and matching_scores0 [N], got {got}")
     if (numbers < -1).any():
-        raise InputError(f"{where}: expected numbers of keypoints from 0, or -1, got {numbers.min()}; hloc writes int16, "
-                         "so match at most 32768 keypoints")  # fmt: skip
+        raise InputError(f"{where}: expected numbers of keypoints from 0, or -1, got {numbers.min()}; hloc writes "
+                         "int16, so match at most 32768 keypoints")  # fmt: skip
     first = np.flatnonzero(numbers >= 0)
     return FileMatches(first, numbers[first], None if scores is None else scores[first])

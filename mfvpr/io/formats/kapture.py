@@ -76,7 +76,9 @@ def _keypoint_layout(path: Path) -> tuple[str, int]:
         lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
     lines = [[word.strip() for word in line.split(",")] for line in lines if line and not line.startswith("#")]
     match lines:
-        case [[_, kind, columns]] if kind.removeprefix("numpy.") in _NUMBERS and columns.isdecimal() and int(columns) > 1:
+        case [[_, kind, columns]] if (
+            kind.removeprefix("numpy.") in _NUMBERS and columns.isdecimal() and int(columns) > 1
+        ):
             return _NUMBERS[kind.removeprefix("numpy.")], int(columns)
     got = shorten("; ".join(", ".join(line) for line in lines))
     raise InputError(f"{path}: expected a line name, dtype, dsize with float32 or float64 and at least 2, got {got!r}")
@@ -86,5 +88,7 @@ def _read_matrix(path: Path, kind: str, columns: int) -> Float[np.ndarray, "rows
     with reading(path, "a file of kapture"):
         content = path.read_bytes()
     if len(content) % (columns * np.dtype(kind).itemsize):
-        raise InputError(f"{path}: expected rows of {columns} numbers of {np.dtype(kind).name}, got {len(content)} bytes")
+        raise InputError(
+            f"{path}: expected rows of {columns} numbers of {np.dtype(kind).name}, got {len(content)} bytes"
+        )
     return np.frombuffer(content, kind).reshape(-1, columns)

@@ -48,8 +48,8 @@ class ResultFiles(PairReader):
             if pair is not None and self._files.setdefault(pair, file) != file:
                 raise InputError(f"{file}: expected another pair than in {self._files[pair].name}; remove either")
         if not self._files:
-            raise InputError(f"{path}: expected a file .npz or .torch for each pair of images, got {len(files)} files of "
-                             "other images; see mfvpr/io/README.md")  # fmt: skip
+            raise InputError(f"{path}: expected a file .npz or .torch for each pair of images, got {len(files)} files "
+                             "of other images; see mfvpr/io/README.md")  # fmt: skip
         self.images = tuple(dict.fromkeys(chain(*self._files)))
 
     def __contains__(self, pair: Pair) -> bool:
@@ -122,7 +122,9 @@ def _matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
     real = numbers >= 0
     if (numbers < -1).any() or (numbers >= len(keypoints1)).any():
         raise InputError(f"{file}: expected matches from -1 to {len(keypoints1) - 1}, got others")
-    return FileMatches(keypoints0[real], keypoints1[numbers[real]], None if confidence is None else confidence[real], sizes)
+    return FileMatches(
+        keypoints0[real], keypoints1[numbers[real]], None if confidence is None else confidence[real], sizes
+    )
 
 
 def _sizes(file: Path, parts: Parts) -> tuple[Size, Size] | None:
