@@ -171,7 +171,7 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     extractor = assembly.extractor(settings["features"], None)
     retriever, matcher = (
         assembly.retriever(settings["retrieval"], extractor, None),
-        assembly.matcher(settings["matching"]),
+        assembly.matcher(settings["matching"], None),
     )
     scorers, seconds = assembly.scorers(settings["scorer"]), dict[str, float]()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))

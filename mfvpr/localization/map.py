@@ -248,7 +248,7 @@ class Map(MapImages):
         if not len(rows):
             return None
         arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
-        matcher = self.system.pipeline.matcher
+        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
         return rows, similarities, *match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
 
     def _noise_score(self, described: DescribedMap, end: int) -> float:
@@ -294,9 +294,7 @@ def _extractor(system: System) -> Extractor:
         raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
                          f"got {len(extractor.scales)}")  # fmt: skip
     if isinstance(matcher := system.pipeline.matcher, PairSource):
-        raise InputError(
-            f"{type(matcher).__name__}: a map compiles its matcher; expected a matcher that JAX can compile"
-        )
+        raise InputError(f"{type(matcher).__name__}: a map compiles its matcher; expected one that JAX can compile")
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.cohort is not None or system.correlated or system.sequences:

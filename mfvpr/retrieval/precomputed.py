@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -141,7 +141,11 @@ class MatchFiles:
     verified: bool = False
     confidences: bool = True
     lengths: Lengths = "unit"
-    inputs: ClassVar[Literal["images"]] = "images"
+
+    @property
+    def inputs(self) -> Literal["images"]:
+        """See `mfvpr.matching.host.PairSource`."""
+        return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
         """See `mfvpr.matching.host.PairSource`."""
