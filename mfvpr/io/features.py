@@ -8,7 +8,8 @@ Parts of an image in a file:
 
 - `keypoints` `[N, 2]` (x, y), px; up to two more columns (scale, angle) are ignored;
 - `descriptors` `[D, N]` (hloc) or `[N, D]`;
-- `scores` or `keypoint_scores` `[N]`, larger = better; without them, every keypoint has the score 1;
+- `scores` or `keypoint_scores` `[N]`, larger = better; without them, or if all are 0 (hloc's SIFT), every keypoint has
+  the score 1;
 - `image_size` `[2]` (width, height), px, of the image that the keypoints are in.
 
 Pixel centers are at whole numbers, as in hloc and OpenCV. hloc gives keypoints in the original image, even if it
@@ -95,6 +96,7 @@ class ImportedFeatures:
             got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
             raise InputError(f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} "
                              f"numbers, got {got}; has the file changed since it was opened?")  # fmt: skip
+        scores = scores if scores.any() else np.ones(count, np.float32)
         size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
         require_inside(where, keypoints, size)
         descriptors = with_length(f"{where}: descriptors", descriptors.reshape(shape), self._lengths)

@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from mfvpr.io.containers import reading, shorten
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
@@ -88,7 +88,7 @@ class ColmapPairs(PairReader):
 
 def _matrix(
     where: str, row: tuple[object, object, object], dtype: np.dtype, columns: int | None = None
-) -> Float[np.ndarray, "rows columns"]:
+) -> Num[np.ndarray, "rows columns"]:
     """The matrix of a row `(rows, cols, data)` of a table."""
     rows, cols, data = row
     content = b"" if data is None else data

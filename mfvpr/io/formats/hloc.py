@@ -19,15 +19,15 @@ class HlocPairs(PairReader):
 
     def __init__(self, path: Path) -> None:
         self.path, self._file = path, H5File(path)
+        [arrays] = self._file.shapes([self._file.images[0]], ())
         for group in self._file.images:
-            if group.count("/") != 1:
+            if group.count("/") != 1 or not {"matches0", "keypoints0"} & {*arrays}:
                 raise InputError(f"{path}: {shorten(group)}: expected groups IMAGE/IMAGE of matches, as hloc writes "
                                  "them since 2021; give matches*.h5, not feats*.h5, or match again")  # fmt: skip
         self._groups = {tuple(map(self.written, group.split("/"))): group for group in self._file.images}
         if len(self._groups) < len(self._file.images):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
         self.images = tuple(dict.fromkeys(name for pair in self._groups for name in pair))
-        [arrays] = self._file.shapes([self._file.images[0]], ())
         self.by_number = "keypoints0" not in arrays
 
     def __contains__(self, pair: Pair) -> bool:
