@@ -12,6 +12,7 @@ from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
 from mfvpr.matching import Scales
 from mfvpr.report import comparisons, runs
+from mfvpr.report.run_files import matched_content
 from mfvpr.scoring import Scorer
 from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.systems.settings import SettingsError
@@ -150,7 +151,7 @@ def _checkpoints(settings: dict[str, Any], scorer: Scorer, data: Part, sets: lis
 
 
 def _heading(settings: dict[str, Any], data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
-    system = f"{settings['scorer']['method']} score, {settings['features']['name']} features"
+    system = f"{settings['scorer']['method']} score, {matched_content(settings)}"
     ground_truth = truth.in_words(*(data_set.about["ground_truth"] for data_set in report or teach))
     if report:
         teach_names, report_names = (", ".join(data_set.part.name for data_set in sets) for sets in (teach, report))

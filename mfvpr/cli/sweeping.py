@@ -9,6 +9,7 @@ from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.report import sweeps
+from mfvpr.report.run_files import matched_content
 from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
@@ -63,13 +64,14 @@ def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:
 
 
 def _heading(settings: dict[str, Any], inputs: Inputs, outcome: Outcome) -> str:
-    dataset, features, ground_truth = inputs.dataset, settings["features"], truth.in_words(inputs.ground_truth)
-    size = " at {} x {} px".format(*features["image_size"]) if features["image_size"] else ""
+    dataset, ground_truth = inputs.dataset, truth.in_words(inputs.ground_truth)
+    content, size = matched_content(settings), settings["features"]["image_size"]
+    content += " at {} x {} px".format(*size) if size and content.endswith("features") else ""
     sequence = f" + {settings['sequence']} sequence" if settings["sequence"] else ""
     return (
         f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
         f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
-        f"{settings['scorer']['method']} score{sequence}, {features['name']} features{size}; {ground_truth}"
+        f"{settings['scorer']['method']} score{sequence}, {content}; {ground_truth}"
     )
 
 

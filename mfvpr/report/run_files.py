@@ -73,15 +73,24 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     bad_database = len({row for sequence in matched for row in sequence.bad_database})
     matching = stages["matching"]
     check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
-    check = "" if check == "cross_check=mutual" else f", {check}"
+    check = "" if check in ("cross_check=mutual", "import", "MatchFiles") else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
         f"{dataset.name}{incomplete}: {report.num_queries} queries{several}{_skip_note(bad_queries)}, "
         f"{len(dataset.database)} database images{_skip_note(bad_database)}, "
         f"{_num_candidates(report)} candidates ({stages['retrieval']['name']}), "
-        f"{stages['features']['name']} features{check}; {description.truth_words}"
+        f"{matched_content(stages)}{check}; {description.truth_words}"
     )
+
+
+def matched_content(stages: Mapping[str, Mapping[str, Any]]) -> str:
+    """Words for the content that the matches come from: features, images, or files."""
+    matching = stages["matching"]
+    if matching["name"] in ("import", "MatchFiles"):
+        return "imported matches"
+    is_of_images = matching.get("inputs") == "images"
+    return f"matches of {matching['name']}" if is_of_images else f"{stages['features']['name']} features"
 
 
 def _skip_note(number: int) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import numpy as np
@@ -45,6 +45,8 @@ class File:
 @dataclass(frozen=True)
 class FeatureFiles:
     """Local features of another program, see `mfvpr.io.open_features`."""
+
+    recipe_name: ClassVar[str] = "FeatureFiles, without scores of 0"  # in stored recipes
 
     files: Mapping[Path, File]  # by the root of the folder of images
     lengths: Lengths = "unit"  # of descriptors

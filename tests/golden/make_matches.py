@@ -1,6 +1,6 @@
 """Makes matches.npz: files of matches by hloc, kapture, COLMAP and vismatch, and the matches that their readers give.
 
-`python -m tests.golden matches HLOC IMAGES`; IMAGES is drawn with `draw_streets(IMAGES, seed=3, num_frames=2)`.
+`python -m tests.golden matches HLOC street`, beside the images of `draw_streets("street", seed=3, num_frames=2)`.
 """
 
 import os

@@ -14,6 +14,7 @@ from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Gains, Run, errors_as_input_errors, read_results, read_run, read_table
 from mfvpr.report.pages.rendering import PAGE, Gallery, Section, pictures, values_table, write_page
+from mfvpr.report.run_files import matched_content
 from mfvpr.report.tables import Table
 from mfvpr.reranking.results import RETRIEVAL
 
@@ -89,7 +90,7 @@ def description(run: Run) -> str:
     lacks = f"; incomplete: {', '.join(common['incomplete'])}" if common.get("incomplete") else ""
     return (
         f"{common['queries']} queries{several}, {common['database']} database images, {common['candidates']} candidates"
-        f" ({common['retrieval']['name']}), {common['features']['name']} features; {correct}{lacks}"
+        f" ({common['retrieval']['name']}), {matched_content(common)}; {correct}{lacks}"
     )
 
 

@@ -1,0 +1,81 @@
+"""matching=import in the programs, with files that hloc, COLMAP and vismatch wrote."""
+
+import json
+
+import pytest
+
+from mfvpr.datasets.streets import draw_streets
+from tests.io.test_matches import tools  # noqa: F401
+from tests.programs import typed
+
+PAIRS = "queries/0000.png database/0000.png\nqueries/0000.png database/0001.png\n" \
+        "queries/0001.png database/0000.png\nqueries/0001.png database/0001.png\n"  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """The images that the tools matched."""
+    root = tmp_path_factory.mktemp("images") / "street"
+    draw_streets(root, seed=3, num_frames=2)
+    (root / "pairs.txt").write_text(PAIRS)
+    return root
+
+
+def settings(street, *more):
+    return ("dataset=folder", f"dataset.database={street}/database", f"dataset.queries={street}/queries",
+            "dataset.ground_truth=order", "retrieval=pairs", f"retrieval.queries={street}/pairs.txt",
+            "candidates=2", "recall.tolerances=[0]", "recall.ks=[1]", "matching=import", *more)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tool", "more"),
+    [
+        ("hloc/matches.h5", ["matching.features={tools}/hloc/feats.h5"]),
+        ("colmap.db", ["matching.verified=true"]),
+        ("kapture", []),
+        ("vismatch", ["matching.confidences=false"]),
+    ],
+)
+def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_path, monkeypatch, capsys):  # noqa: F811
+    """Names need no prefixes where folders have the names that the tool knew."""
+    more = [setting.format(tools=tools) for setting in more]
+    typed_here = settings(street, f"matching.matches={tools}/{tool}", *more, "scorer=count", "figures=1",
+                          "cache=null", f"out={tmp_path}/out")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
+    assert code == 0, stderr
+    assert "2 candidates (pairs), imported matches;" in stdout
+    if tool != "colmap.db":
+        assert "no matches of 1 of 4 pairs of the shortlist" in stderr
+    counts = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert counts
+    assert "imported matches" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+    typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=histogram", "grid.sigma=[10,20]",
+                          f"cache={tmp_path}/cache", f"out={tmp_path}/out")  # fmt: skip
+    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *typed_here)
+    assert code == 0, stderr
+    assert "score, imported matches; recall in %" in stdout
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["matching.matches=missing.h5"], "missing.h5: "),
+        ([], "matching.matches"),
+        (["matching.matches={tools}/hloc/matches.h5"], "give hloc's feats"),
+        (["matching.matches={tools}/hloc/matches.h5", "matching.features={tools}/colmap.db"], "colmap.db: expected"),
+        (["matching.matches={tools}/kapture", "matching.verified=true"], "verified"),
+        (["matching.matches={tools}/kapture", "matching.image_size=[64,64]"], "image of 64"),
+        (["matching.matches={tools}/kapture", "matching.query_prefix=other/"], "of their names"),
+        (["matching.matches={tools}/kapture", "matching.max_distance=1"], "max_distance"),
+    ],
+)
+def test_wrong_settings_are_one_line(street, tools, more, words, tmp_path, monkeypatch, capsys):  # noqa: F811
+    more = [setting.format(tools=tools) for setting in more]
+    typed_here = settings(street, *more, "cache=null", f"out={tmp_path}/out")
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
+    assert code == 2
+    assert words in stderr.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
