@@ -128,7 +128,7 @@ def _match(
 
 
 def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Side, Side]], dict[str, Any]]:
-    """What is matched of queries and candidates by scale, and remarks on bad images of both sides."""
+    """Features of the queries and of all candidates by scale, or their images, and remarks on bad images."""
     dataset, sequence, extractor = work.dataset, work.sequence, work.pipeline.extractor
     if (source := image_source(work.pipeline)) is not None:
         sides = sequence.images, dataset.database

@@ -79,6 +79,10 @@ class HostMatcher:
         interpolation: of the resizing.
         batch_size: None = the function takes one pair. A number = it takes two lists of up to that many, query and
             candidates, and returns a list of the matches of each pair.
+
+    Raises:
+        InputError: wrong settings; or, when pairs are matched, a result of another form, points outside the images, or
+            confidences beyond 0 to 1.
     """
 
     function: Callable[[Any, Any], Any] = field(metadata={"recipe": False})
@@ -104,7 +108,7 @@ class HostMatcher:
         return _CalledPairs(self, queries, database)
 
     def call(self, first: Any, seconds: list[Any]) -> list[Any]:
-        """Results of the function for a query with candidates."""
+        """Results of the function for a query with candidates; an `InputError` if a batch gives another number."""
         if self.batch_size is None:
             return [self.function(first, second) for second in seconds]
         results = []
