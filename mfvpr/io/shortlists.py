@@ -1,7 +1,7 @@
 """Read and write shortlists and rankings of other programs.
 
 Lists of image pairs are hloc's `query database` and kapture's `query, reference, score`. VPR-methods-evaluation writes
-a folder of predictions, a text file for each query.
+a folder of predictions, a text file for each query. To-Match adds the results of an image matcher.
 """
 
 import re
@@ -14,6 +14,7 @@ import numpy as np
 
 from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import FileEntry, reading, shorten
+from mfvpr.io.formats.match_results import read_num_inliers
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.types import Ranking, Shortlist
@@ -26,6 +27,7 @@ Scored = tuple[int, int, float | None]  # rows of a query and a database image, 
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
 _SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
 _QUERY, _PREDICTIONS, _POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
+_HEADINGS = _PREDICTIONS, _POSITIVES
 
 
 class Pair(NamedTuple):
@@ -45,7 +47,8 @@ def read_shortlist(
         path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and optional `scores` `[Q, K]`, in the
             order of `query_names` and `database_names`. Other suffixes: lines of text, `query database` as hloc, or
             `query, reference[, score]` as kapture and Patch-NetVLAD's predictions; # begins a comment. A folder:
-            `preds` of VPR-methods-evaluation. A query's best candidate comes first.
+            `preds` of VPR-methods-evaluation; with To-Match's `.torch` files beside its text files, candidates are
+            re-ranked by the number of inliers. A query's best candidate comes first.
         query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
         database_names: `[N]` likewise.
         num_candidates: C; None = the largest number of a query's candidates.
@@ -97,6 +100,7 @@ def write_shortlist(
     database_names: Sequence[str],
     *,
     layout: PairLayout = "hloc",
+    positives: Sequence[Sequence[int]] | None = None,
 ) -> None:
     """Write a shortlist as `read_shortlist` reads it, atomically.
 
@@ -106,7 +110,9 @@ def write_shortlist(
         query_names: `[Q]`.
         database_names: `[N]`.
         layout: of text. `hloc`: no scores; `kapture`: scores with all digits of float32; `preds`: a new folder `path`
-            of VPR-methods-evaluation's predictions, without scores and positives.
+            of VPR-methods-evaluation's predictions, without scores. Other programs read the images there, if the
+            names are full paths.
+        positives: `[Q]` database rows of the correct images of each query, for `preds`; None = not listed.
 
     Raises:
         InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
@@ -131,9 +137,10 @@ def write_shortlist(
             if name != name.strip() or "\n" in name or "\r" in name:
                 raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
     if layout == "preds":
-        predictions = [[database_names[int(row)] for row in rows[real]]
-                       for rows, real in zip(indices, mask, strict=True)]  # fmt: skip
-        _write_predictions(path, predictions, query_names)
+        listed = [row[real].tolist() for row, real in zip(indices, mask, strict=True)]
+        lists = [listed] if positives is None else [listed, positives]
+        _write_predictions(path, query_names, [[[database_names[row] for row in rows] for rows in each]
+                                               for each in lists])  # fmt: skip
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
@@ -213,20 +220,40 @@ def _read_predictions(folder: Path) -> list[Pair]:
         if (other := files.setdefault(query, path)) != path:
             raise InputError(f"{path}: expected another query than in {other.name}, got {shorten(query)} again; "
                              "remove the files of older runs")  # fmt: skip
-        pairs += [Pair(query, database) for database in parts[_PREDICTIONS]]
+        results = path.with_suffix(".torch")
+        if results.exists():
+            pairs += _by_inliers(query, parts[_PREDICTIONS], results)
+        else:
+            pairs += [Pair(query, database) for database in parts[_PREDICTIONS]]
     if not files:
-        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
+        mend = "; copy the .torch files beside those of preds" if any(folder.glob("*.torch")) else ""
+        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none{mend}")
     return pairs
 
 
-def _write_predictions(folder: Path, predictions: Sequence[Sequence[str]], query_names: Sequence[str]) -> None:
-    """Write a file for each query that has predictions; its number is the query's row."""
+def _by_inliers(query: str, predictions: Sequence[str], results: Path) -> list[Pair]:
+    """Pairs of the predictions that were matched, most inliers first; equal numbers keep their order."""
+    counts = read_num_inliers(results)
+    if not 0 < len(counts) <= len(predictions):
+        raise InputError(f"{results}: expected results of at most {len(predictions)} predictions, as in the text file, "
+                         f"got {len(counts)}; match the predictions of this run")  # fmt: skip
+    order = sorted(range(len(counts)), key=lambda position: -counts[position])
+    return [Pair(query, predictions[position], counts[position]) for position in order]
+
+
+def _write_predictions(folder: Path, query_names: Sequence[str], lists: Sequence[Sequence[Sequence[str]]]) -> None:
+    """Write a file for each query that has predictions; its number is the query's row.
+
+    `lists` are the names of the predictions of each query, and those of its positives if they are known.
+    """
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
     folder.mkdir(parents=True, exist_ok=True)
-    for row, (query, names) in enumerate(zip(query_names, predictions, strict=True)):
-        if names:
-            write_text(folder / f"{row:03d}.txt", "\n".join([_QUERY, query, "", _PREDICTIONS, *names]) + "\n")
+    for row, (query, *names) in enumerate(zip(query_names, *lists, strict=True)):
+        if names[0]:
+            parts = [(_QUERY, query), *((heading, *part) for heading, part in zip(_HEADINGS, names, strict=False))]
+            text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
+            write_text(folder / f"{row:03d}.txt", text)
 
 
 def _ends(name: str) -> tuple[str, str]:

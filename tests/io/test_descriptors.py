@@ -1,9 +1,14 @@
 """Global descriptors: rows in the data set's order, whatever the file's."""
 
+import glob
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mfvpr import InputError
+from mfvpr.datasets import image_folder
 from mfvpr.io import read_global_descriptors, write_global_descriptors
 from tests.builders import unit
 from tests.io.checks import one_line_error
@@ -25,6 +30,23 @@ def test_npy_is_in_sorted_order(tmp_path, descriptors):
     np.save(tmp_path / "g.npy", descriptors * 3)
     scaled = read_global_descriptors(tmp_path / "g.npy", NAMES, lengths="normalize")
     np.testing.assert_allclose(scaled, descriptors[[1, 2, 0]], atol=1e-6)
+
+
+def test_rows_of_vpr_methods_evaluation(tmp_path):
+    """Its rows are in the order of the sorted paths, with a folder given with or without a slash at its end."""
+    names = ["a/b.jpg", "a.b.jpg", "a b/1.jpg", "a-1/x.PNG", "B/2.jpeg", "b/10.jpg", "b/2.jpg", "é.jpg", "10.jpg"]
+    for name in names:
+        (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "set" / name).touch()
+    folder = image_folder(tmp_path / "set")
+    vectors = unit(np.random.default_rng(0).normal(size=(len(names), 8)))
+    for root in (str(folder.root), f"{folder.root}/"):
+        paths = [Path(path) for path in sorted(glob.glob(f"{root}/**/*", recursive=True)) if os.path.isfile(path)]
+        np.save(tmp_path / "database_descriptors.npy", vectors[[folder.paths.index(path) for path in paths]])
+        read = read_global_descriptors(tmp_path / "database_descriptors.npy", folder.names)
+        np.testing.assert_array_equal(read, vectors)
+    with one_line_error(r"expected descriptors \[8, D\] of the images, got \[9, 8\]"):
+        read_global_descriptors(tmp_path / "database_descriptors.npy", folder.names[1:])
 
 
 def test_npz_with_names(tmp_path, descriptors):

@@ -209,6 +209,20 @@ def test_hloc_reads_what_is_written(tmp_path):
     assert pairs == [("q/1.jpg", "d/2.jpg"), ("q/1.jpg", "d/1.jpg"), ("q/2.jpg", "d/1.jpg")]
 
 
+@pytest.mark.parametrize("positives", [None, [[2, 3], [], []]])
+def test_to_match_reads_what_is_written(tmp_path, positives):
+    """Its own reading: the query in line 2, predictions from line 5 to the next empty line, numbers as file names."""
+    shortlist = shortlist_of([[1, 0], [-1, -1], [2, -1]])
+    write_shortlist(tmp_path / "preds", shortlist, QUERIES, DATABASE, layout="preds", positives=positives)
+    texts = {int(path.stem): path.read_text().splitlines() for path in (tmp_path / "preds").glob("*.txt")}
+    predictions = {number: (lines[1], lines[4 : lines.index("", 4)]) for number, lines in texts.items()}
+    expected = {0: ("q/1.jpg", ["d/2.jpg", "d/1.jpg"]), 2: ("q/my query.jpg", ["d/my place.jpg"])}
+    assert predictions == expected
+    listed = [] if positives is None else ["Positives paths:", "d/my place.jpg", "d/x, y.jpg", ""]
+    assert texts[0][7:] == listed
+    assert texts[2][6:] == listed[::3]
+
+
 def test_a_ranking_is_written_as_a_shortlist(tmp_path):
     shortlist = shortlist_of([[3, 1, 0], [2, -1, -1]])
     ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))

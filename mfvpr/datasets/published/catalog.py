@@ -59,7 +59,7 @@ PUBLISHED = {
             ("nordland_3450",), ("summer", "winter"),
         ),
         Published(
-            "nordland_vprbench", "Nordland, VPR-Bench's: winter, every tenth frame of summer", frames.LAYOUT_VPRBENCH,
+            "nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", frames.LAYOUT_VPRBENCH,
             27_592, {"nordland_vprbench": 2760}, frames.nordland_vprbench,
             "https://github.com/MubarizZaffar/VPR-Bench", ("nordland_vprbench",),
         ),
