@@ -5,14 +5,20 @@ __all__ = [
     "open_features",
     "open_matches",
     "read_global_descriptors",
+    "read_poses",
     "read_shortlist",
+    "read_stamps",
     "reranked_shortlist",
+    "stamps_in_names",
     "write_features",
     "write_global_descriptors",
     "write_shortlist",
+    "write_trajectory",
 ]
 
 from .descriptors import read_global_descriptors, write_global_descriptors
 from .features import ImportedFeatures, open_features, write_features
 from .matches import Images, ImportedMatches, open_matches
 from .shortlists import read_shortlist, reranked_shortlist, write_shortlist
+from .stamps import read_stamps, stamps_in_names
+from .trajectories import read_poses, write_trajectory

@@ -137,10 +137,12 @@ def write_shortlist(
             if name != name.strip() or "\n" in name or "\r" in name:
                 raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
     if layout == "preds":
-        listed = [row[real].tolist() for row, real in zip(indices, mask, strict=True)]
-        lists = [listed] if positives is None else [listed, positives]
-        _write_predictions(path, query_names, [[[database_names[row] for row in rows] for rows in each]
-                                               for each in lists])  # fmt: skip
+        lists = [
+            [row[real] for row, real in zip(indices, mask, strict=True)],
+            *([] if positives is None else [positives]),
+        ]
+        names = [[[database_names[int(row)] for row in rows] for rows in each] for each in lists]
+        _write_predictions(path, query_names, names)
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
