@@ -35,11 +35,11 @@ PERMISSIONS = {
     },
     "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {
-        "datasets", "evaluation", "features", "localization", "reranking", "scoring", "storage", "tuning", "types",
-        "utils",
+        "datasets", "evaluation", "features", "io", "localization", "reranking", "scoring", "storage", "tuning",
+        "types", "utils",
     },
     "cli": {
-        "checkpoints", "datasets", "evaluation", "features", "localization", "matching", "report", "reranking",
+        "checkpoints", "datasets", "evaluation", "features", "io", "localization", "matching", "report", "reranking",
         "retrieval", "scoring", "storage", "systems", "tuning", "types", "utils",
     },
 }  # fmt: skip

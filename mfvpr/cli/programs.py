@@ -14,6 +14,7 @@ COMMANDS = {
     "localize": "localize images in a map",
     "weights": "list, download, add and verify weights of networks",
     "data": "list data sets, and check what a folder holds",
+    "export": "write predictions as files of other programs: candidates, trajectories, shifts with times",
     "report": "write the page of a run folder (evaluation, sweep, learning, multirun), or of evaluations compared",
 }
 _COMPARISON = "comparison.html"
@@ -107,12 +108,32 @@ def _add_report_arguments(parser: Parser) -> None:
     parser.set_defaults(run="mfvpr.cli.programs:write_page")
 
 
+def _add_export_arguments(parser: Parser) -> None:
+    layouts = ("preds", "hloc", "kapture", "tum", "kitti", "shifts")
+    about = {
+        "--poses": "for tum and kitti: poses of the database images in this layout, a line for each",
+        "--times": "for tum and shifts: times of the queries, a line for each; by default the names of their files",
+        "--database": "for tum and kitti of mfvpr localize: the folder of the map's images",
+    }
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="run folder of mfvpr evaluate, or file of the "
+                        "lines that mfvpr localize prints")  # fmt: skip
+    parser.add_argument("out", metavar="OUT", type=Path, help="a file; for preds, and for several query sequences, a "
+                        "new folder")  # fmt: skip
+    parser.add_argument("--layout", required=True, choices=layouts, help="candidates of an evaluation for "
+                        "VPR-methods-evaluation, hloc or kapture; trajectory of TUM or KITTI; table of shifts with "
+                        "ROS's times")  # fmt: skip
+    for name, text in about.items():
+        parser.add_argument(name, metavar="DIR" if name == "--database" else "FILE", type=Path, help=text)
+    parser.set_defaults(run="mfvpr.cli.exports:export")
+
+
 _ARGUMENTS = {  # of programs that have commands or arguments instead of settings
     "map": ("Localize images in a map with mfvpr localize. Settings of the first command: mfvpr map build --help.",
             _add_map_commands),
     "weights": ("Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the package; each "
                 "has its own license.", _add_weights_commands),
     "data": ("Nothing is downloaded: each data set has its place and its license.", _add_data_commands),
+    "export": ("Queries without a place are left out, except in the table of shifts.", _add_export_arguments),
     "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, sweep or learn, "
                "of a multirun (runs/multirun/TIME), or of several evaluations beside each other.",
                _add_report_arguments),

@@ -15,6 +15,7 @@ from mfvpr.datasets.datasets import Dataset
 from mfvpr.evaluation.evaluation import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
+from mfvpr.report.exports import CandidateLayout, write_candidates
 from mfvpr.report.runs import claim_run_folder, file_names, write_table
 from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache
@@ -172,6 +173,22 @@ class Result:
             if several and any(report.thresholds for _, report in reports):
                 write_table(root, self.table(thresholds, ks), f"recall in %, {self!r}")
         return folders
+
+    def write_predictions(self, path: Path | str, layout: CandidateLayout = "preds") -> None:
+        """Write the final ranking of `only`, as `mfvpr.io.write_shortlist`; of each of several sequences, `path/NAME`.
+
+        result.write_predictions("preds")  # a folder of VPR-methods-evaluation, with full paths and correct images
+        result.write_predictions("pairs.txt", layout="hloc")
+        """
+        report = EvaluationReport.of(self.only)
+        files = file_names([sequence.name for sequence in report.sequences])
+        for place, sequence in enumerate(report.sequences):
+            target = Path(path) / files[sequence.name] if len(files) > 1 else Path(path)
+            shortlist, database = (
+                report.ranked.systems[report.headline][place].shortlist,
+                report.ranked.dataset.database,
+            )
+            write_candidates(target, shortlist, sequence.images, database, layout, report.positives[place])
 
     def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""

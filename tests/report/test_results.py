@@ -62,6 +62,26 @@ def test_one_result_has_all_data_sets_and_systems(result, dataset, systems):
         result.only  # noqa: B018
 
 
+def test_predictions_are_written_with_full_paths_and_correct_images(result, dataset, systems, tmp_path):
+    alone = replace(result, parts={("one", "paper"): result.parts["one", "paper"]})
+    alone.write_predictions(tmp_path / "preds")
+    alone.write_predictions(tmp_path / "pairs.txt", layout="hloc")
+    rows = result.parts["one", "paper"].systems["histogram"][0].rows
+    queries, database = dataset.queries, dataset.database
+    lines = (tmp_path / "preds" / "004.txt").read_text().split("\n\n")
+    correct = dataset.truth.positives(2).of(4)
+    headings = ("Query path:", "Predictions paths:", "Positives paths:")
+    expected = [[str(queries.paths[4])], *([str(database.paths[row]) for row in part] for part in (rows[4], correct))]
+    assert lines == ["\n".join([heading, *part]) for heading, part in zip(headings, expected, strict=True)] + [""]
+    pairs = [f"{query} {database.names[row]}" for query, part in zip(queries.names, rows, strict=True) for row in part]
+    assert (tmp_path / "pairs.txt").read_text().splitlines() == pairs
+    parts = replace(result, parts={("two", "paper"): result.parts["two", "paper"]})
+    parts.write_predictions(tmp_path / "parts")
+    assert {path.name for path in (tmp_path / "parts").iterdir()} == {"first", "second"}
+    with pytest.raises(InputError, match="expected one data set"):
+        result.write_predictions(tmp_path / "all")
+
+
 def test_a_run_folder_says_which_predictions_a_sequence_changes(dataset, systems, tmp_path):
     filters = DriveFilter(), DriveFilter("smoothed")
     result = mfvpr.evaluate(dataset, replace(systems["paper"], sequences={"histogram": filters}))

@@ -1,0 +1,159 @@
+"""Predictions as files of other programs: candidates, trajectories, and a table of shifts with times."""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.positives import Positives
+from mfvpr.io.containers import reading, shorten
+from mfvpr.io.shortlists import write_shortlist
+from mfvpr.io.stamps import SECOND
+from mfvpr.io.trajectories import read_poses, write_trajectory
+from mfvpr.report.evaluation_files import NO_PLACE
+from mfvpr.report.tables import read_csv, write_csv
+from mfvpr.types import Shortlist
+from mfvpr.utils.errors import InputError
+
+CandidateLayout = Literal["preds", "hloc", "kapture"]
+_NUMBERS = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "scale", "image_width")
+_CELLS = (*_NUMBERS, "reason")
+SHIFT_COLUMNS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "place", *_CELLS, "image")
+_FRAME = "camera"  # header.frame_id
+
+
+@dataclass(frozen=True)
+class LocalizedImage:
+    """A query with its prediction.
+
+    Attributes:
+        name: of the query.
+        place: any JSON value; None = no place.
+        candidates: names of database images and their scores, best first; empty without a place.
+        cells: of the table of shifts, by column.
+    """
+
+    name: str
+    place: Any = None
+    candidates: Sequence[tuple[str, float]] = ()
+    cells: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_candidates(
+    path: Path | str, shortlist: Shortlist, queries: ImageFolder, database: ImageFolder, layout: CandidateLayout,
+    positives: Positives | None = None,
+) -> None:  # fmt: skip
+    """Write candidates as `mfvpr.io.write_shortlist`; `preds` has full paths, and the correct images if known."""
+    names = [[os.path.abspath(path) for path in side.paths] if layout == "preds" else side.names
+             for side in (queries, database)]  # fmt: skip
+    correct = None if positives is None else [positives.of(row).tolist() for row in range(len(queries))]
+    write_shortlist(path, shortlist, *names, layout=layout, positives=correct)
+
+
+def write_poses(
+    path: Path | str, images: Sequence[LocalizedImage], poses: Path, database: Sequence[str],
+    stamps: Sequence[int] | None,
+) -> None:  # fmt: skip
+    """Write the pose of each first candidate, as `mfvpr.io.write_trajectory`; `stamps` None = KITTI.
+
+    `poses` is a file of the `database` images, as `mfvpr.io.read_poses` reads it.
+    """
+    by_name = dict(zip(database, read_poses(poses, database), strict=True))
+    texts = []
+    for image in images:
+        name = None if image.place is None else image.candidates[0][0]
+        if name is not None and name not in by_name:
+            raise InputError(f"{shorten(image.name)}: expected a database image with a pose, got {shorten(name)}; name "
+                             "the folder of the database")  # fmt: skip
+        texts.append(name and by_name[name])
+    write_trajectory(path, texts, stamps)
+
+
+def write_shift_table(path: Path, images: Sequence[LocalizedImage], stamps: Sequence[int]) -> None:
+    """Write a CSV line per image with `SHIFT_COLUMNS`, in the order of the times `stamps` (ns), as ROS names them.
+
+    Unknown numbers, and the place of an image without one, are empty cells.
+    """
+    write_csv(path, SHIFT_COLUMNS, (
+        [stamps[row] // SECOND, stamps[row] % SECOND, _FRAME, _place_text(images[row].place),
+         *(images[row].cells.get(name, "") for name in _CELLS), images[row].name]
+        for row in sorted(range(len(images)), key=stamps.__getitem__)
+    ))  # fmt: skip
+
+
+def _place_text(place: Any) -> str:
+    return "" if place is None else place if isinstance(place, str) else json.dumps(place, ensure_ascii=False)
+
+
+def shortlist_of(images: Sequence[LocalizedImage], database: Sequence[str]) -> Shortlist:
+    """Candidates `[Q, C]` of localized images."""
+    rows = {name: row for row, name in enumerate(database)}
+    depth = max((len(image.candidates) for image in images), default=0)
+    indices, scores = np.full((len(images), depth), -1, np.int32), np.zeros((len(images), depth), np.float32)
+    for query, image in enumerate(images):
+        for rank, (name, score) in enumerate(image.candidates):
+            if name not in rows:
+                raise InputError(f"{shorten(name)}: expected an image of the database, got none; the data set has "
+                                 "changed since the run")  # fmt: skip
+            indices[query, rank], scores[query, rank] = rows[name], score
+    return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
+
+
+def read_lines(path: Path) -> list[LocalizedImage]:
+    """Read the lines of `mfvpr localize`; an image that could not be read has no place, and its error as reason."""
+    with reading(path, mend="expected lines of mfvpr localize"):
+        lines = path.read_text(encoding="utf-8").split("\n")
+    images = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                images.append(_image_of(json.loads(line)))
+            except (AttributeError, LookupError, TypeError, ValueError, RecursionError):
+                raise InputError(f"{path}: line {number}: expected a line of mfvpr localize, got "
+                                 f"{shorten(line)!r}") from None  # fmt: skip
+    return images
+
+
+def _image_of(line: Mapping[str, Any]) -> LocalizedImage:
+    """The image of a line; raises what damaged lines make Python raise."""
+    name, place = line["image"], line.get("place")
+    if not isinstance(name, str):
+        raise TypeError("a name that is no text")
+    if "error" in line:
+        return LocalizedImage(name, cells={"reason": str(line["error"])})
+    low, high = line["shift_interval"] or [[None, None]] * 2
+    numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["scale"], line["image_width"]]
+    if not all(number is None or math.isfinite(number) for number in numbers):
+        raise ValueError("a number that is not finite")
+    cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
+    candidates = [(str(each["name"]), each["score"]) for each in line["alternatives"]]
+    if place is None:
+        return LocalizedImage(name, cells=cells | {"reason": str(line["reason"])})
+    return LocalizedImage(name, place, [candidates[0], *candidates[1:]], cells)
+
+
+def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:
+    """Localized images of a sequence of an evaluation, from the files in its folder; refused queries have no place."""
+    candidates, cells, known = dict[str, list[tuple[str, float]]](), dict[str, dict[str, str]](), {*queries}
+    with reading(folder / "predictions.csv", mend="expected the folder of an evaluation"):
+        for row in read_csv(folder / "predictions.csv"):
+            if row["query"] not in known:
+                raise InputError(f"expected queries of the data set, got {shorten(row['query'])}; the data set has "
+                                 "changed since the run")  # fmt: skip
+            if row["database"] != NO_PLACE:
+                candidates.setdefault(row["query"], []).append((row["database"], float(row["score"])))
+    for name in ("top_predictions.csv", "shifts.csv"):
+        for row in read_csv(folder / name) if (folder / name).exists() else ():
+            row["image_width"] = row.get("width", "")
+            cells.setdefault(row["query"], {}).update({cell: row[cell] for cell in _CELLS if row.get(cell)})
+    images = []
+    for query in queries:
+        place = candidates[query][0][0] if query in candidates else None
+        images.append(LocalizedImage(query, place, candidates.get(query, ()), cells.get(query, {})))
+    return images

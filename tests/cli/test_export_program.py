@@ -1,0 +1,142 @@
+"""mfvpr export: files of other programs from an evaluation and from localized images."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from mfvpr.cli import evaluation
+from mfvpr.cli.inputs import dataset_of
+from mfvpr.io import read_shortlist
+from tests.programs import composed, csv_rows, output_of, shared, small
+
+pytestmark = pytest.mark.thorough
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return shared(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def settings(root, tmp_path_factory):
+    run = tmp_path_factory.mktemp("export") / "run"
+    settings = composed(*small(root), "scorer=histogram", "figures=0", f"out={run}")
+    evaluation.evaluate(settings)
+    return settings
+
+
+@pytest.fixture
+def export(monkeypatch, capsys, tmp_path):
+    """Exports to `tmp_path / out`: the path, what is printed, and errors."""
+
+    def call(source, layout, *more, out="out", code=0):
+        path = tmp_path / out
+        stdout, stderr = output_of(
+            monkeypatch, capsys, "export", str(source), str(path), "--layout", layout, *map(str, more), code=code
+        )
+        return path, stdout, stderr
+
+    return call
+
+
+def first_candidates(run):
+    return {row["query"]: row["database"] for row in csv_rows(Path(run) / "predictions.csv") if row["rank"] == "1"}
+
+
+@pytest.mark.parametrize("layout", ["preds", "hloc", "kapture"])
+def test_candidates_of_a_run(export, settings, layout):
+    dataset = dataset_of(settings["dataset"])
+    path, stdout, _ = export(settings["out"], layout)
+    assert stdout == f"{path}: candidates of {len(dataset.queries)} queries\n"
+    shortlist = read_shortlist(path, dataset.queries.names, dataset.database.names)
+    first = {query: dataset.database.names[row]
+             for query, row in zip(dataset.queries.names, shortlist.indices[:, 0], strict=True)}  # fmt: skip
+    assert first == first_candidates(settings["out"])
+
+
+def test_preds_have_full_paths_and_all_correct_images(export, settings):
+    dataset = dataset_of(settings["dataset"])
+    path, *_ = export(settings["out"], "preds")
+    lines = (path / "004.txt").read_text().splitlines()
+    correct = dataset.truth.positives(1).of(4)  # the middle tolerance of this run
+    assert lines[1] == str(dataset.queries.paths[4])
+    assert lines[lines.index("Positives paths:") + 1 : -1] == [str(dataset.database.paths[row]) for row in correct]
+    assert all(Path(line).is_file() for line in lines if line.startswith("/"))
+
+
+def poses_of(dataset, path, num_numbers):
+    times = [f"{row}.5 " if num_numbers == 7 else "" for row in range(len(dataset.database))]
+    numbers = [f"{row}.0" + " 1e-3" * (num_numbers - 1) for row in range(len(times))]
+    path.write_text("".join(f"{time}{pose}\n" for time, pose in zip(times, numbers, strict=True)))
+    return dict(zip(dataset.database.names, numbers, strict=True))
+
+
+def test_trajectories_and_shifts_of_a_run(export, settings, tmp_path):
+    dataset = dataset_of(settings["dataset"])
+    first = first_candidates(settings["out"])
+    poses = poses_of(dataset, tmp_path / "kitti.txt", 12)
+    path, stdout, _ = export(settings["out"], "kitti", "--poses", tmp_path / "kitti.txt")
+    expected = [poses[first[query]] for query in dataset.queries.names]
+    assert path.read_text().splitlines() == expected
+    assert stdout == f"{path}: {len(expected)} images with a place, 0 without\n"
+    poses = poses_of(dataset, tmp_path / "tum.txt", 7)
+    (tmp_path / "times.txt").write_text("".join(f"{row}.000000001\n" for row in range(len(expected))))
+    times = ("--times", tmp_path / "times.txt")
+    path, *_ = export(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times)
+    expected = [f"{row}.000000001 {poses[first[query]]}" for row, query in enumerate(dataset.queries.names)]
+    assert path.read_text().splitlines() == expected
+    path, *_ = export(settings["out"], "shifts", *times)
+    rows = {row["image"]: row for row in csv_rows(path)}
+    assert {name: row["place"] for name, row in rows.items()} == first
+    for row in csv_rows(Path(settings["out"]) / "shifts.csv"):
+        assert rows[row["query"]]["shift_x"] == row["shift_x"]
+        assert rows[row["query"]]["image_width"] == "160"
+
+
+def test_lines_of_localize(export, tmp_path, settings):
+    dataset = dataset_of(settings["dataset"])
+    poses = poses_of(dataset, tmp_path / "tum.txt", 7)
+    line = {"image": "/drive/1403636579763555584.png", "place": "a", "confidence": None, "shift": None, "reason": None,
+            "shift_interval": None, "scale": None, "image_width": 9,
+            "alternatives": [{"name": dataset.database.names[3], "score": 2.0}]}  # fmt: skip
+    (tmp_path / "lines").write_text(json.dumps(line) + "\n" + json.dumps({"image": "/drive/1.5.png", "error": "bad"}))
+    files = ("--poses", tmp_path / "tum.txt", "--database", dataset.database.root)
+    path, stdout, _ = export(tmp_path / "lines", "tum", *files)
+    assert path.read_text() == f"1403636579.763555584 {poses[dataset.database.names[3]]}\n"
+    assert stdout == f"{path}: 1 images with a place, 1 without\n"
+    path, *_ = export(tmp_path / "lines", "shifts")
+    assert [row["header.stamp.nanosec"] for row in csv_rows(path)] == ["500000000", "763555584"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "more", "words"),
+    [
+        ("tum", [], "--poses: expected a path for --layout tum"),
+        ("preds", ["--poses", "p"], "--poses: expected none for --layout preds"),
+        ("kitti", ["--poses", "p", "--times", "t"], "--times: expected none for --layout kitti"),
+        ("tum", ["--poses", "p", "--database", "d"], "--database: expected none for --layout tum"),
+        ("shifts", [], "0000.png: expected the time as the name of the file"),
+        ("csv", [], "argument --layout: invalid choice: 'csv'"),
+    ],
+)
+def test_wrong_arguments_are_one_line(export, settings, tmp_path, layout, more, words):
+    path, _, stderr = export(settings["out"], layout, *more, code=2)
+    assert words in stderr
+    assert stderr.count("\n") == 1
+    assert not path.exists()
+
+
+def test_other_sources_are_one_line(export, settings, tmp_path):
+    for source, words in ((tmp_path, "run.json: expected a file, got nothing"),
+                          (tmp_path / "none", "none: expected the run folder of mfvpr evaluate for --layout hloc"),
+                          (tmp_path / "copy", "expected a run of mfvpr evaluate, got one of Python")):  # fmt: skip
+        if source.name == "copy":
+            shutil.copytree(settings["out"], source)
+            about = json.loads((source / "run.json").read_text())
+            del about["settings"]["recall"]
+            (source / "run.json").write_text(json.dumps(about))
+        _, _, stderr = export(source, "hloc", code=2)
+        assert words in stderr
+        assert stderr.count("\n") == 1
