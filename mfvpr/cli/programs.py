@@ -133,7 +133,8 @@ _ARGUMENTS = {  # of programs that have commands or arguments instead of setting
     "weights": ("Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the package; each "
                 "has its own license.", _add_weights_commands),
     "data": ("Nothing is downloaded: each data set has its place and its license.", _add_data_commands),
-    "export": ("Queries without a place are left out, except in the table of shifts.", _add_export_arguments),
+    "export": ("Queries without a place are left out of candidates and of TUM, have an empty place in "
+               "the table of shifts, and are an error for KITTI.", _add_export_arguments),
     "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, sweep or learn, "
                "of a multirun (runs/multirun/TIME), or of several evaluations beside each other.",
                _add_report_arguments),
