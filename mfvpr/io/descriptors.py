@@ -24,7 +24,8 @@ def read_global_descriptors(
     """Global descriptors of the images `names`.
 
     Args:
-        path: `.npy`: `[M, D]`, in the order of the names as Python sorts them (image10 before image2);
+        path: `.npy`: `[M, D]`, in the order of the names as Python sorts them (image10 before image2), such as
+            VPR-methods-evaluation's `database_descriptors.npy`;
             `.npz`: `descriptors` `[M, D]` and `names` `[M]`; without `names`, the order of `.npy`;
             `.h5` or `.hdf5`: as hloc, a `global_descriptor` `[D]` for each image.
         names: `[M]` relative POSIX paths, matched as in `names.match_names`.
