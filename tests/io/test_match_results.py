@@ -84,7 +84,7 @@ def test_other_content_is_one_line(folder, monkeypatch, content, words):
 
 def test_damaged_and_missing_files_are_one_line(folder):
     write_results(folder / "000.torch", [result(5)] * 4, zipfile.ZIP_DEFLATED)
-    with one_line_error(None, "000.torch", "expected an uncompressed entry"):
+    with one_line_error(None, "000.torch", "once and uncompressed"):
         read_shortlist(folder, QUERIES, DATABASE)
     write_results(folder / "000.torch", [result(5)] * 4)
     with one_line_error("expected scores of all pairs or of none"):
