@@ -4,6 +4,7 @@ __all__ = [
     "AlikedFeatures",
     "D2NetFeatures",
     "Description",
+    "Dinov2Features",
     "Extractor",
     "FeatureSet",
     "FeatureSource",
@@ -25,6 +26,7 @@ __all__ = [
 
 from .aliked import AlikedFeatures
 from .d2net import D2NetFeatures
+from .dinov2 import Dinov2Features
 from .extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
 from .global_descriptor import GlobalDescriptor, MixVprDescriptor

@@ -30,6 +30,19 @@ class Tokens(NamedTuple):
     maps: Float[Array, "batch rows columns width"]  # tokens of the patches
 
 
+class BlockOutput(NamedTuple):
+    """Tokens, queries, keys and values of one block's patches, and the attention to the patches.
+
+    Heads are joined. Queries are not scaled.
+    """
+
+    token: Float[Array, "batch rows columns width"]  # after the block, normalized as the last tokens
+    query: Float[Array, "batch rows columns width"]
+    key: Float[Array, "batch rows columns width"]
+    value: Float[Array, "batch rows columns width"]
+    attention: Float[Array, "batch rows columns"]  # of the class token, mean over the heads
+
+
 class Patches(nnx.Module):
     """Linear map of each patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
 
@@ -56,10 +69,14 @@ class Attention(nnx.Module):
         self.heads = heads
         self.precision = precision
 
+    def split(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "3 batch heads tokens width//heads"]:
+        """Queries, keys and values of each head."""
+        batch, tokens, _ = x.shape
+        return jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, -1), (2, 3), (0, 2))
+
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        batch, tokens, width = x.shape
-        queries, keys, values = jnp.moveaxis(self.qkv(x).reshape(batch, tokens, 3, self.heads, -1), (2, 3), (0, 2))
-        queries = queries * (width // self.heads) ** -0.5
+        queries, keys, values = self.split(x)
+        queries = queries * queries.shape[-1] ** -0.5
         logits = jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision)
         weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
         context = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
@@ -118,15 +135,40 @@ class VisionTransformer(nnx.Module):
 
     def __call__(self, images: Images) -> Tokens:
         """Normalized tokens of preprocessed images."""
-        batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
-        maps = self.patches(images) + self._positions(rows, columns)[None]
-        first = (self.first[...] + self.positions[...][0])[None]
-        extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
-        x = jnp.concatenate([jnp.broadcast_to(extra, (batch, *extra.shape)), maps], axis=1)
+        x = self._embed(images)
         for block in self.blocks:
             x = block(x)
         x = self.norm(x)
-        return Tokens(x[:, 0], x[:, len(extra) :].reshape(batch, rows, columns, self.width))
+        return Tokens(x[:, 0], self._maps(x, images))
+
+    def with_block(self, images: Images, index: int) -> tuple[Tokens, BlockOutput]:
+        """Normalized tokens of preprocessed images, and the output of the block with this index."""
+        states = [self._embed(images)]
+        for block in self.blocks:
+            states.append(block(states[-1]))
+        x = self.norm(states[-1])
+        place, block = index % len(self.blocks), self.blocks[index]
+        parts = block.attention.split(block.norm1(states[place]))
+        joined = jnp.moveaxis(parts, 2, 3).reshape(3, *states[place].shape)
+        attention = jnp.mean(_class_attention(parts[0], parts[1], self.precision), axis=1)
+        last, token, query, key, value, weights = (
+            self._maps(values, images) for values in (x, self.norm(states[place + 1]), *joined, attention)
+        )
+        return Tokens(x[:, 0], last), BlockOutput(token, query, key, value, weights)
+
+    def _embed(self, images: Images) -> Float[Array, "batch tokens dimensions"]:
+        """Class token, registers and patches with their positions, the input of the first block."""
+        maps = self.patches(images) + self._positions(images.shape[1] // PATCH, images.shape[2] // PATCH)[None]
+        first = (self.first[...] + self.positions[...][0])[None]
+        extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
+        return jnp.concatenate([jnp.broadcast_to(extra, (len(images), *extra.shape)), maps], axis=1)
+
+    def _maps(
+        self, x: Float[Array, "batch tokens *dimensions"], images: Images
+    ) -> Float[Array, "batch rows columns *dimensions"]:
+        """Values of the patches' tokens, which are the last."""
+        rows, columns = images.shape[1] // PATCH, images.shape[2] // PATCH
+        return x[:, -rows * columns :].reshape(len(x), rows, columns, *x.shape[2:])
 
     def _positions(self, rows: int, columns: int) -> Float[Array, "{rows}*{columns} width"]:
         """Position encodings of the patches: the learned ones, resized without antialiasing."""
@@ -169,6 +211,14 @@ class TokenDescriptor(nnx.Module):
         """Descriptors of unit length of preprocessed images."""
         class_token, maps = self.network(images)
         return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
+
+
+def _class_attention(
+    queries: Float[Array, "batch heads tokens size"], keys: Float[Array, "batch heads tokens size"], precision: str
+) -> Float[Array, "batch heads tokens"]:
+    """Attention of the class token, the first, to all tokens: a softmax."""
+    scaled = queries[:, :, :1] * queries.shape[-1] ** -0.5
+    return jax.nn.softmax(jnp.matmul(scaled, keys.swapaxes(2, 3), precision=precision)[:, :, 0], axis=-1)
 
 
 def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:

@@ -42,6 +42,7 @@ _NETWORK_EXTRACTORS = {
         "ssm": "SsmCells",
         "patch_netvlad": "PatchNetVladFeatures",
         "selavpr": "SelaVprFeatures",
+        "dinov2": "Dinov2Features",
     },
     "retrieval": {"mixvpr": "MixVprDescriptor", "ssm": "SsmWindows"}
     | dict.fromkeys(["netvlad", "gem", "dinov2"], "GlobalDescriptor"),
@@ -82,8 +83,8 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
     if name != "same":
         return Retrieval(_network_extractor("retrieval", name, options), search)
     if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise SettingsError("retrieval=same: expected features with a global descriptor, patch_netvlad or selavpr; "
-                            "choose another retrieval")  # fmt: skip
+        raise SettingsError("retrieval=same: expected features with a global descriptor, such as patch_netvlad, "
+                            "selavpr or dinov2; choose another retrieval")  # fmt: skip
     return Retrieval(local, search)
 
 
@@ -98,7 +99,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
         raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model = _network(group, networks, options.pop("weights", None))
-    if name == "dinov2":
+    if (group, name) == ("retrieval", "dinov2"):
         from mfvpr.networks.vit import TokenDescriptor
 
         model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))

@@ -101,7 +101,7 @@ RULES: dict[str, Rule] = {
     for names, rule in {
         # choices
         "widen_index orient multiscale zero_row watch add verified confidences .compiled": one_of(True, False),
-        "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "import"),
+        "features.name": one_of("sift", "d2net", "aliked", "ssm", "patch_netvlad", "selavpr", "dinov2", "import"),
         "retrieval.name": one_of("vlad", "mixvpr", "netvlad", "gem", "dinov2", "ssm", "same", "import", "pairs"),
         "matching.name": one_of("neighbors", "lightglue", "import"),
         "cluster.name": one_of("local", "slurm", "address"),
@@ -113,6 +113,7 @@ RULES: dict[str, Rule] = {
         ),
         "preprocessing": one_of("caffe", "torch"),
         "pooling": one_of("cls", "gem"),
+        "facet": one_of("token", "query", "key", "value"),
         "cross_check": one_of("mutual", "opencv_legacy", "none", "candidate"),
         "retrieval_score": one_of("cosine", "negative_euclidean"),
         "ties": one_of("retrieval", "index"),
@@ -159,6 +160,7 @@ RULES: dict[str, Rule] = {
         "whiten components": either(whole(1, 4096), None),
         "patch_sizes": list_of(whole(1, 64)),
         "stride": whole(1, 8),
+        "block": whole(-24, 23),
         "previous_queries": whole(0, 1000),
         ".sequence": either(or_list(one_of("causal", "lagged", "smoothed", "viterbi")), None),
         "trials": whole(1, 100_000),

@@ -129,7 +129,7 @@ def test_version(succeed, program):
     ("evaluate", ["+new=1"], "+new=1: settings can be set, not added"),
     ("evaluate", ["word"], "word: expected name=value"),
     ("evaluate", ["scorer=[count,sum]"], "expected one of all"),
-    ("evaluate", ["features=null"], "aliked, d2net, import, patch_netvlad, selavpr, sift, ssm"),
+    ("evaluate", ["features=null"], "aliked, d2net, dinov2, dinov2_attention, import, patch_netvlad, selavpr, sift"),
     ("evaluate", ["scorer.count.method=histogram"], "scorer.count.method=histogram: expected count"),
     ("evaluate", ["scorer=histogram", "scorer.bin_size=[1,2"], "scorer.bin_size=[1,2: expected a number from 1e-06"),
     ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),

@@ -1,4 +1,4 @@
-"""SelaVPR as a system, and DINOv2 as a retriever, by name, with weights converted as anybody's are; small networks."""
+"""SelaVPR as a system, DINOv2 as retriever and features, by name, with weights converted from files; small networks."""
 
 from functools import partial
 
@@ -80,6 +80,42 @@ def test_dinov2_is_a_retriever(program, tmp_path, pooling):
     assert {row["retrieval"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
     stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2", code=2)
     assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
+
+
+@pytest.fixture
+def dinov2(program, tmp_path):
+    """A command line, with a small DINOv2 installed."""
+    tensors = random_checkpoint(dinov2_shapes(64, 1))
+    program("weights", "add", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
+    return program
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("features", "facet"), [("dinov2", "token"), ("dinov2_attention", "value")])
+def test_dinov2_gives_features_and_the_global_descriptor_in_one_pass(dinov2, tmp_path, features, facet):
+    network = f"features={features}", "features.weights=dinov2_vits14", "features.block=-1"
+    small = "features.image_size=[70,56]", "candidates=5", "figures=0"
+    dinov2("evaluate", *network, *small, "retrieval=same", "scorer=demo")
+    rows = read_rows(tmp_path / "out")
+    assert {row["system"] for row in rows} >= {"retrieval", "count", "anchor", "histogram"}
+    assert {row["features"]["facet"] for row in rows} == {facet}
+    stores = sorted(path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*"))
+    assert stores == ["Dinov2Features", "matches"]
+
+
+@pytest.mark.parametrize(("option", "words"), [
+    ("features.image_size=[56,40]", "image_size=[56, 40]: expected multiples of 14, the side of a patch in px"),
+    ("features.image_size=auto", "expected [width, height] for features=dinov2"),
+    ("features.block=-2", "block=-2: expected from -1 to 0, a block of this network"),
+    ("features.block=24", "features.block=24: expected a whole number from -24 to 23"),
+    ("features.facet=attention", "features.facet=attention: expected one of token, query, key, value"),
+    ("features.weights=d2_tf", "features.weights=d2_tf: expected weights of dinov2: one of dinov2_vits14"),
+])  # fmt: skip
+def test_wrong_settings_of_dinov2_are_one_line(dinov2, option, words):
+    small = "features.image_size=[28,28]" if "image_size" not in option else "features.block=-1"
+    stderr = dinov2("evaluate", "features=dinov2", "features.weights=dinov2_vits14", small, option, code=2)
+    assert words in stderr
+    assert stderr.count("\n") == 1
 
 
 def test_wrong_weights_are_told(program, tmp_path):
