@@ -37,7 +37,8 @@ class Dinov2Features(NetworkExtractor):
         threshold: keep patches with at least this score; 0 keeps all, 1 keeps the best.
 
     Raises:
-        InputError: another network, an unknown facet, no such block, or an image size that is no multiple of 14.
+        InputError: another network, an unknown facet, no such block, a threshold above 1, or an image size that is no
+            multiple of 14.
     """
 
     model: VisionTransformer = field(repr=False)
@@ -55,6 +56,8 @@ class Dinov2Features(NetworkExtractor):
             raise InputError(f"facet={self.facet}: expected one of {', '.join(get_args(Facet))}")
         if not -(depth := len(self.model.blocks)) <= self.block < depth:
             raise InputError(f"block={self.block}: expected from {-depth} to {depth - 1}, a block of this network")
+        if not 0 <= self.threshold <= 1:
+            raise InputError(f"threshold={self.threshold}: expected from 0, which keeps all patches, to 1")
 
     @property
     def vector_size(self) -> int:

@@ -111,6 +111,7 @@ def test_other_settings_have_other_recipes():
     ({"facet": "values"}, "facet=values: expected one of token, query, key, value"),
     ({"block": 2}, "block=2: expected from -2 to 1, a block of this network"),
     ({"block": -3}, "block=-3: expected from -2 to 1, a block of this network"),
+    ({"threshold": 1.5}, "threshold=1.5: expected from 0, which keeps all patches, to 1"),
 ])  # fmt: skip
 def test_wrong_settings_are_one_line(settings, words):
     with pytest.raises(InputError, match=f"^{words}[^\n]*$"):
