@@ -1,0 +1,8 @@
+"""Compiled scores for programs in other languages: StableHLO, ONNX, and arrays to check them with.
+
+Read first: folders.py (the files of an export), programs.py (the functions that are exported).
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,9 @@
+__all__ = [
+    "ExportShapes",
+    "ExportedProgram",
+    "export",
+    "load_exported",
+]
+
+from .folders import ExportedProgram, export, load_exported
+from .programs import ExportShapes

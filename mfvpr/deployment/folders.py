@@ -1,0 +1,245 @@
+"""Folders of exported programs: the program, arrays to check it with, and a description of both."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mfvpr.deployment import onnx_models, stablehlo
+from mfvpr.deployment.check_arrays import check_inputs, largest_difference
+from mfvpr.deployment.programs import ExportShapes, Program, Tensor, scorer_program, system_program
+from mfvpr.evaluation.system import System
+from mfvpr.scoring.scorer import Scorer
+from mfvpr.types import Array
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import path_inside, require_file
+from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.numerics import as_array
+from mfvpr.utils.versions import versions
+
+FORMAT = "mfvpr exported program 1"
+DESCRIPTION, PROGRAM, MODEL = "export.json", "program.stablehlo", "program.onnx"
+
+
+@dataclass(frozen=True)
+class ExportedProgram:
+    """A program of a folder. Call it with an array for each input.
+
+        program = mfvpr.load_exported("exported")
+        scores = program(**arrays)["scores"]  # arrays as program.inputs says
+
+    Attributes:
+        folder: the program's.
+        inputs: name, shape, dtype, unit and axes of each array that the program takes.
+        outputs: the same of each array that it returns.
+        description: content of `export.json`.
+    """
+
+    folder: Path
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+    description: Mapping[str, Any] = field(repr=False)
+    run: Callable[..., tuple[Array, ...]] = field(repr=False)
+
+    def __call__(self, **arrays: Any) -> dict[str, np.ndarray]:
+        """Outputs by name, NumPy. Raises an `InputError` if an array is missing, or has another shape or dtype."""
+        if arrays.keys() != (expected := {each.name: each for each in self.inputs}).keys():
+            raise InputError(f"inputs: expected {', '.join(expected)}, got {', '.join(arrays) or 'none'}")
+        values = {name: as_array(array) for name, array in arrays.items()}
+        for name, each in expected.items():
+            got = str(np.result_type(values[name])), np.shape(values[name])
+            if got != (each.dtype, each.shape):
+                raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got[0]} {[*got[1]]}")
+        outputs = self.run(*(values[name] for name in expected))
+        return {each.name: np.asarray(values) for each, values in zip(self.outputs, outputs, strict=True)}
+
+    def check(self) -> float:
+        """Largest difference from the outputs in the folder, relative where they are above 1."""
+        inputs, outputs = (
+            {each.name: _read_array(self.folder, each) for each in tensors} for tensors in (self.inputs, self.outputs)
+        )
+        return largest_difference(self(**inputs), outputs)
+
+
+def export(
+    folder: Path | str, method: Scorer | System, shapes: ExportShapes, *, with_shift: bool = False,
+    onnx: bool | None = None,
+) -> ExportedProgram:  # fmt: skip
+    """Write a scorer, or the matcher and scorers of a system, as a program that runs without Python.
+
+        shapes = mfvpr.deployment.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
+        program = mfvpr.export("exported", mfvpr.HistogramOfShifts(), shapes)
+
+    The program scores all candidates of one query. The page of `mfvpr.deployment` lists files, inputs and limits.
+
+    Args:
+        folder: new or empty.
+        method: a scorer takes matches; a system takes features, and returns the scores of all of its scorers.
+        shapes: sizes of all arrays.
+        with_shift: also return the refined dominant shifts of the deciding `HistogramOfShifts`, `[C, 2]` px.
+        onnx: write an ONNX model as well; None = if the package jax2onnx is installed and has the operations.
+
+    Raises:
+        InputError: JAX cannot compile the scorer, or it calls Python or a library; `onnx` is True and there is no
+            model, or its outputs differ; or the folder has files.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
+    of_method = system_program if isinstance(method, System) else scorer_program
+    with jax.enable_x64(False):
+        program = stablehlo.without_unused_inputs(of_method(method, shapes, with_shift=with_shift))
+        content = stablehlo.serialize(program)
+        inputs = check_inputs(program)
+        run = jax.jit(stablehlo.deserialize(content, str(folder)).call)
+        outputs = dict(
+            zip((each.name for each in program.outputs), map(np.asarray, run(*inputs.values())), strict=True)
+        )
+        model, onnx_note = _model(program, inputs, outputs, required=onnx)
+    files = {PROGRAM: content} | ({} if model is None else {MODEL: model})
+    with _new_folder(folder) as temporary:
+        for name, file_content in files.items():
+            (temporary / name).write_bytes(file_content)
+        for name, array in (inputs | outputs).items():
+            np.save(_array_path(temporary, name), array, allow_pickle=False)
+        description = _description(program, onnx_note) | {"files": _digests(temporary)}
+        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
+    return load_exported(folder)
+
+
+def load_exported(folder: Path | str) -> ExportedProgram:
+    """Load a program that `export` wrote.
+
+        program = mfvpr.load_exported("exported")
+
+    Raises:
+        InputError: a file is missing or damaged, the description does not fit the program, or this version of JAX
+            cannot read the program.
+    """
+    folder = Path(folder)
+    description = _read_description(folder)
+    for name, digest in description["files"].items():
+        require_file(path := path_inside(folder, name))
+        if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            raise InputError(f"{path}: expected the file as it was exported, got a changed one; export it again")
+    content, where = (folder / PROGRAM).read_bytes(), str(folder / PROGRAM)
+    exported = stablehlo.deserialize(content, where)
+    sides = [[Tensor(**entry) for entry in description[side]] for side in ("inputs", "outputs")]
+    for tensors, avals in zip(sides, (exported.in_avals, exported.out_avals), strict=True):
+        if [(tuple(each.shape), each.dtype) for each in tensors] != [(each.shape, str(each.dtype)) for each in avals]:
+            raise InputError(f"{folder / DESCRIPTION}: expected the inputs and outputs of {PROGRAM}, got others; "
+                             "export it again")  # fmt: skip
+    inputs, outputs = (tuple(each._replace(shape=tuple(each.shape)) for each in tensors) for tensors in sides)
+    return ExportedProgram(folder, inputs, outputs, description, jax.jit(exported.call))
+
+
+def _model(
+    program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray], *, required: bool | None
+) -> tuple[bytes | None, dict[str, Any]]:
+    """The ONNX model, and how it was checked, or why there is none."""
+    if required is False or (required is None and not onnx_models.is_installed()):
+        return None, {"missing": "not requested" if required is False else "jax2onnx is not installed"}
+    try:
+        model = onnx_models.convert(program)
+        difference = largest_difference(onnx_models.run(model, inputs), outputs)
+        if not difference <= onnx_models.TOLERANCE:
+            raise InputError(f"onnx=True: expected outputs within {onnx_models.TOLERANCE:g} of JAX's, got a difference "
+                             f"of {difference:g}; leave onnx out")  # fmt: skip
+    except InputError as error:
+        if required:
+            raise
+        return None, {"missing": str(error)}
+    return model, {"largest_difference": difference, "tolerance": onnx_models.TOLERANCE}
+
+
+def _description(program: Program, onnx_note: dict[str, Any]) -> dict[str, Any]:
+    """Content of `export.json` without the hashes of files."""
+    shapes = program.shapes
+    return {
+        "format": FORMAT,
+        "versions": versions(),
+        "platforms": stablehlo.PLATFORMS,
+        "inputs": [each._asdict() for each in program.inputs],
+        "outputs": [each._asdict() for each in program.outputs],
+        "axes": {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension},
+        "image_size": shapes.image_size,
+        "parameters": {name: _recipe(part) for name, part in program.parameters.items()},
+        "left_out": program.left_out,
+        "onnx": onnx_note,
+    }
+
+
+def _recipe(part: Any) -> Any:
+    try:
+        return recipe_of(part)
+    except TypeError:  # a plain function
+        return {"function": getattr(part, "__qualname__", type(part).__qualname__)}
+
+
+def _read_description(folder: Path) -> dict[str, Any]:
+    """Content of `export.json`; an InputError unless it has the form that `export` writes."""
+    require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
+    try:
+        description = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON, got a damaged file; export it again") from error
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
+        got = str(description.get("format"))[:80] if isinstance(description, dict) else type(description).__name__
+        raise InputError(f"{path}: expected the format {FORMAT!r}, got {got!r}; export it again with this version")
+    files, tensors = description.get("files"), [description.get(side) for side in ("inputs", "outputs")]
+    is_complete = isinstance(files, dict) and all(isinstance(entries, list) for entries in tensors)
+    if not is_complete or not all(_is_tensor(entry) for entries in tensors for entry in entries):
+        raise InputError(f"{path}: expected files, inputs and outputs, got an incomplete description; export it again")
+    arrays = [str(_array_path(Path(), entry["name"])) for entries in tensors for entry in entries]
+    if missing := [name for name in (PROGRAM, *arrays) if name not in files]:
+        raise InputError(f"{path}: expected the hash of {missing[0]}, got none; export it again")
+    return description
+
+
+def _is_tensor(entry: Any) -> bool:
+    """Whether a JSON value describes an input or an output."""
+    if not isinstance(entry, dict) or entry.keys() != {*Tensor._fields}:
+        return False
+    shape = entry["shape"]
+    return isinstance(shape, list) and all(isinstance(entry[name], str) for name in Tensor._fields if name != "shape")
+
+
+def _array_path(folder: Path, name: str) -> Path:
+    return folder / "check" / f"{name}.npy"
+
+
+def _read_array(folder: Path, tensor: Tensor) -> np.ndarray:
+    path = _array_path(folder, tensor.name)
+    require_file(path)
+    try:
+        return np.load(path, allow_pickle=False)
+    except ValueError as error:
+        raise InputError(f"{path}: expected an array, got a damaged file; export it again") from error
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder that takes the place of a new or empty `folder` when the block ends without an error."""
+    folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.absolute().parent))
+    try:
+        (temporary / "check").mkdir()
+        temporary.chmod(0o755)
+        yield temporary
+        os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
