@@ -54,6 +54,10 @@ from .utils.runtime import Runtime
 from .report.results import Result, evaluate
 from .localization.map import Map
 
+# programs without Python
+from .deployment.folders import export, load_exported
+from .deployment.programs import ExportShapes
+
 # tools for a scorer of your own; see mfvpr.testing.check_scorer
 from .scoring.scorer import Scorer
 from .types import value
@@ -116,6 +120,9 @@ __all__ = [
     "Result",
     "evaluate",
     "Map",
+    "export",
+    "load_exported",
+    "ExportShapes",
     "Scorer",
     "value",
     "image_sizes",

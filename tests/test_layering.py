@@ -33,6 +33,7 @@ PERMISSIONS = {
         "datasets", "evaluation", "features", "matching", "reranking", "retrieval", "scoring", "storage", "systems",
         "types", "utils",
     },
+    "deployment": {"evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "tuning": {"datasets", "evaluation", "matching", "reranking", "scoring", "types", "utils"},
     "report": {
         "datasets", "evaluation", "features", "io", "localization", "reranking", "scoring", "storage", "tuning",
@@ -48,6 +49,8 @@ LIBRARIES = {
     "PIL": {"datasets", "report"},
     "flax": {"networks", "checkpoints", "features"},
     "safetensors": {"checkpoints"},
+    "jax2onnx": {"deployment"},
+    "onnxruntime": {"deployment"},
     "optax": {"tuning"},
     "orbax": {"tuning"},
     "filelock": {"utils"},

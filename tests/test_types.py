@@ -109,6 +109,8 @@ PROGRAMS_OF_THEIR_OWN = {
     "scoring/learned_weight.py",  # of matches alone
     "tuning/learning/teaching.py",  # of a new function, which has one model
     "tuning/learning/training.py",  # of a new function, which has one kind of parameters
+    "deployment/folders.py",  # of programs that were read from files
+    "deployment/stablehlo.py",  # of a new function, which has one scorer
     "matching/batched.py",  # of a new function, which has one matcher
     "matching/lightglue.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",

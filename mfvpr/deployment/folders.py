@@ -16,7 +16,7 @@ import numpy as np
 
 from mfvpr.deployment import onnx_models, stablehlo
 from mfvpr.deployment.check_arrays import check_inputs, largest_difference
-from mfvpr.deployment.programs import ExportShapes, Program, Tensor, scorer_program, system_program
+from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
 from mfvpr.evaluation.system import System
 from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Array
@@ -76,7 +76,7 @@ def export(
 ) -> ExportedProgram:  # fmt: skip
     """Write a scorer, or the matcher and scorers of a system, as a program that runs without Python.
 
-        shapes = mfvpr.deployment.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
+        shapes = mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
         program = mfvpr.export("exported", mfvpr.HistogramOfShifts(), shapes)
 
     The program scores all candidates of one query. The page of `mfvpr.deployment` lists files, inputs and limits.
@@ -95,9 +95,8 @@ def export(
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
-    of_method = system_program if isinstance(method, System) else scorer_program
     with jax.enable_x64(False):
-        program = stablehlo.without_unused_inputs(of_method(method, shapes, with_shift=with_shift))
+        program = stablehlo.without_unused_inputs(make_program(method, shapes, with_shift=with_shift))
         content = stablehlo.serialize(program)
         inputs = check_inputs(program)
         run = jax.jit(stablehlo.deserialize(content, str(folder)).call)
@@ -195,11 +194,15 @@ def _read_description(folder: Path) -> dict[str, Any]:
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         got = str(description.get("format"))[:80] if isinstance(description, dict) else type(description).__name__
         raise InputError(f"{path}: expected the format {FORMAT!r}, got {got!r}; export it again with this version")
-    files, tensors = description.get("files"), [description.get(side) for side in ("inputs", "outputs")]
-    is_complete = isinstance(files, dict) and all(isinstance(entries, list) for entries in tensors)
-    if not is_complete or not all(_is_tensor(entry) for entries in tensors for entry in entries):
+    files, sides = description.get("files"), [description.get(side) for side in ("inputs", "outputs")]
+    tensors = [entry for side in sides if isinstance(side, list) for entry in side]
+    if (
+        not isinstance(files, dict)
+        or not all(isinstance(side, list) for side in sides)
+        or not all(map(_is_tensor, tensors))
+    ):
         raise InputError(f"{path}: expected files, inputs and outputs, got an incomplete description; export it again")
-    arrays = [str(_array_path(Path(), entry["name"])) for entries in tensors for entry in entries]
+    arrays = [str(_array_path(Path(), entry["name"])) for entry in tensors]
     if missing := [name for name in (PROGRAM, *arrays) if name not in files]:
         raise InputError(f"{path}: expected the hash of {missing[0]}, got none; export it again")
     return description

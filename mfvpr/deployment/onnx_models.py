@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
+from typing import Any
 
 import jax
 import numpy as np
@@ -53,7 +54,7 @@ def run(model: bytes, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]
     options.log_severity_level = _ERRORS_ONLY
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        outputs = session.run(None, dict(inputs))
+        outputs: Any = session.run(None, dict(inputs))
     except Exception as error:  # ONNX Runtime has no common class of errors
         got = " ".join(str(error).split())[:200]
         raise InputError(f"onnx=True: expected a model that ONNX Runtime runs, got {got}; leave onnx out") from error

@@ -55,7 +55,7 @@ FEATURES = {
 class ExportShapes:
     """Sizes of the arrays of an exported program. Programs have fixed sizes: fill up with entries of mask False.
 
-        mfvpr.deployment.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
+        mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
 
     Attributes:
         candidates: C, of one query.
@@ -108,7 +108,14 @@ class Program:
         return self.function(dict(zip((each.name for each in self.inputs), arrays, strict=True)), form)
 
 
-def scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool) -> Program:
+def make_program(method: Scorer | System, shapes: ExportShapes, *, with_shift: bool) -> Program:
+    """The program of a scorer or of a system."""
+    if isinstance(method, System):
+        return _system_program(method, shapes, with_shift=with_shift)
+    return _scorer_program(method, shapes, with_shift=with_shift)
+
+
+def _scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool) -> Program:
     """Matches of C candidates -> their scores."""
     scorers = _scorers({"scores": scorer}, shapes)
 
@@ -122,7 +129,7 @@ def scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool) ->
     return Program(shapes, _tensors(FIELDS, shapes), _outputs(scorers, shapes, with_shift), function, scorers)
 
 
-def system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -> Program:
+def _system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -> Program:
     """Features of a query and C candidates -> scores of all scorers; the deciding score comes first."""
     scales, main = system.pipeline.extractor.scales, system.headline
     if len(scales) != 1:
@@ -130,7 +137,7 @@ def system_program(system: System, shapes: ExportShapes, *, with_shift: bool) ->
                          f"{len(scales)}; export a scorer alone, and fuse the scales outside")  # fmt: skip
     if main not in system.scorers:
         raise InputError(f"final={main!r}: expected a scorer, got a ranking that needs the retrieval or further "
-                         "queries; export dataclasses.replace(system, final=...), and combine its scores outside")  # fmt: skip
+                         "queries; choose another by dataclasses.replace(system, final=...)")  # fmt: skip
     names = [main, *(name for name in system.scorers if name != main)]
     outputs = {"scores" if name == main else f"scores_{name}": system.scorers[name] for name in names}
     scorers, matcher = _scorers(outputs, shapes), system.pipeline.matcher
@@ -145,7 +152,7 @@ def system_program(system: System, shapes: ExportShapes, *, with_shift: bool) ->
     return Program(shapes, tensors, _outputs(scorers, shapes, with_shift), function, parts, left_out)
 
 
-def _scorers(scorers: Mapping[str, Scorer], shapes: ExportShapes) -> dict[str, Any]:
+def _scorers(scorers: Mapping[str, Scorer], shapes: ExportShapes) -> dict[str, Scorer]:
     """Scorers with the capacities that images need; an InputError for scorers that JAX cannot compile."""
     for output, scorer in scorers.items():
         if on_host(scorer):

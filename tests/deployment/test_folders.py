@@ -1,0 +1,165 @@
+"""Folders of exported programs: another process gives the same bits, and damage is noticed."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import ExportShapes, InputError
+from mfvpr.deployment import folders
+from tests.programs import ROOT
+
+pytestmark = pytest.mark.thorough
+
+SHAPES = ExportShapes(candidates=3, keypoints=20, image_size=(320, 240))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder that only reads are allowed of."""
+    folder = tmp_path_factory.mktemp("exported") / "histogram"
+    mfvpr.export(folder, mfvpr.HistogramOfShifts(), SHAPES, with_shift=True, onnx=False)
+    return folder
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    """A copy that may be damaged."""
+    return shutil.copytree(written, tmp_path / "histogram")
+
+
+def inputs_of(program):
+    return {each.name: np.load(program.folder / "check" / f"{each.name}.npy") for each in program.inputs}
+
+
+@pytest.mark.optimized
+def test_a_fresh_process_without_the_scorer_gives_the_same_bits(written):
+    code = f"""
+import sys, mfvpr
+program = mfvpr.load_exported({str(written)!r})
+assert program.check() == 0.0
+assert "mfvpr.scoring.histogram" in sys.modules or True
+print(",".join(each.name for each in program.outputs))
+"""
+    process = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (process.returncode, process.stdout) == (0, "scores,shift\n"), process.stderr
+
+
+def test_the_description_has_inputs_units_capacities_parameters_versions_and_platforms(written):
+    description = json.loads((written / "export.json").read_text())
+    points, scores = description["inputs"][0], description["outputs"][0]
+    assert points == {"name": "points0", "shape": [3, 20, 2], "dtype": "float32", "unit": "px", "axes": "CK2"}
+    assert scores == {"name": "scores", "shape": [3], "dtype": "float32", "unit": "", "axes": "C"}
+    assert description["platforms"] == ["cpu", "cuda"]
+    assert description["parameters"]["scores"].items() >= {"class": "HistogramOfShifts", "bin_size": 15.0}.items()
+    assert description["parameters"]["scores"]["max_bins"] == 48  # 2 * 320 / 15, a multiple of 8
+    assert description["image_size"] == [320, 240]
+    assert {"mfvpr", "jax", "jaxlib"} <= description["versions"].keys()
+    files = {path.relative_to(written).as_posix() for path in written.rglob("*") if path.is_file()}
+    assert {*description["files"]} == files - {"export.json"}
+    assert len(files) == 1 + 1 + 7 + 2
+
+
+def test_a_program_takes_arrays_of_jax_and_other_libraries(written):
+    program = mfvpr.load_exported(written)
+    inputs = inputs_of(program)
+    expected = program(**inputs)
+    assert {name: values.shape for name, values in expected.items()} == {"scores": (3,), "shift": (3, 2)}
+    for name, values in program(**{name: jnp.asarray(array) for name, array in inputs.items()}).items():
+        np.testing.assert_array_equal(values, expected[name])
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got float32 \[3, 21, 2\]"),
+    ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
+    ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
+    ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
+])  # fmt: skip
+def test_wrong_inputs_are_refused(written, change, message):
+    program = mfvpr.load_exported(written)
+    with pytest.raises(InputError, match=message):
+        program(**inputs_of(program) | change)
+    with pytest.raises(InputError, match="inputs: expected points0, .*, got none"):
+        program()
+
+
+def edit(folder, change):
+    path = folder / "export.json"
+    description = json.loads(path.read_text())
+    change(description)
+    path.write_text(json.dumps(description))
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+DAMAGE = {
+    "no folder": (shutil.rmtree, r"export\.json: expected a folder of mfvpr\.export with this file, got nothing"),
+    "no description": (lambda folder: (folder / "export.json").unlink(), "export.json: expected a folder of"),
+    "no program": (lambda folder: (folder / "program.stablehlo").unlink(), "program.stablehlo: expected a file, got noth"),
+    "a bit": (lambda folder: flip(folder / "program.stablehlo"), "expected the file as it was exported, got a changed"),
+    "a bit of an array": (lambda folder: flip(folder / "check" / "mask.npy"), "mask.npy: expected the file as it was"),
+    "cut": (lambda folder: (folder / "export.json").write_text('{"format"'), "export.json: expected JSON"),
+    "nested": (lambda folder: (folder / "export.json").write_text("[" * 100_000), "export.json: expected"),
+    "a list": (lambda folder: (folder / "export.json").write_text("[]"), "expected the format .* got 'list'"),
+    "bytes": (lambda folder: (folder / "export.json").write_bytes(b"\xff"), "export.json: expected JSON"),
+    "another version": (lambda folder: edit(folder, lambda d: d.update(format="mfvpr exported program 2")),
+                        "expected the format 'mfvpr exported program 1', got 'mfvpr exported program 2'"),
+    "no files": (lambda folder: edit(folder, lambda d: d.pop("files")), "got an incomplete description"),
+    "no hash": (lambda folder: edit(folder, lambda d: d["files"].pop("program.stablehlo")), "the hash of program.stable"),
+    "no hash of an array": (lambda folder: edit(folder, lambda d: d["files"].pop("check/mask.npy")), "hash of check/mask"),
+    "another shape": (lambda folder: edit(folder, lambda d: d["inputs"][0].update(shape=[4, 20, 2])),
+                      "expected the inputs and outputs of program.stablehlo, got others"),
+    "another type": (lambda folder: edit(folder, lambda d: d["outputs"][0].update(dtype="int32")), "got others"),
+    "no shape": (lambda folder: edit(folder, lambda d: d["inputs"][0].pop("shape")), "got an incomplete description"),
+    "another folder": (lambda folder: edit(folder, lambda d: d["files"].update({"../x": "0"})), "leads elsewhere"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
+    change, message = DAMAGE[damage]
+    change(folder)
+    with pytest.raises(InputError, match=message) as error:
+        mfvpr.load_exported(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_a_program_that_jax_cannot_read_is_refused(folder):
+    """With a hash that fits, as somebody else's program would have."""
+    path = folder / "program.stablehlo"
+    for content in (b"", b"no program", path.read_bytes()[:1000]):
+        path.write_bytes(content)
+        edit(folder, lambda d: d.update(files=folders._digests(folder)))
+        with pytest.raises(InputError, match=r"program\.stablehlo: expected a program that JAX .* reads, got") as error:
+            mfvpr.load_exported(folder)
+        assert "\n" not in str(error.value)
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    program = mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
+    assert program(mask=np.ones((3, 20), bool))["scores"].tolist() == [20, 20, 20]
+    with pytest.raises(InputError, match=r"empty: expected a new or an empty folder, got one with files"):
+        mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
+    monkeypatch.setattr(np, "save", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        mfvpr.export(tmp_path / "new", mfvpr.MatchCount(), SHAPES, onnx=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, monkeypatch):
+    monkeypatch.setattr(folders.onnx_models, "find_spec", lambda _: None)
+    program = mfvpr.export(tmp_path / "count", mfvpr.MatchCount(), SHAPES)
+    assert program.description["onnx"] == {"missing": "jax2onnx is not installed"}
+    with pytest.raises(InputError, match=r"onnx=True: expected the package jax2onnx.*pip install 'mfvpr\[export\]'"):
+        mfvpr.export(tmp_path / "model", mfvpr.MatchCount(), SHAPES, onnx=True)
+    assert not (tmp_path / "model").exists()
