@@ -56,7 +56,7 @@ class ExportedProgram:
             raise InputError(f"inputs: expected {', '.join(expected)}, got {', '.join(arrays) or 'none'}")
         values = {name: as_array(array) for name, array in arrays.items()}
         for name, each in expected.items():
-            got = str(np.result_type(values[name])), np.shape(values[name])
+            got = str(getattr(values[name], "dtype", type(values[name]).__name__)), np.shape(values[name])
             if got != (each.dtype, each.shape):
                 raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got[0]} {[*got[1]]}")
         outputs = self.run(*(values[name] for name in expected))

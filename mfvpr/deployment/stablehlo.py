@@ -15,7 +15,7 @@ from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 PLATFORMS = ("cpu", "cuda")
-_CALLBACK = re.compile(r"= (\w*callback|debug_print)\[")
+_CALLBACK = re.compile(r"\b(\w+_callback|debug_print)\[")
 _CUSTOM_CALL = re.compile(r"custom_call @([\w.]+)")
 
 
@@ -60,15 +60,11 @@ def _export(function: Callable[..., Any], inputs: tuple[Tensor, ...]) -> jax_exp
     structs, program = shape_structs(inputs), jax.jit(lambda *arrays: function(*arrays))
     try:
         traced = program.trace(*structs)
-    except jax.errors.JAXTypeError as error:
-        raise InputError(f"scorer: expected code that JAX compiles, got {_first_line(error)}; use jax.numpy instead of "
-                         "NumPy and Python") from error  # fmt: skip
-    _require_none(_CALLBACK.findall(str(traced.jaxpr)), "scorer")
-    try:
+        _require_none(_CALLBACK.findall(str(traced.jaxpr)), "scorer")
         text = traced.lower(lowering_platforms=PLATFORMS).as_text()
-    except NotImplementedError as error:
-        raise InputError(f"scorer: expected operations of JAX for {' and '.join(PLATFORMS)}, got {_first_line(error)}; "
-                         "leave the operation out") from error  # fmt: skip
+    except (jax.errors.JAXTypeError, NotImplementedError) as error:
+        raise InputError(f"scorer: expected code that JAX compiles for {' and '.join(PLATFORMS)}, got "
+                         f"{_first_line(error)}; use jax.numpy instead of NumPy and Python") from error  # fmt: skip
     _require_none(_CUSTOM_CALL.findall(text), "scorer")
     return jax_export.export(program, platforms=PLATFORMS)(*structs)
 

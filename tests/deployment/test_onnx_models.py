@@ -65,7 +65,7 @@ def test_an_operation_that_onnx_lacks_is_named(tmp_path):
 
 def test_a_model_with_other_outputs_is_not_written(tmp_path, monkeypatch):
     monkeypatch.setattr(onnx_models, "run", lambda *_: {"scores": np.full(3, 7.0, np.float32)})
-    with pytest.raises(InputError, match="onnx=True: expected outputs within 0.0001 of JAX's, got a difference of"):
+    with pytest.raises(InputError, match=r"onnx=True: expected outputs within 0.0001 of JAX's, got a difference of"):
         mfvpr.export(tmp_path / "count", mfvpr.MatchCount(), SHAPES, onnx=True)
     assert not (tmp_path / "count").exists()
 

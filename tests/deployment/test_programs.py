@@ -30,9 +30,9 @@ def make_system(scorers, *, extractor=SIFT, matcher=mfvpr.NearestNeighborMatcher
     return mfvpr.System(pipeline, scorers, **options)
 
 
-def outputs_of(method, *, seed_of_padding=None, with_shift=False, shapes=SHAPES):
+def outputs_of(method, *, with_shift=False):
     """Inputs of a program, and what its serialized form returns for them, by name."""
-    program = make_program(method, shapes, with_shift=with_shift)
+    program = make_program(method, SHAPES, with_shift=with_shift)
     inputs = check_inputs(program)
     exported = stablehlo.deserialize(stablehlo.serialize(program), "program")
     outputs = exported.call(*inputs.values())
@@ -47,8 +47,9 @@ def candidate_matches(inputs):
 
 @pytest.mark.optimized
 @pytest.mark.parametrize("scorer", [
-    *(SCORERS[name]() for name in SCORERS if name not in ("homography_opencv", "grid")), HISTOGRAM, plain,
+    *(SCORERS[name]() for name in SCORERS if name not in ("homography", "homography_opencv", "grid")), HISTOGRAM, plain,
     mfvpr.GridAnchors(side=7), mfvpr.HistogramOfShifts(temperature=0.5),
+    pytest.param(mfvpr.Homography(), marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     inputs, outputs = outputs_of(scorer)
@@ -116,7 +117,7 @@ def test_a_loop_gives_the_same():
 
 @pytest.mark.parametrize(("scorer", "names"), [
     (mfvpr.MatchCount(), ["mask"]),
-    (mfvpr.MatchCount(per_feature=True), ["mask", "count0"]),
+    (mfvpr.RapidSpatialScore(per_feature=True), ["points0", "points1", "mask", "image_size0", "count0"]),
     (HISTOGRAM, ["points0", "points1", "mask", "image_size0", "image_size1", "ratio"]),
 ])  # fmt: skip
 def test_inputs_without_effect_are_left_out(scorer, names):
@@ -126,7 +127,8 @@ def test_inputs_without_effect_are_left_out(scorer, names):
 
 
 def call_python(matches):
-    return jax.pure_callback(lambda mask: np.float32(mask.sum()), jax.ShapeDtypeStruct((), np.float32), matches.mask)
+    shape = jax.ShapeDtypeStruct((), np.float32)
+    return jax.pure_callback(lambda mask: np.float32(mask.sum()), shape, matches.mask, vmap_method="sequential")
 
 
 def print_number(matches):
@@ -150,8 +152,8 @@ def branch_in_python(matches):
     (call_python, "without calls into Python or libraries, got pure_callback"),
     (print_number, "without calls into Python or libraries, got debug_"),
     (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
-    (use_numpy, "code that JAX compiles, got TracerArrayConversionError.*use jax.numpy"),
-    (branch_in_python, "code that JAX compiles, got TracerBoolConversionError"),
+    (use_numpy, "code that JAX compiles, for cpu and cuda, got TracerArrayConversionError.*use jax.numpy"),
+    (branch_in_python, "code that JAX compiles for cpu and cuda, got TracerBoolConversionError"),
     (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
     (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, got one .*score_pairs"),
 ])  # fmt: skip
@@ -163,7 +165,7 @@ def test_scorers_that_cannot_be_exported_are_refused_by_the_operation(scorer, me
 
 @dataclass(frozen=True)
 class TwoScales:
-    scales: tuple = (Scale(dimension=8), Scale(dimension=8))
+    scales: tuple = (Scale(8, 100), Scale(8, 100))
 
 
 COUNT = {"count": mfvpr.MatchCount()}
