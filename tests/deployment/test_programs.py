@@ -152,7 +152,7 @@ def branch_in_python(matches):
     (call_python, "without calls into Python or libraries, got pure_callback"),
     (print_number, "without calls into Python or libraries, got debug_"),
     (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
-    (use_numpy, "code that JAX compiles, for cpu and cuda, got TracerArrayConversionError.*use jax.numpy"),
+    (use_numpy, "code that JAX compiles for cpu and cuda, got TracerArrayConversionError.*use jax.numpy"),
     (branch_in_python, "code that JAX compiles for cpu and cuda, got TracerBoolConversionError"),
     (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
     (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, got one .*score_pairs"),
