@@ -118,7 +118,11 @@ def export(
 def load_exported(folder: Path | str) -> ExportedProgram:
     """Load a program that `export` wrote.
 
-        program = mfvpr.load_exported("exported")
+        mfvpr.export("count", mfvpr.MatchCount(), mfvpr.ExportShapes(50, 800, (640, 480)), onnx=False)
+        mfvpr.load_exported("count")(mask=np.ones((50, 800), bool))["scores"]  # [C]
+
+    Args:
+        folder: of `export`, on this or on another computer.
 
     Raises:
         InputError: a file is missing or damaged, the description does not fit the program, or this version of JAX

@@ -53,12 +53,12 @@ FEATURES = {
 
 @dataclass(frozen=True)
 class ExportShapes:
-    """Sizes of the arrays of an exported program. Programs have fixed sizes: fill up with entries of mask False.
+    """Sizes of the arrays of an exported program, which are fixed; an `InputError` unless they are above 0.
 
         mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
 
     Attributes:
-        candidates: C, of one query.
+        candidates: C, of one query; fill up with candidates whose mask is False.
         keypoints: K, of each image; of a scorer alone: match slots of each pair.
         image_size: largest (width, height) of an image, px; the capacities of histograms follow from it.
         dimension: D, of a descriptor; None = the extractor's. A scorer alone has no descriptors.
