@@ -6,9 +6,11 @@ import shutil
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export as jax_export
 
 import mfvpr
 from mfvpr import ExportShapes, InputError
@@ -133,13 +135,25 @@ def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
     assert "\n" not in str(error.value)
 
 
+def exchange_program(folder, content):
+    (folder / "program.stablehlo").write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    edit(folder, lambda description: description["files"].update({"program.stablehlo": digest}))
+
+
+def test_a_program_that_calls_a_library_is_not_loaded(folder):
+    exported = jax_export.export(jax.jit(jnp.linalg.cholesky))(jax.ShapeDtypeStruct((3, 3), np.float32))
+    exchange_program(folder, bytes(exported.serialize()))
+    with pytest.raises(
+        InputError, match=r"program\.stablehlo: expected a program without calls .* got lapack_spotrf_ffi"
+    ):
+        mfvpr.load_exported(folder)
+
+
 def test_a_program_that_jax_cannot_read_is_refused(folder):
     """With a hash that fits, as somebody else's program would have."""
-    path = folder / "program.stablehlo"
-    for content in (b"", b"no program", path.read_bytes()[:1000]):
-        path.write_bytes(content)
-        digest = hashlib.sha256(content).hexdigest()
-        edit(folder, lambda d: d["files"].update({path.name: digest}))  # noqa: B023
+    for content in (b"", b"no program", (folder / "program.stablehlo").read_bytes()[:1000]):
+        exchange_program(folder, content)
         with pytest.raises(InputError, match=r"program\.stablehlo: expected a program that JAX .* reads, got") as error:
             mfvpr.load_exported(folder)
         assert "\n" not in str(error.value)
