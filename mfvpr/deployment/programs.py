@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.evaluation.system import System
+from mfvpr.matching.host import PairSource
 from mfvpr.matching.matcher import Matcher
 from mfvpr.reranking.ranking import BIN_STEP
 from mfvpr.scoring.histogram import HistogramOfShifts
@@ -135,6 +136,9 @@ def _system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -
     if len(scales) != 1:
         raise InputError(f"{type(system.pipeline.extractor).__name__}: expected local features of one scale, got "
                          f"{len(scales)}; export a scorer alone, and fuse the scales outside")  # fmt: skip
+    if isinstance(system.pipeline.matcher, PairSource):
+        raise InputError(f"{type(system.pipeline.matcher).__name__}: expected a matcher that JAX compiles, got one "
+                         "that runs on the host; export a scorer alone")  # fmt: skip
     if main not in system.scorers:
         raise InputError(f"final={main!r}: expected a scorer, got a ranking that needs the retrieval or further "
                          "queries; choose another by dataclasses.replace(system, final=...)")  # fmt: skip

@@ -1,10 +1,6 @@
-"""ONNX models: the outputs of ONNX Runtime from Python and from C++."""
+"""ONNX models, and their outputs in ONNX Runtime."""
 
 import json
-import os
-import shutil
-import subprocess
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +10,6 @@ import mfvpr
 from mfvpr import ExportShapes, InputError
 from mfvpr.deployment import onnx_models
 from tests.deployment.test_programs import HISTOGRAM, make_system
-from tests.programs import ROOT
 
 pytest.importorskip("jax2onnx", reason="jax2onnx, of the extra `export`, is not installed")
 pytestmark = pytest.mark.thorough
@@ -73,36 +68,3 @@ def test_a_model_with_other_outputs_is_not_written(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"onnx=True: expected outputs within 0.0001 of JAX's, got a difference of"):
         mfvpr.export(tmp_path / "count", mfvpr.MatchCount(), SHAPES, onnx=True)
     assert not (tmp_path / "count").exists()
-
-
-@pytest.fixture(scope="module")
-def cpp_program(tmp_path_factory):
-    """The C++ example, built."""
-    for tool in ("cmake", "c++"):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is not installed")
-    build = tmp_path_factory.mktemp("build")
-    commands = [["cmake", "-S", str(ROOT / "experiments" / "cpp"), "-B", str(build)], ["cmake", "--build", str(build)]]
-    configured = subprocess.run(commands[0], capture_output=True, text=True)
-    if configured.returncode and "ONNXRUNTIME" in configured.stderr and not os.environ.get("ONNXRUNTIME_ROOT"):
-        pytest.skip("ONNX Runtime for C++ is not installed; set ONNXRUNTIME_ROOT to its folder")
-    assert configured.returncode == 0, configured.stderr
-    subprocess.run(commands[1], check=True, capture_output=True)
-    return build / "exported_scorer"
-
-
-def run_cpp(program: Path, *arguments):
-    process = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
-    return process.returncode, process.stdout, process.stderr
-
-
-def test_cpp_gives_the_outputs_in_the_folder(cpp_program, system_folder, tmp_path):
-    code, stdout, stderr = run_cpp(cpp_program, system_folder)
-    assert (code, stderr) == (0, "")
-    assert "largest difference: " in stdout
-    changed = shutil.copytree(system_folder, tmp_path / "changed")
-    np.save(changed / "check" / "scores_count.npy", np.full(3, 5, np.float32))
-    code, stdout, _ = run_cpp(cpp_program, changed)
-    assert code == 1
-    (changed / "check" / "mask0.npy").unlink()
-    assert run_cpp(cpp_program, changed)[0] == 2
