@@ -49,8 +49,6 @@ class ImportedMatches:
         path: file or folder.
         names: names in the file of queries and database images; None = the file lacks the image.
         numbered: whether matches have numbers of keypoints.
-        has_distances: whether distances are those of descriptors; if not, all are 0.
-        has_scores: whether scores are those of keypoints; if not, all are 1.
     """
 
     def __init__(
@@ -61,9 +59,6 @@ class ImportedMatches:
         self._first: dict[bool, str] = {}  # with and without confidences, the first pair
         self.numbered = reader.by_number
         self.names = _names(reader, sides)
-        features = [side.features for side in sides]
-        self.has_distances = all(each is not None and each.dimension > 0 for each in features)
-        self.has_scores = all(each is not None and each.scored for each in features)
 
     def contains(self, query: int, candidate: int) -> bool:
         """Whether the file has matches of a pair, in either order; they may be none."""
@@ -136,7 +131,7 @@ class ImportedMatches:
             name = str(self.names[side][row])
             size = np.array(self._size(side, row, self._reader.image_size(name)), np.float32)
             where, points = f"{self.path}: keypoints of {shorten(name)}", self._reader.keypoints(name)
-            assert points is not None  # see `open_matches`
+            assert points is not None  # readers of numbers have them, or `open_matches` has the features
             points = as_float32(where, points)
             require_inside(where, points, size)
             features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
@@ -157,13 +152,14 @@ class ImportedMatches:
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
             raise InputError(f"{self.path}: expected the image_size that was given, {list(self._image_size)}, got "
                              f"{list(stored)}")  # fmt: skip
-        if (size := stored or self._image_size) is not None:
-            return size
-        size_of = self._sides[side].size
-        if size_of is None or not self._reader.in_image_files:
+        size_of = self._sides[side].size if self._reader.in_image_files else None
+        size = stored or self._image_size or (size_of and size_of(row))
+        if size is None:
             raise InputError(f"{self.path}: expected the size of the images that the points are in, got none; set "
                              "image_size=[W,H]")  # fmt: skip
-        return size_of(row)
+        if not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):
+            raise InputError(f"{self.path}: expected the size of an image, width and height in px, got {list(size)}")
+        return size
 
     def _where(self, query: int, row: int) -> str:
         return f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"

@@ -163,6 +163,9 @@ def test_npz_of_points(tmp_path):
     with one_line_error("image_size"):
         pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS))
     assert pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS), image_size=(64, 64)).mask.all()
+    for side in (0, -1, np.nan, np.inf):
+        with one_line_error("size of an image"):
+            pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS, im_size=side))
 
 
 def test_npz_of_superglue(tmp_path):
@@ -205,6 +208,7 @@ def test_files_by_stems_have_the_query_first(tmp_path):
         ({"points0": POINTS, "points1": np.array([None] * 3)}, "objects"),
         ({"points0": POINTS, "points1": POINTS, "im_size": "large"}, "im_size"),
         ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "was given"),
+        ({"points0": POINTS, "points1": POINTS, "im_size": np.nan}, "was given"),
     ],
 )
 def test_hostile_npz(tmp_path, arrays, message):
@@ -314,6 +318,7 @@ def changed_database(tools, tmp_path, *statements):
         ("DELETE FROM keypoints", "keypoints"),
         ("DELETE FROM cameras", "camera"),
         ("UPDATE cameras SET width = 3", "image of 3"),
+        ("UPDATE cameras SET width = 'wide'", "size of an image"),
         ("UPDATE keypoints SET data = zeroblob(length(data) - 8), rows = 1", "bytes"),
     ],
 )
