@@ -42,8 +42,25 @@ class H5File(Container):
         h5py = _h5py(self.path)
         with reading(self.path), h5py.File(self.path, "r") as file:
             for image in images:
-                group = h5py.h5g.open(file.id, _encode(image))
+                name = _encode(image)
+                _require_data(self.path, file.id, name, name)
+                group = h5py.h5g.open(file.id, name)
                 yield {part: _read(self.path, image, group, part) for part in parts if _encode(part) in group}
+
+
+class H5Pairs(H5File):
+    """Reader of an hloc file of matches, with the names `IMAGE/IMAGE` of all pairs; it opens no pair."""
+
+    def __init__(self, path: Path) -> None:
+        h5py = _h5py(path)
+        self.path, names = path, list[str]()
+        with reading(path), h5py.File(path, "r") as file:
+            for name in file.id:
+                _require_data(path, file.id, name, name)
+                if h5py.h5o.get_info(file.id, name).type == h5py.h5o.TYPE_GROUP:
+                    names += [b"/".join((name, child)).decode("utf-8", "surrogateescape")
+                              for child in h5py.h5g.open(file.id, name)]  # fmt: skip
+        self.images = tuple(names)
 
 
 def write_h5(path: Path, groups: Iterable[tuple[str, Mapping[str, np.ndarray]]]) -> None:

@@ -284,6 +284,18 @@ def test_hostile_hloc(tools, tmp_path, numbers, message):
         numbered_file(tools, tmp_path, numbers).read(0, [0])
 
 
+@pytest.mark.parametrize("place", ["q-1.jpg", "q-1.jpg/d-1.jpg", "q-1.jpg/d-1.jpg/keypoints1"])
+def test_links_to_other_files_are_not_followed(tmp_path, place):
+    write_hloc(tmp_path / "other.h5", ["q-1.jpg/d-1.jpg"], keypoints0=POINTS, keypoints1=POINTS)
+    path = write_hloc(tmp_path / "m.h5", ["q-0.jpg/d-1.jpg", "q-1.jpg/d-1.jpg"], keypoints0=POINTS, keypoints1=POINTS)
+    with h5py.File(path, "a") as file:
+        del file[place]
+        file[place] = h5py.ExternalLink("other.h5", place)
+    size = lambda row: SIZE  # noqa: E731
+    with one_line_error("link"):
+        open_matches(path, Images(["q/1.jpg"], (), size), Images(["d/1.jpg"], (), size)).read(0, [0])
+
+
 def test_hloc_without_its_features_or_in_an_old_layout(tools, tmp_path):
     with one_line_error("feats"):
         open_matches(tools / "hloc/matches.h5", side("queries/", QUERIES), side("database/", DATABASE))

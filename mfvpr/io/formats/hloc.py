@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.io.containers import shorten
+from mfvpr.io.containers import Shapes, shorten
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader
-from mfvpr.io.h5 import H5File
+from mfvpr.io.h5 import H5Pairs
 from mfvpr.utils.errors import InputError
 
 _NUMBERS = ("matches0", "matching_scores0")  # of a matcher of features
@@ -18,12 +18,11 @@ class HlocPairs(PairReader):
     """Reader of an hloc file of matches; names have `/` for each `-`."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self._file = path, H5File(path)
-        [arrays] = self._file.shapes([self._file.images[0]], ())
-        for group in self._file.images:
-            if group.count("/") != 1 or not {"matches0", "keypoints0"} & {*arrays}:
-                raise InputError(f"{path}: {shorten(group)}: expected groups IMAGE/IMAGE of matches, as hloc writes "
-                                 "them since 2021; give matches*.h5, not feats*.h5, or match again")  # fmt: skip
+        self.path, self._file = path, H5Pairs(path)
+        arrays = _arrays_of_first(self._file)
+        if not {"matches0", "keypoints0"} & {*arrays}:
+            raise InputError(f"{path}: expected groups IMAGE/IMAGE of matches, as hloc writes them since 2021, got "
+                             "others; give matches*.h5, not feats*.h5, or match again")  # fmt: skip
         self._groups = {tuple(map(self.written, group.split("/"))): group for group in self._file.images}
         if len(self._groups) < len(self._file.images):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
@@ -48,6 +47,14 @@ class HlocPairs(PairReader):
 
     def written(self, name: str) -> str:
         return name.replace("-", "/")
+
+
+def _arrays_of_first(file: H5Pairs) -> Shapes:
+    """Arrays of the first pair; none if it is no group."""
+    try:
+        return next(file.shapes(file.images[:1], ()), {})
+    except InputError:
+        return {}
 
 
 def _numbered(where: str, numbers: np.ndarray, scores: np.ndarray | None) -> FileMatches:
