@@ -14,7 +14,7 @@ COMMANDS = {
     "localize": "localize images in a map",
     "weights": "list, download, add and verify weights of networks",
     "data": "list data sets, and check what a folder holds",
-    "export": "write predictions as files of other programs: candidates, trajectories, shifts with times",
+    "convert": "write predictions as files of other programs: candidates, trajectories, shifts with times",
     "report": "write the page of a run folder (evaluation, sweep, learning, multirun), or of evaluations compared",
 }
 _COMPARISON = "comparison.html"
@@ -108,7 +108,7 @@ def _add_report_arguments(parser: Parser) -> None:
     parser.set_defaults(run="mfvpr.cli.programs:write_page")
 
 
-def _add_export_arguments(parser: Parser) -> None:
+def _add_convert_arguments(parser: Parser) -> None:
     layouts = ("preds", "hloc", "kapture", "tum", "kitti", "shifts")
     about = {
         "--poses": "for tum and kitti: poses of the database images in this layout, a line for each",
@@ -124,7 +124,7 @@ def _add_export_arguments(parser: Parser) -> None:
                         "ROS's times")  # fmt: skip
     for name, text in about.items():
         parser.add_argument(name, metavar="DIR" if name == "--database" else "FILE", type=Path, help=text)
-    parser.set_defaults(run="mfvpr.cli.exports:export")
+    parser.set_defaults(run="mfvpr.cli.prediction_files:convert")
 
 
 _ARGUMENTS = {  # of programs that have commands or arguments instead of settings
@@ -133,8 +133,8 @@ _ARGUMENTS = {  # of programs that have commands or arguments instead of setting
     "weights": ("Weights live in MFVPR_WEIGHTS, by default ~/.cache/mfvpr/weights. None come with the package; each "
                 "has its own license.", _add_weights_commands),
     "data": ("Nothing is downloaded: each data set has its place and its license.", _add_data_commands),
-    "export": ("Queries without a place are left out of candidates and of TUM, have an empty place in "
-               "the table of shifts, and are an error for KITTI.", _add_export_arguments),
+    "convert": ("Queries without a place are left out of candidates and of TUM, have an empty place in "
+               "the table of shifts, and are an error for KITTI.", _add_convert_arguments),
     "report": ("One HTML file that needs no other and no network: of one run folder of mfvpr evaluate, sweep or learn, "
                "of a multirun (runs/multirun/TIME), or of several evaluations beside each other.",
                _add_report_arguments),

@@ -15,7 +15,7 @@ from mfvpr.datasets.datasets import Dataset
 from mfvpr.evaluation.evaluation import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.exports import CandidateLayout, write_candidates
+from mfvpr.report.prediction_files import CandidateLayout, write_candidates
 from mfvpr.report.runs import claim_run_folder, file_names, write_table
 from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache

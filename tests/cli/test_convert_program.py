@@ -1,4 +1,4 @@
-"""mfvpr export: files of other programs from an evaluation and from localized images."""
+"""mfvpr convert: files of other programs from an evaluation and from localized images."""
 
 import json
 import shutil
@@ -21,20 +21,20 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def settings(root, tmp_path_factory):
-    run = tmp_path_factory.mktemp("export") / "run"
+    run = tmp_path_factory.mktemp("convert") / "run"
     settings = composed(*small(root), "scorer=histogram", "figures=0", f"out={run}")
     evaluation.evaluate(settings)
     return settings
 
 
 @pytest.fixture
-def export(monkeypatch, capsys, tmp_path):
+def convert(monkeypatch, capsys, tmp_path):
     """Exports to `tmp_path / out`: the path, what is printed, and errors."""
 
     def call(source, layout, *more, out="out", code=0):
         path = tmp_path / out
         stdout, stderr = output_of(
-            monkeypatch, capsys, "export", str(source), str(path), "--layout", layout, *map(str, more), code=code
+            monkeypatch, capsys, "convert", str(source), str(path), "--layout", layout, *map(str, more), code=code
         )
         return path, stdout, stderr
 
@@ -46,9 +46,9 @@ def first_candidates(run):
 
 
 @pytest.mark.parametrize("layout", ["preds", "hloc", "kapture"])
-def test_candidates_of_a_run(export, settings, layout):
+def test_candidates_of_a_run(convert, settings, layout):
     dataset = dataset_of(settings["dataset"])
-    path, stdout, _ = export(settings["out"], layout)
+    path, stdout, _ = convert(settings["out"], layout)
     assert stdout == f"{path}: candidates of {len(dataset.queries)} queries\n"
     shortlist = read_shortlist(path, dataset.queries.names, dataset.database.names)
     first = {query: dataset.database.names[row]
@@ -56,9 +56,9 @@ def test_candidates_of_a_run(export, settings, layout):
     assert first == first_candidates(settings["out"])
 
 
-def test_preds_have_full_paths_and_all_correct_images(export, settings):
+def test_preds_have_full_paths_and_all_correct_images(convert, settings):
     dataset = dataset_of(settings["dataset"])
-    path, *_ = export(settings["out"], "preds")
+    path, *_ = convert(settings["out"], "preds")
     lines = (path / "004.txt").read_text().splitlines()
     correct = dataset.truth.positives(1).of(4)  # the middle tolerance of this run
     assert lines[1] == str(dataset.queries.paths[4])
@@ -73,21 +73,21 @@ def poses_of(dataset, path, num_numbers):
     return dict(zip(dataset.database.names, numbers, strict=True))
 
 
-def test_trajectories_and_shifts_of_a_run(export, settings, tmp_path):
+def test_trajectories_and_shifts_of_a_run(convert, settings, tmp_path):
     dataset = dataset_of(settings["dataset"])
     first = first_candidates(settings["out"])
     poses = poses_of(dataset, tmp_path / "kitti.txt", 12)
-    path, stdout, _ = export(settings["out"], "kitti", "--poses", tmp_path / "kitti.txt")
+    path, stdout, _ = convert(settings["out"], "kitti", "--poses", tmp_path / "kitti.txt")
     expected = [poses[first[query]] for query in dataset.queries.names]
     assert path.read_text().splitlines() == expected
     assert stdout == f"{path}: {len(expected)} images with a place, 0 without\n"
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     (tmp_path / "times.txt").write_text("".join(f"{row}.000000001\n" for row in range(len(expected))))
     times = ("--times", tmp_path / "times.txt")
-    path, *_ = export(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times)
+    path, *_ = convert(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times)
     expected = [f"{row}.000000001 {poses[first[query]]}" for row, query in enumerate(dataset.queries.names)]
     assert path.read_text().splitlines() == expected
-    path, *_ = export(settings["out"], "shifts", *times)
+    path, *_ = convert(settings["out"], "shifts", *times)
     rows = {row["image"]: row for row in csv_rows(path)}
     assert {name: row["place"] for name, row in rows.items()} == first
     for row in csv_rows(Path(settings["out"]) / "shifts.csv"):
@@ -95,7 +95,7 @@ def test_trajectories_and_shifts_of_a_run(export, settings, tmp_path):
         assert rows[row["query"]]["image_width"] == "160"
 
 
-def test_lines_of_localize(export, tmp_path, settings):
+def test_lines_of_localize(convert, tmp_path, settings):
     dataset = dataset_of(settings["dataset"])
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     line = {"image": "/drive/1403636579763555584.png", "place": "a", "confidence": None, "shift": None, "reason": None,
@@ -103,10 +103,10 @@ def test_lines_of_localize(export, tmp_path, settings):
             "alternatives": [{"name": dataset.database.names[3], "score": 2.0}]}  # fmt: skip
     (tmp_path / "lines").write_text(json.dumps(line) + "\n" + json.dumps({"image": "/drive/1.5.png", "error": "bad"}))
     files = ("--poses", tmp_path / "tum.txt", "--database", dataset.database.root)
-    path, stdout, _ = export(tmp_path / "lines", "tum", *files)
+    path, stdout, _ = convert(tmp_path / "lines", "tum", *files)
     assert path.read_text() == f"1403636579.763555584 {poses[dataset.database.names[3]]}\n"
     assert stdout == f"{path}: 1 images with a place, 1 without\n"
-    path, *_ = export(tmp_path / "lines", "shifts")
+    path, *_ = convert(tmp_path / "lines", "shifts")
     assert [row["header.stamp.nanosec"] for row in csv_rows(path)] == ["500000000", "763555584"]
 
 
@@ -121,14 +121,14 @@ def test_lines_of_localize(export, tmp_path, settings):
         ("csv", [], "argument --layout: invalid choice: 'csv'"),
     ],
 )
-def test_wrong_arguments_are_one_line(export, settings, tmp_path, layout, more, words):
-    path, _, stderr = export(settings["out"], layout, *more, code=2)
+def test_wrong_arguments_are_one_line(convert, settings, tmp_path, layout, more, words):
+    path, _, stderr = convert(settings["out"], layout, *more, code=2)
     assert words in stderr
     assert stderr.count("\n") == 1
     assert not path.exists()
 
 
-def test_other_sources_are_one_line(export, settings, tmp_path):
+def test_other_sources_are_one_line(convert, settings, tmp_path):
     for source, words in ((tmp_path, "run.json: expected a file, got nothing"),
                           (tmp_path / "none", "none: expected the run folder of mfvpr evaluate for --layout hloc"),
                           (tmp_path / "copy", "expected a run of mfvpr evaluate, got one of Python")):  # fmt: skip
@@ -137,6 +137,6 @@ def test_other_sources_are_one_line(export, settings, tmp_path):
             about = json.loads((source / "run.json").read_text())
             del about["settings"]["recall"]
             (source / "run.json").write_text(json.dumps(about))
-        _, _, stderr = export(source, "hloc", code=2)
+        _, _, stderr = convert(source, "hloc", code=2)
         assert words in stderr
         assert stderr.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Export: predictions of a run folder, or of lines of `mfvpr localize`, as files of other programs."""
+"""Convert the predictions of a run folder, or of lines of `mfvpr localize`, to files of other programs."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -10,9 +10,9 @@ from mfvpr.datasets import Dataset, QuerySequence, image_folder
 from mfvpr.datasets.truth import middle
 from mfvpr.io import read_stamps, stamps_in_names
 from mfvpr.io.containers import reading
-from mfvpr.report import exports
+from mfvpr.report import prediction_files
 from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.exports import LocalizedImage
+from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils.files import printable
@@ -20,7 +20,9 @@ from mfvpr.utils.files import printable
 _CANDIDATES = ("preds", "hloc", "kapture")
 
 
-def export(source: Path, out: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None) -> None:
+def convert(
+    source: Path, out: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None
+) -> None:
     """Write the predictions of an evaluation, or of localized images, and print the paths."""
     _check(source, layout, poses, times, database)
     if source.is_dir():
@@ -32,7 +34,7 @@ def export(source: Path, out: Path, layout: str, poses: Path | None, times: Path
                 _write_localized(target, layout, images, poses, dataset.database.names, times)
     else:
         names = image_folder(database).names if database else ()
-        _write_localized(out, layout, exports.read_lines(source), poses, names, times)
+        _write_localized(out, layout, prediction_files.read_lines(source), poses, names, times)
 
 
 def _check(source: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None) -> None:
@@ -69,16 +71,16 @@ def _sequences(folder: Path, out: Path, dataset: Dataset) -> Iterator[tuple[Path
     for place, sequence in enumerate(dataset.sequences):
         target = out / file_names(names)[sequence.name] if len(names) > 1 else out
         queries = sequence_folder(folder, names, place)
-        yield target, sequence, exports.read_run_images(queries, sequence.images.names)
+        yield target, sequence, prediction_files.read_run_images(queries, sequence.images.names)
 
 
 def _write_candidates(
     path: Path, layout: Any, images: Sequence[LocalizedImage], sequence: QuerySequence, dataset: Dataset,
     thresholds: Sequence[float],
 ) -> None:  # fmt: skip
-    shortlist = exports.shortlist_of(images, dataset.database.names)
+    shortlist = prediction_files.shortlist_of(images, dataset.database.names)
     positives = sequence.truth.positives(middle(thresholds)) if sequence.truth and thresholds else None
-    exports.write_candidates(path, shortlist, sequence.images, dataset.database, layout, positives)
+    prediction_files.write_candidates(path, shortlist, sequence.images, dataset.database, layout, positives)
     print(printable(f"{path}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
 
 
@@ -89,8 +91,8 @@ def _write_localized(
     names = [image.name for image in images]
     stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
     if layout == "shifts":
-        exports.write_shift_table(path, images, stamps)
+        prediction_files.write_shift_table(path, images, stamps)
     elif poses is not None:
-        exports.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
+        prediction_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
     num_places = sum(image.place is not None for image in images)
     print(printable(f"{path}: {num_places} images with a place, {len(images) - num_places} without"))

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from mfvpr.report.exports import (
+from mfvpr.report.prediction_files import (
     SHIFT_COLUMNS,
     read_lines,
     read_run_images,
