@@ -55,6 +55,9 @@ int run_example(int argc, char** argv, Run run) {
     return 2;
   }
   try {
+    if (!std::ifstream(std::string(argv[1]) + "/program.onnx"))
+      throw std::runtime_error(std::string(argv[1]) + ": expected program.onnx, got none; pip install 'mfvpr[export]', "
+                                                      "and export again");
     const float tolerance = argc > 2 ? std::strtof(argv[2], nullptr) : 1e-4f;
     const float largest = run(std::string(argv[1]));
     std::cout << "largest difference: " << largest << " (tolerance " << tolerance << ")\n";

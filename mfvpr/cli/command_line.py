@@ -64,7 +64,7 @@ def run(config: str) -> None:
                 "multirun": hydra_settings.sweep.dir, "number": hydra_settings.job.num,
                 "overrides": dict(override.split("=", 1) for override in hydra_settings.overrides.task),
             }  # fmt: skip
-            words, cluster = in_settings(settings.get("retrieval", {})), build.cluster(settings.get("cluster"))
+            words, cluster = in_settings(settings), build.cluster(settings.get("cluster"))
             with interruptible, words, _frozen_imports(), cluster as started:
                 job(settings | {"multirun": multirun_job, "command": command, "cluster": started})
 

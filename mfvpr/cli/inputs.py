@@ -73,13 +73,14 @@ def prepare(settings: Mapping[str, Any], watch: Stopwatch) -> Inputs:
     runtime = build.runtime(settings["devices"], settings["memory"], settings.get("cluster"))
     wait = bool(settings.get("multirun"))
     cache = build.cache(settings["cache"], runtime, on_bad_image=settings["on_bad_image"], wait=wait)
-    names = {settings[group]["name"] for group in ("features", "retrieval")}
+    names = {settings[group]["name"] for group in ("features", "retrieval", "matching")}
     pipeline = None if names & {"import", "pairs"} else assembly.pipeline(settings, None)
     with watch("data"):
         dataset, contents = _data(settings["dataset"], cache)
         ground_truth = truth.describe(settings["dataset"], settings["recall"], dataset)
         notes.tell_peculiarities(dataset, contents, ground_truth.get("thresholds", []))
-        notes.note_candidates(settings["candidates"], settings["recall"]["ks"], dataset.database)
+        if settings["retrieval"]["name"] != "pairs":  # whose numbers of candidates are not known yet
+            notes.note_candidates(settings["candidates"], settings["recall"]["ks"], dataset.database)
         groups = {group: settings[group] for group in ("features", "matching")}
         notes.warn_of_matching(groups, assembly.weights(settings), dataset.name, contents)
     return Inputs(dataset, contents, pipeline or assembly.pipeline(settings, dataset), cache, ground_truth)

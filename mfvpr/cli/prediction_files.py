@@ -1,6 +1,7 @@
 """Convert the predictions of a run folder, or of lines of `mfvpr localize`, to files of other programs."""
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,21 +16,25 @@ from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 
 _CANDIDATES = ("preds", "hloc", "kapture")
 
 
 def convert(
-    source: Path, out: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None
-) -> None:
+    source: Path, out: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None,
+    query_prefix: str, database_prefix: str,
+) -> None:  # fmt: skip
     """Write the predictions of an evaluation, or of localized images, and print the paths."""
     _check(source, layout, poses, times, database)
+    if (prefixes := (query_prefix, database_prefix)) != ("", "") and layout not in ("hloc", "kapture"):
+        raise SettingsError(f"--query-prefix, --database-prefix: expected none for --layout {layout}; remove them")
     if source.is_dir():
         dataset, thresholds = _dataset_of_run(source)
         for target, sequence, images in _sequences(source, out, dataset):
             if layout in _CANDIDATES:
-                _write_candidates(target, layout, images, sequence, dataset, thresholds)
+                _write_candidates(target, layout, images, sequence, dataset, thresholds, prefixes)
             else:
                 _write_localized(target, layout, images, poses, dataset.database.names, times)
     else:
@@ -46,9 +51,9 @@ def _check(source: Path, layout: str, poses: Path | None, times: Path | None, da
         ("poses", poses, is_trajectory), ("database", database, is_trajectory and not is_run)
     ):  # fmt: skip
         if is_needed != (value is not None):
-            got = "it" if value else "none"
+            remedy = f"add --{name} PATH" if is_needed else f"remove --{name}"
             raise SettingsError(f"--{name}: expected {'a path' if is_needed else 'none'} for --layout {layout} of "
-                                f"{source}, got {got}")  # fmt: skip
+                                f"{source}, got {value}; {remedy}")  # fmt: skip
     if times and layout not in ("tum", "shifts"):
         raise SettingsError(f"--times: expected none for --layout {layout}, which has no times, got {times}")
 
@@ -76,11 +81,12 @@ def _sequences(folder: Path, out: Path, dataset: Dataset) -> Iterator[tuple[Path
 
 def _write_candidates(
     path: Path, layout: Any, images: Sequence[LocalizedImage], sequence: QuerySequence, dataset: Dataset,
-    thresholds: Sequence[float],
+    thresholds: Sequence[float], prefixes: tuple[str, str],
 ) -> None:  # fmt: skip
     shortlist = prediction_files.shortlist_of(images, dataset.database.names)
     positives = sequence.truth.positives(middle(thresholds)) if sequence.truth and thresholds else None
-    prediction_files.write_candidates(path, shortlist, sequence.images, dataset.database, layout, positives)
+    sides = sequence.images, dataset.database
+    prediction_files.write_candidates(path, shortlist, *sides, layout, positives, prefixes=prefixes)
     print(printable(f"{path}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
 
 
@@ -89,7 +95,10 @@ def _write_localized(
     times: Path | None,
 ) -> None:  # fmt: skip
     names = [image.name for image in images]
-    stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
+    try:
+        stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
+    except InputError as error:
+        raise SettingsError(re.sub("give a file of times$", "add --times FILE", str(error))) from error
     if layout == "shifts":
         prediction_files.write_shift_table(path, images, stamps)
     elif poses is not None:

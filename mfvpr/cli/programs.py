@@ -114,6 +114,8 @@ def _add_convert_arguments(parser: Parser) -> None:
         "--poses": "for tum and kitti: poses of the database images in this layout, a line for each",
         "--times": "for tum and shifts: times of the queries, a line for each; by default the names of their files",
         "--database": "for tum and kitti of mfvpr localize: the folder of the map's images",
+        "--query-prefix": "for hloc and kapture: what stands before the names of the queries, such as queries/",
+        "--database-prefix": "for hloc and kapture: what stands before the names of the database images",
     }
     parser.add_argument("source", metavar="SOURCE", type=Path, help="run folder of mfvpr evaluate, or file of the "
                         "lines that mfvpr localize prints")  # fmt: skip
@@ -123,7 +125,9 @@ def _add_convert_arguments(parser: Parser) -> None:
                         "VPR-methods-evaluation, hloc or kapture; trajectory of TUM or KITTI; table of shifts with "
                         "ROS's times")  # fmt: skip
     for name, text in about.items():
-        parser.add_argument(name, metavar="DIR" if name == "--database" else "FILE", type=Path, help=text)
+        is_prefix = name.endswith("prefix")
+        kind = {"type": str, "default": "", "metavar": "TEXT"} if is_prefix else {"type": Path, "metavar": "PATH"}
+        parser.add_argument(name, help=text, **kind)
     parser.set_defaults(run="mfvpr.cli.prediction_files:convert")
 
 

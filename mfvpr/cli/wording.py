@@ -7,7 +7,7 @@ from typing import Any
 
 from mfvpr.systems.settings import SettingsError
 
-# Pattern in a message of the library -> words of the settings. GROUP stands for `features` or `retrieval`.
+# Pattern in a message of the library -> words of the settings. GROUP stands for `features`, `retrieval` or `matching`.
 _WORDS = {
     r"or skip bad images$": "or set on_bad_image=skip",
     r"^(ground_truth|exclude_neighbors|queries)(=|:)": r"dataset.\1\2",
@@ -19,7 +19,14 @@ _WORDS = {
     r"give one of this folder as well$": "choose another retrieval, or no cohort",  # not for one of several folders
     r"or lower num_words$": "or lower retrieval.num_words",
     r"extract these, or match nearest neighbors$": "set features=aliked, or matching=neighbors",
-    r"give it as image_size=$": "give it as features.image_size=[W,H]",
+    r"give it as image_size=$": "give it as GROUP.image_size=[W,H]",
+    r"set image_size=\[W,H\]$": "set matching.image_size=[W,H]",
+    r"confidences=False": "matching.confidences=false",
+    r"verified=True": "matching.verified=true",
+    r"give hloc's feats\*.h5$": "set matching.features=FILE, hloc's feats*.h5",
+    r"the prefix(?:es)? of (both folders|their folder)": "matching.database_prefix and "
+    r"matching.query_prefix, the prefixes of \1",
+    r"match them with_ratio=True$": "set another weight, such as scorer.weight=unit, for matching=import",
     r"lengths='(normalize|keep)'": r"GROUP.lengths=\1",
     r"^weights: expected": "fusion.weights: expected",
     r"score by it as well$": "choose scorer=all, or another group of scores that has it",
@@ -27,14 +34,14 @@ _WORDS = {
 
 
 @contextmanager
-def in_settings(retrieval: Mapping[str, Any]) -> Iterator[None]:
-    """Raise errors of the library again, in words of the settings; those of the retrieval may name its files."""
+def in_settings(settings: Mapping[str, Any]) -> Iterator[None]:
+    """Raise errors of the library again, in words of the settings, which may name files of other programs."""
     from mfvpr.utils import InputError
 
     try:
         yield
     except InputError as error:
-        text, group = str(error), _group(str(error), retrieval)
+        text, group = str(error), _group(str(error), settings)
         for pattern, words in _WORDS.items():
             text = re.sub(pattern, words.replace("GROUP", group), text)
         if text == str(error):
@@ -42,10 +49,15 @@ def in_settings(retrieval: Mapping[str, Any]) -> Iterator[None]:
         raise SettingsError(text) from error
 
 
-def _group(text: str, retrieval: Mapping[str, Any]) -> str:
+def _group(text: str, settings: Mapping[str, Any]) -> str:
     """The group of settings with the file that a message begins with."""
     from mfvpr.cli.build import expand_user
 
-    queries = retrieval.get("queries", [])
-    files = [retrieval.get("database"), *(queries if isinstance(queries, list) else [queries])]
-    return "retrieval" if any(file and text.startswith(f"{expand_user(file)}:") for file in files) else "features"
+    for group in ("retrieval", "matching"):
+        values = settings.get(group, {})
+        for name in ("database", "queries", "matches", "features", "query_features"):
+            files = values.get(name) or []
+            for file in files if isinstance(files, list) else [files]:
+                if text.startswith(f"{expand_user(file)}:"):
+                    return group
+    return "features"

@@ -13,7 +13,7 @@ from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.system import Pipeline
-from mfvpr.evaluation.validation import image_warnings, validate_candidates
+from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
 from mfvpr.features.extractor import Scale
 from mfvpr.matching.host import PairSource, Side
 from mfvpr.matching.match_set import MatchSet
@@ -82,6 +82,9 @@ def match_sequence(
             retrieved = _find_candidates(work)
             matches, remarks = _match(work, retrieved, stores)
             matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
+    if image_source(work.pipeline) is not None:
+        for line in empty_pairs_warning(sequence.name, matched):
+            cache.warn(line)
     missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
     if missing:
         images = sequence.images

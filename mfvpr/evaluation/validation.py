@@ -54,6 +54,14 @@ def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, 
                "scores are 0")  # fmt: skip
 
 
+def empty_pairs_warning(name: str, matched: Matched) -> Iterator[str]:
+    """Warning if half of the pairs or more have no matches."""
+    real = matched.candidates.mask
+    empty = int((real & (matched.matches[0].counts == 0)).sum())
+    if empty and 2 * empty >= real.sum():
+        yield f"{name}: {empty} of {real.sum()} pairs have no matches; they score 0"
+
+
 def require_finite(name: str, scores: np.ndarray) -> None:
     """Raise an InputError if every score of a scorer is NaN, infinite, or 0, the score of pairs without matches."""
     if not np.isfinite(scores).all() and not scores[np.isfinite(scores)].any():

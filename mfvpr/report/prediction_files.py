@@ -47,11 +47,16 @@ class LocalizedImage:
 
 def write_candidates(
     path: Path | str, shortlist: Shortlist, queries: ImageFolder, database: ImageFolder, layout: CandidateLayout,
-    positives: Positives | None = None,
+    positives: Positives | None = None, *, prefixes: tuple[str, str] = ("", ""),
 ) -> None:  # fmt: skip
-    """Write candidates as `mfvpr.io.write_shortlist`; `preds` has full paths, and the correct images if known."""
-    names = [[os.path.abspath(path) for path in side.paths] if layout == "preds" else side.names
-             for side in (queries, database)]  # fmt: skip
+    """Write candidates as `mfvpr.io.write_shortlist`; `preds` has full paths, and the correct images if known.
+
+    Other layouts have `prefixes` before the names of queries and database images.
+    """
+    sides = (queries, prefixes[0]), (database, prefixes[1])
+    names = [[prefix + name for name in side.names] for side, prefix in sides]
+    if layout == "preds":
+        names = [[os.path.abspath(path) for path in side.paths] for side, _ in sides]
     correct = None if positives is None else [positives.of(row).tolist() for row in range(len(queries))]
     write_shortlist(path, shortlist, *names, layout=layout, positives=correct)
 

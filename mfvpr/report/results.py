@@ -66,7 +66,9 @@ def evaluate(
         InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
             or a scorer; one line says which, and how to fix it.
     """
-    cache = cache or FeatureCache()
+    cache = FeatureCache() if cache is None else cache
+    if not isinstance(cache, FeatureCache):
+        raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
     datasets = data if isinstance(data, Mapping) else {data.name: data}
     systems = system if isinstance(system, Mapping) else {system.headline: system}
     pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]

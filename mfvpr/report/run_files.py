@@ -87,7 +87,7 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
 def matched_content(stages: Mapping[str, Mapping[str, Any]]) -> str:
     """Words for the content that the matches come from: features, images, or files."""
     matching = stages["matching"]
-    if matching["name"] in ("import", "MatchFiles"):
+    if matching.get("name") in ("import", "MatchFiles"):
         return "imported matches"
     is_of_images = matching.get("inputs") == "images"
     return f"matches of {matching['name']}" if is_of_images else f"{stages['features']['name']} features"

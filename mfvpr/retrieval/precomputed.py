@@ -1,6 +1,6 @@
 """Files of other programs in place of extractors and retrievals; the cache knows them by content, not by path."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -13,6 +13,7 @@ from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.images import Interpolation, read_size
 from mfvpr.features.extractor import Scale
 from mfvpr.io.checks import Lengths
+from mfvpr.io.containers import FileEntry
 from mfvpr.io.descriptors import read_with_entries as read_descriptors
 from mfvpr.io.features import ImportedFeatures, open_features
 from mfvpr.io.matches import Images, ImportedMatches, open_matches
@@ -110,6 +111,7 @@ class ShortlistFiles:
         names = [self.database_prefix + name for name in database.names]
         shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
         images: ImageOfEntry = {}
+        _require_own_folder(file.path, database, sequence.images, database_entries)
         require_one_image(file.path, database.paths, database_entries, images)
         require_one_image(file.path, sequence.images.paths, query_entries, images)
         if sequence.excluded is not None:
@@ -173,6 +175,18 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
         raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}; give one of "
                          "this folder as well")  # fmt: skip
     return files[folder.root]
+
+
+def _require_own_folder(
+    path: Path, folder: ImageFolder, other: ImageFolder, entries: Sequence[FileEntry | None]
+) -> None:
+    """Raise an InputError if names of a file begin with the other folder's name, but not with that of their own."""
+    own_parts, other_parts = (f"/{each.root.absolute().as_posix().strip('/')}/" for each in (folder, other))
+    for name, entry in zip(folder.names, entries, strict=True):
+        start = "/" + entry.name.removesuffix(name).lstrip("/") if entry is not None else "/"
+        if start != "/" and other_parts.endswith(start) and not own_parts.endswith(start):
+            raise InputError(f"{path}: expected names of images in {folder.root}, got names in {other.root}; exchange "
+                             "dataset.database and dataset.queries, or the columns of the file")  # fmt: skip
 
 
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:

@@ -296,7 +296,7 @@ def _limit_rule(*, length: int = 0, optional: bool = False, file: str = "", **li
 def _check_cells(settings: Mapping[str, Any]) -> None:
     """Check that features are the cells of a square grid, as scorer=grid expects."""
     features, side = settings["features"], settings["scorer"]["side"]
-    if features["name"] not in ("ssm", "import"):
+    if features["name"] not in ("ssm", "import") and settings["matching"]["name"] != "import":
         raise SettingsError(f"scorer=grid: expected features=ssm, whose features are cells, got {features['name']}")
     matching = settings["matching"]
     if (check := matching.get("cross_check", matching["name"])) != "candidate":

@@ -29,7 +29,7 @@ def settings(root, tmp_path_factory):
 
 @pytest.fixture
 def convert(monkeypatch, capsys, tmp_path):
-    """Exports to `tmp_path / out`: the path, what is printed, and errors."""
+    """Writes to `tmp_path / out`: the path, what is printed, and errors."""
 
     def call(source, layout, *more, out="out", code=0):
         path = tmp_path / out
@@ -54,6 +54,17 @@ def test_candidates_of_a_run(convert, settings, layout):
     first = {query: dataset.database.names[row]
              for query, row in zip(dataset.queries.names, shortlist.indices[:, 0], strict=True)}  # fmt: skip
     assert first == first_candidates(settings["out"])
+
+
+def test_prefixes_stand_before_names(convert, settings):
+    dataset = dataset_of(settings["dataset"])
+    prefixes = "--query-prefix", "queries/", "--database-prefix", "database/"
+    path, *_ = convert(settings["out"], "hloc", *prefixes)
+    query, database = path.read_text().splitlines()[0].split(" ")
+    assert query == f"queries/{dataset.queries.names[0]}"
+    assert database.removeprefix("database/") in dataset.database.names
+    _, _, stderr = convert(settings["out"], "preds", *prefixes, out="preds", code=2)
+    assert "--query-prefix, --database-prefix: expected none for --layout preds" in stderr
 
 
 def test_preds_have_full_paths_and_all_correct_images(convert, settings):

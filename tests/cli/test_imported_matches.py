@@ -51,6 +51,24 @@ def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_p
     assert "imported matches" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+    typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=count", "figures=0", "retrieval=vlad",
+                          "retrieval.num_words=4", "cache=null", f"out={tmp_path}/out")  # fmt: skip
+    typed_here = [setting for setting in typed_here if not setting.startswith(("retrieval=pairs", "retrieval.queries"))]
+    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
+    assert code == 0, stderr
+    assert "2 candidates (vlad), imported matches;" in stdout
+
+
+def test_swapped_folders_are_noticed(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+    typed_here = [*settings(street, f"matching.matches={tools}/kapture", f"out={tmp_path}/out"),
+                  f"dataset.database={street}/queries", f"dataset.queries={street}/database"]  # fmt: skip
+    typed_here = [setting for place, setting in enumerate(typed_here) if place not in (1, 2)]
+    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
+    assert code == 2
+    assert "exchange dataset.database and dataset.queries" in stderr.splitlines()[-1]
+
+
 def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
     typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=histogram", "grid.sigma=[10,20]",
                           f"cache={tmp_path}/cache", f"out={tmp_path}/out")  # fmt: skip
@@ -64,11 +82,13 @@ def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsy
     [
         (["matching.matches=missing.h5"], "missing.h5: "),
         ([], "matching.matches"),
-        (["matching.matches={tools}/hloc/matches.h5"], "give hloc's feats"),
+        (["matching.matches={tools}/hloc/matches.h5"], "set matching.features=FILE"),
         (["matching.matches={tools}/hloc/matches.h5", "matching.features={tools}/colmap.db"], "colmap.db: expected"),
-        (["matching.matches={tools}/kapture", "matching.verified=true"], "verified"),
         (["matching.matches={tools}/kapture", "matching.image_size=[64,64]"], "image of 64"),
-        (["matching.matches={tools}/kapture", "matching.query_prefix=other/"], "of their names"),
+        (["matching.matches={tools}/kapture", "matching.query_prefix=other/"], "matching.query_prefix"),
+        (["matching.matches={tools}/kapture", "matching.verified=true"], "matching.verified=true"),
+        (["matching.matches={tools}/kapture", "scorer=histogram", "scorer.weight=ratio"], "scorer.weight=unit"),
+        (["matching.matches={tools}"], "expected files .npz or .torch"),
         (["matching.matches={tools}/kapture", "matching.max_distance=1"], "max_distance"),
     ],
 )

@@ -136,7 +136,10 @@ def test_a_cache_calls_the_function_once_and_goes_on_after_an_interruption(datas
 
 def test_pairs_without_matches_score_0(dataset):
     nowhere = mfvpr.HostMatcher(lambda first, second: (np.zeros((0, 2)), np.zeros((0, 2))), "nowhere")
-    result = mfvpr.evaluate(few(dataset, 1), mfvpr.System(pipeline(nowhere), SCORERS))
+    lines = []
+    runtime = Runtime(log=lines.append)
+    result = mfvpr.evaluate(few(dataset, 1), mfvpr.System(pipeline(nowhere), SCORERS), runtime=runtime)
+    assert any("4 of 4 pairs have no matches" in line for line in lines)
     assert (result.only.systems["count"][0].scores == 0).all()
 
 

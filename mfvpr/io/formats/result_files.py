@@ -47,6 +47,9 @@ class ResultFiles(PairReader):
         for file, pair in pairs.items():
             if pair is not None and self._files.setdefault(pair, file) != file:
                 raise InputError(f"{file}: expected another pair than in {self._files[pair].name}; remove either")
+        if not files:
+            raise InputError(f"{path}: expected files .npz or .torch of matches, got none; give the file matches*.h5, "
+                             "the database, or the folder of matches")  # fmt: skip
         if not self._files:
             raise InputError(f"{path}: expected a file .npz or .torch for each pair of images, got {len(files)} files "
                              "of other images; see mfvpr/io/README.md")  # fmt: skip
