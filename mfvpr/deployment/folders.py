@@ -93,8 +93,9 @@ def export(
             model, or its outputs differ; or the folder has files.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
+    is_other = folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))
+    if is_other or folder.is_symlink():
+        raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     with jax.enable_x64(False):
         program = stablehlo.without_unused_inputs(make_program(method, shapes, with_shift=with_shift))
         content = stablehlo.serialize(program)
@@ -241,8 +242,12 @@ def _digests(folder: Path) -> dict[str, str]:
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that takes the place of a new or empty `folder` when the block ends without an error."""
-    folder.absolute().parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.absolute().parent))
+    folder = folder.absolute()
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another path") from error
     try:
         (temporary / "check").mkdir()
         temporary.chmod(0o755)

@@ -75,8 +75,10 @@ class ExportShapes:
         for name in names:
             if not isinstance(number := getattr(self, name), int) or number < 1:
                 raise InputError(f"{name}={number!r}: expected a whole number from 1")
-        if np.shape(self.image_size) != (2,) or not (np.asarray(self.image_size) > 0).all():
+        size = np.asarray(self.image_size, np.float64)
+        if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
             raise InputError(f"image_size={self.image_size!r}: expected (width, height) above 0, px")
+        object.__setattr__(self, "image_size", tuple(size.tolist()))
 
 
 class Tensor(NamedTuple):

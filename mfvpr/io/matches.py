@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Num
 
 from mfvpr.io.checks import as_float32
-from mfvpr.io.containers import choose_reader, shorten
+from mfvpr.io.containers import FileEntry, choose_reader, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
 from mfvpr.io.formats.colmap import ColmapPairs
 from mfvpr.io.formats.hloc import HlocPairs
 from mfvpr.io.formats.kapture import KapturePairs
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
 from mfvpr.io.formats.result_files import ResultFiles
-from mfvpr.io.names import match_paths
+from mfvpr.io.names import ImageOfEntry, match_paths, require_one_image
 from mfvpr.io.plain_matches import numbered_matches, point_matches
 from mfvpr.types import Features, Matches, Shortlist
 from mfvpr.utils.errors import InputError
@@ -31,13 +31,15 @@ class Images(NamedTuple):
     """Images of one side.
 
     names: relative POSIX paths, as `ImageFolder.names`, matched as in `names.match_names`.
-    paths: full paths, which are tried before the names; () = none.
+    paths: full paths, by which an image that is on both sides is known; () = unknown.
+    has_prefix: whether names have a prefix as in the file; without one, paths are tried before the names.
     size: size of the image file of a row; None = unknown.
     features: of these images, for files of matches without keypoints.
     """
 
     names: Sequence[str]
     paths: Sequence[str] = ()
+    has_prefix: bool = False
     size: Callable[[int], Size] | None = None
     features: ImportedFeatures | None = None
 
@@ -56,7 +58,6 @@ class ImportedMatches:
     ) -> None:
         self.path, self._reader, self._sides = reader.path, reader, sides
         self._image_size, self._use_confidences = image_size, confidences
-        self._first: dict[bool, str] = {}  # with and without confidences, the first pair
         self.numbered = reader.by_number
         self.names = _names(reader, sides)
 
@@ -141,9 +142,8 @@ class ImportedMatches:
         """Confidences of the file; all pairs or none must have them."""
         if not self._use_confidences or not len(raw.first):
             return None
-        self._first.setdefault(raw.confidence is not None, where)
-        if len(self._first) == 2:
-            raise InputError(f"{self._first[False]}: expected confidences of all pairs or of none, got none; ignore "
+        if (raw.confidence is not None) != self._reader.has_confidences:
+            raise InputError(f"{where}: expected confidences of all pairs or of none, unlike the first pair; ignore "
                              "them with confidences=False")  # fmt: skip
         return raw.confidence
 
@@ -198,6 +198,12 @@ def open_matches(
     return ImportedMatches(reader, (queries, database), image_size, confidences)
 
 
+def content_paths(path: Path) -> list[Path]:
+    """Files and folders that decide the matches in `path`, without links."""
+    is_kapture = path.is_dir() and KapturePairs.fits(path)
+    return [each.resolve() for each in (KapturePairs.folders(path) if is_kapture else [path])]
+
+
 def _open(path: Path, queries: Images, database: Images, verified: bool) -> PairReader:
     if path.is_dir() and not KapturePairs.fits(path):
         return ResultFiles(path, (queries.names, database.names), verified)
@@ -213,18 +219,19 @@ def _open(path: Path, queries: Images, database: Images, verified: bool) -> Pair
 def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str | None], list[str | None]]:
     """Names in the file of the images of each side."""
     names = tuple(
-        match_paths(reader.path, [*map(reader.written, side.names)], [*map(reader.written, side.paths)], reader.images)
+        match_paths(
+            reader.path,
+            [*map(reader.written, side.names)],
+            [] if side.has_prefix else [*map(reader.written, side.paths)],
+            reader.images,
+        )
         for side in sides
     )
-    both = {*filter(None, names[0])} & {*filter(None, names[1])}
-    is_shared = both and not reader.sided and [*sides[0].paths] != [*sides[1].paths]
-    for name in sorted(both) if is_shared else ():
-        images = [side.paths[each.index(name)] if side.paths else side.names[each.index(name)]
-                  for side, each in zip(sides, names, strict=True)]  # fmt: skip
-        if images[0] != images[1]:
-            raise InputError(f"{reader.path}: expected one image for each name, got {shorten(name)} for the query "
-                             f"{shorten(images[0], 200)} and the database image {shorten(images[1], 200)}; give the "
-                             "prefixes of both folders, with which the file has them")  # fmt: skip
+    images: ImageOfEntry = {}
+    for side, each in zip(sides, names, strict=True):
+        entries = [None if name is None else FileEntry(reader.path, name) for name in each]
+        if not reader.sided and side.paths:
+            require_one_image(reader.path, [*map(Path, side.paths)], entries, images)
     for side, each in zip(("queries", "database images"), names, strict=True):
         if not any(each):
             raise InputError(f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, "

@@ -30,6 +30,10 @@ def numbered_matches(
                         ((first, features0), (second, features1)))  # fmt: skip
     if len(number0) != len(number1):
         raise InputError(f"{where}: expected pairs of keypoints, got {len(number0)} and {len(number1)} numbers")
+    dimensions = [np.shape(features.descriptors)[1] for features in (features0, features1)]
+    if dimensions[0] != dimensions[1]:
+        raise InputError(f"{where}: expected descriptors of one length, got {dimensions[0]} and {dimensions[1]}; give "
+                         "the features that were matched")  # fmt: skip
     differences = np.asarray(features0.descriptors)[number0] - np.asarray(features1.descriptors)[number1]
     return Matches(
         points0=features0.keypoints[number0],

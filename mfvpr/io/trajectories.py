@@ -69,6 +69,8 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
     path = Path(path)
     num_numbers = _KITTI if stamps is None else _TUM
     stamps = range(len(poses)) if stamps is None else stamps
+    if len(stamps) and min(stamps) < 0:
+        raise InputError(f"{path}: expected times from 0 ns, got {min(stamps)}")
     if len(stamps) != len(poses):
         raise InputError(f"{path}: expected times of {len(poses)} images, got {len(stamps)}")
     refused = [row for row, pose in enumerate(poses) if pose is None]

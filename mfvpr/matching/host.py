@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
+import jax
 import numpy as np
 from jaxtyping import Int, UInt8
 
@@ -98,27 +99,28 @@ class HostMatcher:
         require_word("inputs", self.inputs, Inputs)
         if not self.name:
             raise InputError("name='': expected the name of the program and its weights, by which a cache knows them")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise InputError(f"batch_size={self.batch_size}: expected a number from 1, or None")
-        if self.image_size is not None and self.inputs == "features":
-            raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
+        if self.batch_size is not None and not (type(self.batch_size) is int and self.batch_size >= 1):
+            raise InputError(f"batch_size={self.batch_size}: expected a whole number from 1, or None")
+        if self.image_size is not None:
+            if self.inputs == "features":
+                raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
+            if len(self.image_size) != 2 or not all(type(side) is int and side > 0 for side in self.image_size):
+                raise InputError(
+                    f"image_size={self.image_size}: expected whole numbers (width, height) above 0, or None"
+                )
 
     def open(self, queries: Side, database: Side) -> "_CalledPairs":
         """See `PairSource`."""
         return _CalledPairs(self, queries, database)
 
-    def call(self, first: Any, seconds: list[Any]) -> list[Any]:
-        """Results of the function for a query with candidates; an `InputError` if a batch gives another number."""
+    def call(self, firsts: list[Any], seconds: list[Any]) -> Sequence[Any]:
+        """Results of the function for a batch of pairs; an `InputError` if it gives another number."""
         if self.batch_size is None:
-            return [self.function(first, second) for second in seconds]
-        results = []
-        for start in range(0, len(seconds), self.batch_size):
-            batch = seconds[start : start + self.batch_size]
-            matches = self.function([first] * len(batch), batch)
-            if not isinstance(matches, Sequence) or len(matches) != len(batch):
-                got = len(matches) if isinstance(matches, Sequence) else type(matches).__name__
-                raise InputError(f"{self.name}: expected a list of the matches of {len(batch)} pairs, got {got}")
-            results += matches
+            return [self.function(*pair) for pair in zip(firsts, seconds, strict=True)]
+        results = self.function(firsts, seconds)
+        if not isinstance(results, Sequence) or len(results) != len(seconds):
+            got = len(results) if isinstance(results, Sequence) else type(results).__name__
+            raise InputError(f"{self.name}: expected a list of the matches of {len(seconds)} pairs, got {got}")
         return results
 
 
@@ -138,13 +140,18 @@ class _CalledPairs:
         return []
 
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
-        first = self._input(self.queries, query)
-        if first is None:
-            return [None] * len(candidates)
-        seconds = {row: each for row in candidates if (each := self._input(self.database, row)) is not None}
-        results = dict(zip(seconds, self.matcher.call(first, list(seconds.values())), strict=True))
-        return [self._convert(query, row, results[row], first, seconds[row]) if row in seconds else None
-                for row in candidates]  # fmt: skip
+        first, size = self._input(self.queries, query), self.matcher.batch_size or 1
+        matches: dict[int, Matches | None] = dict.fromkeys(candidates)
+        for start in range(0, len(candidates) if first is not None else 0, size):
+            inputs = {row: self._input(self.database, row) for row in candidates[start : start + size]}
+            inputs = {row: second for row, second in inputs.items() if second is not None}
+            # Copies, as the function may change its arguments.
+            results = (
+                self.matcher.call([_copy(first) for _ in inputs], [*map(_copy, inputs.values())]) if inputs else ()
+            )
+            for (row, second), result in zip(inputs.items(), results, strict=True):
+                matches[row] = self._convert(query, row, result, first, second)
+        return [matches[row] for row in candidates]
 
     def _input(self, side: Any, row: int) -> UInt8[np.ndarray, "height width 3"] | Features | None:
         """The image or the features of a row; None = an image without features."""
@@ -160,12 +167,20 @@ class _CalledPairs:
         if not isinstance(result, tuple | list) or len(result) not in (2, 3) or result[0] is None or result[1] is None:
             raise InputError(f"{where}: expected two arrays and optionally confidences, or matched_kpts0 and "
                              f"matched_kpts1, got {type(result).__name__}")  # fmt: skip
-        values = [None if part is None else np.asarray(as_array(part)) for part in result]
+        try:
+            values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
+        except ValueError as error:
+            raise InputError(f"{where}: expected arrays, got lists of different lengths") from error
         confidence = values[2] if len(values) == 3 else None
         if self.numbered:
             return numbered_matches(where, values[0], values[1], confidence, first, second)
         sizes = [(each.shape[1], each.shape[0]) for each in (first, second)]
         return point_matches(where, values[0], values[1], confidence, *sizes)
+
+
+def _copy(image: Any) -> Any:
+    """Copy of an image or of features."""
+    return jax.tree.map(np.array, image)
 
 
 def match_queries(

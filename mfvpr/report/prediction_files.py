@@ -72,6 +72,9 @@ def write_poses(
     by_name = dict(zip(database, read_poses(poses, database), strict=True))
     texts = []
     for image in images:
+        if image.place is not None and not image.candidates:
+            raise InputError(f"{shorten(image.name)}: expected the name of its place, got no alternatives; localize "
+                             "with alternatives=1 or more")  # fmt: skip
         name = None if image.place is None else image.candidates[0][0]
         if name is not None and name not in by_name:
             raise InputError(f"{shorten(image.name)}: expected a database image with a pose, got {shorten(name)}; name "
@@ -140,7 +143,7 @@ def _image_of(line: Mapping[str, Any]) -> LocalizedImage:
     candidates = [(str(each["name"]), each["score"]) for each in line["alternatives"]]
     if place is None:
         return LocalizedImage(name, cells=cells | {"reason": str(line["reason"])})
-    return LocalizedImage(name, place, [candidates[0], *candidates[1:]], cells)
+    return LocalizedImage(name, place, candidates, cells)
 
 
 def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:

@@ -1,9 +1,9 @@
 """Files of other programs in place of extractors and retrievals; the cache knows them by content, not by path."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from mfvpr.io.checks import Lengths
 from mfvpr.io.containers import FileEntry
 from mfvpr.io.descriptors import read_with_entries as read_descriptors
 from mfvpr.io.features import ImportedFeatures, open_features
-from mfvpr.io.matches import Images, ImportedMatches, open_matches
+from mfvpr.io.matches import Images, ImportedMatches, content_paths, open_matches
 from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
@@ -147,6 +147,12 @@ class MatchFiles:
     lengths: Lengths = "unit"
 
     @property
+    def recipe(self) -> dict[str, Any]:
+        """Everything that matches depend on; a cache takes the content of files and folders for their paths."""
+        files = {root: [*content_paths(file.path), file.prefix] for root, file in self.files.items()}
+        return {part.name: getattr(self, part.name) for part in fields(self)} | {"files": files}
+
+    @property
     def inputs(self) -> Literal["images"]:
         """See `mfvpr.matching.host.PairSource`."""
         return "images"
@@ -154,18 +160,22 @@ class MatchFiles:
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
         """See `mfvpr.matching.host.PairSource`."""
         file = _file_of(self.files, queries)
-        sides = self._images(queries, file.prefix), self._images(database, self.database_prefix)
+        known: ImageOfEntry = {}  # images of the entries of both folders
+        sides = self._images(queries, file.prefix, known), self._images(database, self.database_prefix, known)
         options = {"verified": self.verified, "confidences": self.confidences, "image_size": self.image_size}
         return open_matches(file.path, *sides, **options)
 
-    def _images(self, folder: ImageFolder, prefix: str) -> Images:
-        """Names, sizes and features of a folder's images; full paths identify them if there is no prefix."""
-        paths = () if prefix else [path.absolute().as_posix() for path in folder.paths]
+    def _images(self, folder: ImageFolder, prefix: str, known: ImageOfEntry) -> Images:
+        """Names, full paths, sizes and features of a folder's images."""
+        paths = [path.absolute().as_posix() for path in folder.paths]
         names, features = [prefix + name for name in folder.names], None
         if self.features:
             file = _file_of(self.features, folder)
-            features = open_features(file.path, names, paths=paths, image_size=self.image_size, lengths=self.lengths)
-        return Images(names, paths, lambda row: read_size(folder.paths[row], orient=folder.orient), features)
+            options = {"image_size": self.image_size, "lengths": self.lengths}
+            features = open_features(file.path, names, paths=() if prefix else paths, **options)
+            require_one_image(file.path, folder.paths, features.entries, known)
+        size = lambda row: read_size(folder.paths[row], orient=folder.orient)  # noqa: E731
+        return Images(names, paths, bool(prefix), size, features)
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:

@@ -139,6 +139,15 @@ def test_wrong_arguments_are_one_line(convert, settings, tmp_path, layout, more,
     assert not path.exists()
 
 
+def test_files_that_are_read_are_not_overwritten(convert, settings, tmp_path):
+    dataset = dataset_of(settings["dataset"])
+    poses_of(dataset, tmp_path / "out", 7)
+    before = (tmp_path / "out").read_text()
+    _, _, stderr = convert(settings["out"], "tum", "--poses", tmp_path / "out", code=2)
+    assert "expected another path than those that are read" in stderr
+    assert (tmp_path / "out").read_text() == before
+
+
 def test_other_sources_are_one_line(convert, settings, tmp_path):
     for source, words in ((tmp_path, "run.json: expected a file, got nothing"),
                           (tmp_path / "none", "none: expected the run folder of mfvpr evaluate for --layout hloc"),

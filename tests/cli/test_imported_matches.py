@@ -1,7 +1,9 @@
 """matching=import in the programs, with files that hloc, COLMAP and vismatch wrote."""
 
 import json
+import shutil
 
+import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import draw_streets
@@ -49,6 +51,24 @@ def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_p
     counts = json.loads((tmp_path / "out" / "results.json").read_text())
     assert counts
     assert "imported matches" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("folder", ["kapture", "kapture/reconstruction/matches/sift", "link"])
+def test_changed_keypoints_are_read_again(street, tools, folder, tmp_path, monkeypatch, capsys):  # noqa: F811
+    shutil.copytree(tools / "kapture", tmp_path / "kapture")
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "reconstruction").symlink_to(tmp_path / "kapture" / "reconstruction")
+    [file] = (tmp_path / "kapture").rglob("queries/0000.png.kpt")
+    scores = []
+    for change in (0, 20):
+        points = np.fromfile(file, np.float32) * (1 - change / 100)
+        file.write_bytes(points.tobytes())
+        typed_here = settings(street, f"matching.matches={tmp_path}/{folder}", "scorer=histogram", "figures=0",
+                              f"cache={tmp_path}/cache", f"out={tmp_path}/out{change}")  # fmt: skip
+        code, _, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
+        assert code == 0, stderr
+        scores.append((tmp_path / f"out{change}" / "predictions.csv").read_text())
+    assert scores[0] != scores[1]
 
 
 def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811

@@ -163,7 +163,7 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     program = mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
     assert program(mask=np.ones((3, 20), bool))["scores"].tolist() == [20, 20, 20]
-    with pytest.raises(InputError, match=r"empty: expected a new or an empty folder, got one with files"):
+    with pytest.raises(InputError, match=r"empty: expected a new or an empty folder, got another"):
         mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
     monkeypatch.setattr(np, "save", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -178,3 +178,23 @@ def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, 
     with pytest.raises(InputError, match=r"onnx=True: expected the package jax2onnx.*pip install 'mfvpr\[export\]'"):
         mfvpr.export(tmp_path / "model", mfvpr.MatchCount(), SHAPES, onnx=True)
     assert not (tmp_path / "model").exists()
+
+
+def test_paths_that_cannot_be_a_new_folder_are_one_line(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "folder")
+    (tmp_path / "dangling").symlink_to(tmp_path / "none")
+    for name in ("file", "file/below", "link", "dangling"):
+        with pytest.raises(InputError, match=name) as error:
+            mfvpr.export(tmp_path / name, mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False)
+        assert "\n" not in str(error.value)
+    monkeypatch.chdir(tmp_path / "folder")
+    assert mfvpr.export(".", mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False).check() == 0
+
+
+@pytest.mark.parametrize("size", [np.array([64, 48]), [64, 48], (64.0, 48.0)])
+def test_sizes_may_be_arrays(size):
+    assert ExportShapes(2, 3, size) == ExportShapes(2, 3, (64, 48))
+    with pytest.raises(InputError, match="image_size"):
+        ExportShapes(2, 3, (64, np.inf))

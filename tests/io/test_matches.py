@@ -35,7 +35,7 @@ def tools(tmp_path_factory):
 
 def side(prefix, names, features=None):
     """Images with the names that the tools know."""
-    return Images([prefix + name for name in names], (), lambda row: SIZE, features)
+    return Images([prefix + name for name in names], size=lambda row: SIZE, features=features)
 
 
 def open_tool(tools, tool):
@@ -103,7 +103,7 @@ def test_missing_pairs_are_one_warning(tools, tool, missing):
 
 def test_names_without_prefixes_are_identified_by_the_folders_of_the_images(tools):
     """Queries and database images have the same names; their folders tell them apart."""
-    sides = [Images(QUERIES, [f"/data/set/{folder}/{name}" for name in QUERIES], lambda row: SIZE)
+    sides = [Images(QUERIES, [f"/data/set/{folder}/{name}" for name in QUERIES], size=lambda row: SIZE)
              for folder in ("queries", "database")]  # fmt: skip
     matches = open_matches(tools / "kapture", *sides).read(0, [1])[0]
     np.testing.assert_array_equal(
@@ -122,11 +122,27 @@ def write_hloc(path, pairs, **arrays):
     return path
 
 
+def test_one_name_is_not_of_a_query_and_of_another_database_image(tmp_path):
+    """Also with prefixes, which tell nothing apart if they are the same."""
+    path = write_hloc(tmp_path / "m.h5", ["0000.png/0001.png"], keypoints0=POINTS, keypoints1=POINTS)
+    size = lambda row: SIZE  # noqa: E731
+    sides = [Images(QUERIES, [f"/data/{folder}/{name}" for name in QUERIES], has_prefix, size)
+             for folder, has_prefix in (("queries", True), ("database", True))]  # fmt: skip
+    for row in (0, 1):
+        for folder in ("queries", "database"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            (tmp_path / folder / f"000{row}.png").write_text(folder)
+    with one_line_error("one image for each entry", "0000.png"):
+        open_matches(path, *sides)
+    same = [side._replace(paths=sides[0].paths) for side in sides]
+    assert open_matches(path, *same).contains(0, 1)
+
+
 def test_a_pair_in_the_other_order_is_exchanged(tmp_path):
     path = write_hloc(tmp_path / "m.h5", ["d-1.jpg/q-1.jpg"], keypoints0=POINTS, keypoints1=POINTS + 5,
                       scores=np.float32([0.1, 0.2, 0.3]))  # fmt: skip
     sizes = [(100, 80), (120, 90)]
-    sides = [Images([name], (), lambda row, size=size: size) for name, size in zip(("q/1.jpg", "d/1.jpg"), sizes)]  # noqa: B905
+    sides = [Images([name], size=lambda row, size=size: size) for name, size in zip(("q/1.jpg", "d/1.jpg"), sizes)]  # noqa: B905
     [matches] = open_matches(path, *sides).read(0, [0])
     np.testing.assert_array_equal(matches.points0, POINTS + 5)
     np.testing.assert_array_equal(matches.points1, POINTS)
@@ -138,9 +154,9 @@ def test_dashes_in_names_are_told_from_folders_or_refused(tmp_path):
     path = write_hloc(tmp_path / "m.h5", ["q-a-1.jpg/d-1.jpg"], keypoints0=POINTS, keypoints1=POINTS)
     size = lambda row: SIZE  # noqa: E731
     for name in ("q/a/1.jpg", "q/a-1.jpg"):
-        assert open_matches(path, Images([name], (), size), Images(["d/1.jpg"], (), size)).contains(0, 0)
+        assert open_matches(path, Images([name], size=size), Images(["d/1.jpg"], size=size)).contains(0, 0)
     with one_line_error("different names"):
-        open_matches(path, Images(["q/a/1.jpg", "q/a-1.jpg"], (), size), Images(["d/1.jpg"], (), size))
+        open_matches(path, Images(["q/a/1.jpg", "q/a-1.jpg"], size=size), Images(["d/1.jpg"], size=size))
 
 
 def npz_folder(tmp_path, name="q1_d1_matches.npz", **arrays):
@@ -207,6 +223,7 @@ def test_files_by_stems_have_the_query_first(tmp_path):
         ({"points0": POINTS}, "expected points0 and points1"),
         ({"points0": POINTS, "points1": np.array([None] * 3)}, "objects"),
         ({"points0": POINTS, "points1": POINTS, "im_size": "large"}, "im_size"),
+        ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
         ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "was given"),
         ({"points0": POINTS, "points1": POINTS, "im_size": np.nan}, "was given"),
     ],
@@ -217,11 +234,13 @@ def test_hostile_npz(tmp_path, arrays, message):
 
 
 def test_confidences_of_all_pairs_or_of_none(tmp_path):
+    """The first pair of the files decides, whichever pair is read first."""
     npz_folder(tmp_path, "q1_d1.npz", points0=POINTS, points1=POINTS, confidence=[0.5] * 3)
     folder = npz_folder(tmp_path, "q1_d2.npz", points0=POINTS, points1=POINTS)
     sides = Images(["q1.jpg"]), Images(["d1.jpg", "d2.jpg"])
-    with one_line_error("of all pairs or of none"):
-        open_matches(folder, *sides, image_size=(64, 64)).read(0, [0, 1])
+    for rows in ([0, 1], [1]):
+        with one_line_error("of all pairs or of none"):
+            open_matches(folder, *sides, image_size=(64, 64)).read(0, rows)
     read = open_matches(folder, *sides, image_size=(64, 64), confidences=False).read(0, [0, 1])
     assert all((matches.confidence == 1).all() for matches in read)
 
@@ -251,6 +270,7 @@ def test_hostile_results_of_vismatch(tmp_path, monkeypatch):
         ("img1_path", Path("/y/other.jpg"), "got none of their names"),
         ("matched_kpts1", [1, 2], "points"),
         ("matched_kpts1", None, "expected points0"),
+        ("im_size", [64, 64, 64], "im_size"),
     ]:
         torch_file(folder / "output_0_result.torch", {**result, key: value})
         with one_line_error(message):
@@ -293,7 +313,7 @@ def test_links_to_other_files_are_not_followed(tmp_path, place):
         file[place] = h5py.ExternalLink("other.h5", place)
     size = lambda row: SIZE  # noqa: E731
     with one_line_error("link"):
-        open_matches(path, Images(["q/1.jpg"], (), size), Images(["d/1.jpg"], (), size)).read(0, [0])
+        open_matches(path, Images(["q/1.jpg"], size=size), Images(["d/1.jpg"], size=size)).read(0, [0])
 
 
 def test_hloc_without_its_features_or_in_an_old_layout(tools, tmp_path):
@@ -349,8 +369,10 @@ def test_colmaps_database_is_not_touched(tools, tmp_path):
     assert [*path.parent.iterdir()] == [path]
     assert path.stat().st_mtime_ns == before
     (path.parent / "colmap.db-wal").write_bytes(b"changes")
-    with one_line_error("close COLMAP"):
-        open_matches(path, side("queries/", QUERIES), side("database/", DATABASE))
+    (tmp_path / "link.db").symlink_to(path)
+    for name in (path, tmp_path / "link.db"):
+        with one_line_error("close COLMAP"):
+            open_matches(name, side("queries/", QUERIES), side("database/", DATABASE))
 
 
 @pytest.mark.parametrize(

@@ -21,10 +21,11 @@ _JOURNALS = ("-wal", "-journal")  # files of changes that are not in the databas
 class ColmapPairs(PairReader):
     """Reader of the table `matches`, or of `two_view_geometries` if `verified`."""
 
-    by_number = True
+    by_number, has_confidences = True, False
 
     def __init__(self, path: Path, verified: bool = False) -> None:
         self.path = path
+        self._target = path.resolve()  # beside which SQLite writes its journals
         self._table = "two_view_geometries" if verified else "matches"
         with self._open() as database:
             rows = database.execute("SELECT image_id, name, camera_id FROM images").fetchall()
@@ -67,12 +68,12 @@ class ColmapPairs(PairReader):
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
         """The database, opened read-only; raise an InputError for changes beside it, and for SQLite's errors."""
-        for journal in (Path(f"{self.path}{suffix}") for suffix in _JOURNALS):
+        for journal in (Path(f"{self._target}{suffix}") for suffix in _JOURNALS):
             if journal.is_file() and journal.stat().st_size:
                 raise InputError(
                     f"{self.path}: expected a closed database, got changes in {journal.name}; close COLMAP"
                 )
-        address = f"file:{quote(str(self.path.absolute()))}?mode=ro&immutable=1"  # writes no file beside it either
+        address = f"file:{quote(str(self._target))}?mode=ro&immutable=1"  # writes no file beside it either
         with (
             reading(self.path, "a COLMAP database", "is it whole, and COLMAP's?"),
             closing(sqlite3.connect(address, uri=True)) as database,

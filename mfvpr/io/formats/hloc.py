@@ -28,6 +28,7 @@ class HlocPairs(PairReader):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
         self.images = tuple(dict.fromkeys(name for pair in self._groups for name in pair))
         self.by_number = "keypoints0" not in arrays
+        self.has_confidences = ("matching_scores0" if self.by_number else "scores") in arrays
 
     def __contains__(self, pair: Pair) -> bool:
         return pair in self._groups

@@ -20,12 +20,11 @@ class KapturePairs(PairReader):
     `path` is kapture's root, or a folder of matches if there are several types.
     """
 
-    by_number = True
+    by_number, has_confidences = True, True
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._matches = _matches_folder(path)
-        self._keypoints = self._matches.parents[1] / "keypoints" / self._matches.name
+        self._matches, self._keypoints = self.folders(path)
         self._type, self._columns = _keypoint_layout(self._keypoints / "keypoints.txt")
         files = [file.relative_to(self._matches).as_posix() for file in sorted(self._matches.rglob(f"*{_SUFFIX}"))]
         self._files: dict[Pair, str] = {}
@@ -37,6 +36,12 @@ class KapturePairs(PairReader):
         if not files:
             raise InputError(f"{self._matches}: expected files named {_SUFFIX}, got none; unpack archives first")
         self.images = tuple(dict.fromkeys(name for pair in self._files for name in pair))
+
+    @staticmethod
+    def folders(path: Path) -> tuple[Path, Path]:
+        """Folders of matches and of keypoints."""
+        matches = _matches_folder(path)
+        return matches, matches.parents[1] / "keypoints" / matches.name
 
     @staticmethod
     def fits(folder: Path) -> bool:

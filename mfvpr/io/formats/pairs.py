@@ -38,6 +38,7 @@ class PairReader:
         images: their names in the file.
         by_number: whether matches are numbers of keypoints.
         sided: whether the first name of a pair is always the query's, so that a name may also be a database image's.
+        has_confidences: whether matches have confidences: those of the first pair that has matches.
         in_image_files: whether points without sizes are in the px of the image files.
     """
 
@@ -45,6 +46,7 @@ class PairReader:
     images: tuple[str, ...]
     by_number: bool
     sided: bool = False
+    has_confidences: bool
     in_image_files: ClassVar[bool] = True
 
     def __contains__(self, pair: Pair) -> bool:

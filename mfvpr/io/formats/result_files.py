@@ -1,6 +1,7 @@
 """Read folders with a file of matches for each pair: `.npz`, or `.torch` as vismatch writes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -55,6 +56,11 @@ class ResultFiles(PairReader):
                              "of other images; see mfvpr/io/README.md")  # fmt: skip
         self.images = tuple(dict.fromkeys(chain(*self._files)))
 
+    @cached_property
+    def has_confidences(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        real = (matches for matches in self.read([*self._files]) if len(matches.first))
+        return next((matches.confidence is not None for matches in real), False)
+
     def __contains__(self, pair: Pair) -> bool:
         return pair in self._files
 
@@ -87,7 +93,7 @@ def _read(file: Path) -> Parts:
         if not isinstance(result, dict):
             raise InputError(f"expected a dictionary of results, got {type(result).__name__}")
         parts = {name: part for name, part in result.items() if name in _PARTS and part is not None}
-        return {name: part.numbers() if isinstance(part, Array) else part for name, part in parts.items()}
+        return {name: part.numbers() if isinstance(part, Array) else np.asarray(part) for name, part in parts.items()}
 
 
 def _names_inside(file: Path) -> Pair | None:
@@ -132,8 +138,8 @@ def _matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
 
 def _sizes(file: Path, parts: Parts) -> tuple[Size, Size] | None:
     side = parts.get("im_size")
-    sizes = [side, side] if side is not None else [parts.get(name) for name in _SIZES[:2]]
-    if all(size is None for size in sizes):
+    sizes = [side, side] if side is not None else [parts[name] for name in _SIZES[:2] if name in parts]
+    if not sizes:
         return None
     try:
         (size0, size1) = (np.broadcast_to(np.asarray(size, np.float64), 2) for size in sizes)
