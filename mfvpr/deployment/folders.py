@@ -94,7 +94,7 @@ def export(
     """
     folder = Path(folder)
     is_other = folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))
-    if is_other or folder.is_symlink():
+    if is_other or folder.is_symlink() or folder.resolve() == Path.cwd():
         raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     with jax.enable_x64(False):
         program = stablehlo.without_unused_inputs(make_program(method, shapes, with_shift=with_shift))

@@ -185,12 +185,11 @@ def test_paths_that_cannot_be_a_new_folder_are_one_line(tmp_path, monkeypatch):
     (tmp_path / "folder").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "folder")
     (tmp_path / "dangling").symlink_to(tmp_path / "none")
-    for name in ("file", "file/below", "link", "dangling"):
-        with pytest.raises(InputError, match=name) as error:
-            mfvpr.export(tmp_path / name, mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False)
-        assert "\n" not in str(error.value)
     monkeypatch.chdir(tmp_path / "folder")
-    assert mfvpr.export(".", mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False).check() == 0
+    for name in ("../file", "../file/below", "../link", "../dangling", "."):
+        with pytest.raises(InputError) as error:
+            mfvpr.export(name, mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False)
+        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("size", [np.array([64, 48]), [64, 48], (64.0, 48.0)])
