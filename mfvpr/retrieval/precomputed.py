@@ -174,7 +174,7 @@ class MatchFiles:
             options = {"image_size": self.image_size, "lengths": self.lengths}
             features = open_features(file.path, names, paths=() if prefix else paths, **options)
             require_one_image(file.path, folder.paths, features.entries, known)
-        size = lambda row: read_size(folder.paths[row], orient=folder.orient)  # noqa: E731
+        size = lambda row: read_size(folder.paths[row], orient=False)  # noqa: E731  # as hloc and kapture read images
         return Images(names, paths, bool(prefix), size, features)
 
 
