@@ -184,6 +184,14 @@ def test_npz_of_points(tmp_path):
             pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS, im_size=side))
 
 
+def test_npz_with_names_may_have_either_order(tmp_path):
+    arrays = {"points0": POINTS, "points1": POINTS + 1, "image_size0": [64, 65], "image_size1": [96, 97]}
+    folder = npz_folder(tmp_path, "any name.npz", img0_path="/x/d1.jpg", img1_path="/x/q1.jpg", **arrays)
+    matches = pair_of(folder)
+    np.testing.assert_array_equal(matches.points1 - matches.points0, np.full((3, 2), -1))
+    assert [matches.image_size0.tolist(), matches.image_size1.tolist()] == [[96, 97], [64, 65]]
+
+
 def test_npz_of_superglue(tmp_path):
     """A partner for each keypoint of the first image, -1 = none."""
     arrays = {"keypoints0": POINTS, "keypoints1": POINTS[::-1] + 1, "matches": np.array([2, -1, 0]),

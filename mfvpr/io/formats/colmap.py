@@ -13,7 +13,9 @@ from mfvpr.io.containers import reading, shorten
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
 from mfvpr.utils.errors import InputError
 
-_MOST_IMAGES = 2**31 - 1  # of COLMAP; a pair's number is this times the smaller number of an image plus the larger
+_MOST_IMAGES = (
+    2**31 - 1
+)  # of COLMAP; a pair's number is this times the number of its first image plus that of its second
 _CENTER = 0.5  # the center of COLMAP's first pixel, px
 _JOURNALS = ("-wal", "-journal")  # files of changes that are not in the database yet
 
@@ -41,7 +43,7 @@ class ColmapPairs(PairReader):
 
     def __contains__(self, pair: Pair) -> bool:
         first, second = (self._numbers[name] for name in pair)
-        return first < second and _MOST_IMAGES * first + second in self._pairs
+        return _MOST_IMAGES * first + second in self._pairs
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
         with self._open() as database:
