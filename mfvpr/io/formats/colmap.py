@@ -13,9 +13,7 @@ from mfvpr.io.containers import reading, shorten
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
 from mfvpr.utils.errors import InputError
 
-_MOST_IMAGES = (
-    2**31 - 1
-)  # of COLMAP; a pair's number is this times the number of its first image plus that of its second
+_MOST_IMAGES = 2**31 - 1  # of COLMAP; the number of a pair is this times the number of the first image plus the other
 _CENTER = 0.5  # the center of COLMAP's first pixel, px
 _JOURNALS = ("-wal", "-journal")  # files of changes that are not in the database yet
 
