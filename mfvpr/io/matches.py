@@ -20,6 +20,7 @@ from mfvpr.io.formats.colmap import ColmapPairs
 from mfvpr.io.formats.hloc import HlocPairs
 from mfvpr.io.formats.kapture import KapturePairs
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
+from mfvpr.io.formats.predictions import PredictionPairs
 from mfvpr.io.formats.result_files import ResultFiles
 from mfvpr.io.names import ImageOfEntry, match_paths, require_one_image
 from mfvpr.io.plain_matches import numbered_matches, point_matches
@@ -177,8 +178,8 @@ def open_matches(
     """Open the matches of queries with database images; reads names, and no matches.
 
     Args:
-        path: hloc's `matches*.h5`; COLMAP's `.db`; a kapture folder; or a folder with a file for each pair, `.npz`, or
-            `.torch` of vismatch.
+        path: hloc's `matches*.h5`; COLMAP's `.db`; a kapture folder; a folder with a file for each pair, `.npz`, or
+            `.torch` of vismatch; or VPR-methods-evaluation's `preds` with To-Match's `.torch` files.
         queries: names of the queries, and what is known of them.
         database: likewise; hloc's matches of features need the `features` of both sides.
         image_size: (width, height) of the images that points are in, px, if the file does not tell.
@@ -206,6 +207,8 @@ def content_paths(path: Path) -> list[Path]:
 
 def _open(path: Path, queries: Images, database: Images, verified: bool) -> PairReader:
     if path.is_dir() and not KapturePairs.fits(path):
+        if PredictionPairs.fits(path):
+            return PredictionPairs(path, verified)
         return ResultFiles(path, (queries.names, database.names), verified)
     if path.suffix.lower() == ".db":
         return ColmapPairs(path, verified)

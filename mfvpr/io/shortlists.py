@@ -14,7 +14,7 @@ import numpy as np
 
 from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import FileEntry, reading, shorten
-from mfvpr.io.formats.match_results import read_num_inliers
+from mfvpr.io.formats.predictions import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.types import Ranking, Shortlist
@@ -26,8 +26,7 @@ Candidates = dict[int, float | None]  # database rows and scores of one query, b
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
 _SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
-_QUERY, _PREDICTIONS, _POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
-_HEADINGS = _PREDICTIONS, _POSITIVES
+_HEADINGS = PREDICTIONS, POSITIVES
 
 
 class Pair(NamedTuple):
@@ -206,27 +205,15 @@ def _read_predictions(folder: Path) -> list[Pair]:
     """Read the pairs of a folder of predictions. Positives are not read: the data set has its own ground truth."""
     pairs, files = [], dict[str, Path]()
     for path in sorted(folder.glob("*.txt")):
-        with reading(path, mend="expected a text file of predictions"):
-            text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-        parts: dict[str, list[str]] = {heading: [] for heading in ("", _QUERY, _PREDICTIONS, _POSITIVES)}
-        heading = ""
-        for line in filter(None, map(str.strip, text.split("\n"))):
-            if line in parts:
-                heading = line
-            else:
-                parts[heading].append(printable(line))
-        if parts[""] or len(parts[_QUERY]) != 1 or not parts[_PREDICTIONS]:
-            raise InputError(f"{path}: expected one path below {_QUERY!r}, and one or more below {_PREDICTIONS!r}, as "
-                             "VPR-methods-evaluation writes them")  # fmt: skip
-        [query] = parts[_QUERY]
+        query, predictions = read_predictions(path)
         if (other := files.setdefault(query, path)) != path:
             raise InputError(f"{path}: expected another query than in {other.name}, got {shorten(query)} again; "
                              "remove the files of older runs")  # fmt: skip
         results = path.with_suffix(".torch")
         if results.exists():
-            pairs += _by_inliers(query, parts[_PREDICTIONS], results)
+            pairs += _by_inliers(query, predictions, results)
         else:
-            pairs += [Pair(query, database) for database in parts[_PREDICTIONS]]
+            pairs += [Pair(query, database) for database in predictions]
     if not files:
         mend = "; copy the .torch files beside those of preds" if any(folder.glob("*.torch")) else ""
         raise InputError(f"{folder}: expected text files of predictions, one for each query, got none{mend}")
@@ -253,7 +240,7 @@ def _write_predictions(folder: Path, query_names: Sequence[str], lists: Sequence
     folder.mkdir(parents=True, exist_ok=True)
     for row, (query, *names) in enumerate(zip(query_names, *lists, strict=True)):
         if names[0]:
-            parts = [(_QUERY, query), *((heading, *part) for heading, part in zip(_HEADINGS, names, strict=False))]
+            parts = [(QUERY, query), *((heading, *part) for heading, part in zip(_HEADINGS, names, strict=False))]
             text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
             write_text(folder / f"{row:03d}.txt", text)
 

@@ -66,7 +66,7 @@ class ResultFiles(PairReader):
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
         for pair in pairs:
-            yield _matches(self._files[pair], _read(self._files[pair]), self._verified)
+            yield result_matches(self._files[pair], _read(self._files[pair]), self._verified)
 
 
 class _ResultUnpickler(ArrayUnpickler):
@@ -92,8 +92,13 @@ def _read(file: Path) -> Parts:
             result = _ResultUnpickler(archive.pickle).load()
         if not isinstance(result, dict):
             raise InputError(f"expected a dictionary of results, got {type(result).__name__}")
-        parts = {name: part for name, part in result.items() if name in _PARTS and part is not None}
-        return {name: part.numbers() if isinstance(part, Array) else np.asarray(part) for name, part in parts.items()}
+        return plain_parts(result)
+
+
+def plain_parts(result: Mapping[Any, Any]) -> Parts:
+    """Arrays of an unpickled result that matter here."""
+    parts = {name: part for name, part in result.items() if name in _PARTS and part is not None}
+    return {name: part.numbers() if isinstance(part, Array) else np.asarray(part) for name, part in parts.items()}
 
 
 def _names_inside(file: Path) -> Pair | None:
@@ -117,7 +122,8 @@ def _names_of_file(file: Path, stems: tuple[set[str], ...]) -> Pair | None:
     return pairs[0] if pairs else None
 
 
-def _matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
+def result_matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
+    """Matches of a result, or its inliers if `verified`."""
     sizes = _sizes(file, parts)
     for first, second, confidence in (_INLIERS,) if verified else _LAYOUTS:
         if first in parts and second in parts:

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from mfvpr.io import read_shortlist
+from mfvpr.io import Images, open_matches, read_shortlist
 from tests.io.checks import one_line_error
 
 QUERIES = ["q/1.jpg", "q/2.jpg"]
@@ -54,6 +54,32 @@ def test_torch_writes_the_same(folder):
     torch.save([result(count) for count in (0, 7, 7)], folder / "000.torch")
     torch.save([result(2), result(90)], folder / "001.torch")
     assert read_shortlist(folder, QUERIES, DATABASE).indices.tolist() == [[2, 1, 3], [1, 0, -1]]
+
+
+def matched(count, shift):
+    points = np.arange(2.0 * count).reshape(count, 2)
+    return result(count) | {"matched_kpts0": points, "matched_kpts1": points + shift, "matched_confidences": None,
+                            "inlier_kpts0": points[1:], "inlier_kpts1": points[1:] + shift}  # fmt: skip
+
+
+def test_matches_of_predictions(folder):
+    """A result for each prediction, in their order; predictions beyond the results were not matched."""
+    write_results(folder / "000.torch", [matched(3, 1.0), matched(0, 1.0), matched(5, 2.0)])
+    sides = Images(QUERIES), Images(DATABASE)
+    files = open_matches(folder, *sides, image_size=(512, 512))
+    assert [files.contains(0, row) for row in range(4)] == [False, True, True, True]
+    assert not files.contains(1, 0)
+    read = files.read(0, [3, 1, 0, 2])
+    assert [None if each is None else len(each.mask) for each in read] == [3, 5, None, 0]
+    np.testing.assert_array_equal(read[1].points1 - read[1].points0, np.full((5, 2), 2.0))
+    assert read[1].image_size0.tolist() == [512, 512]
+    verified = open_matches(folder, *sides, image_size=(512, 512), verified=True).read(0, [1])
+    assert len(verified[0].mask) == 4
+    with one_line_error("image_size"):
+        open_matches(folder, *sides).read(0, [3])
+    write_results(folder / "000.torch", [matched(3, 1.0)] * 5)
+    with one_line_error("at most 4 predictions"):
+        open_matches(folder, *sides)
 
 
 class Malicious:
