@@ -24,6 +24,7 @@ def check_inputs(program: Program) -> dict[str, np.ndarray]:
     values = {
         "points0": np.broadcast_to(points0, (*lengths, 2)), "points1": points1, "mask": mask,
         "distance": rng.uniform(0, 1, lengths), "ratio": rng.uniform(0.5, 1, lengths),
+        "confidence": np.linspace(0, 1, lengths[0] * lengths[1]).reshape(lengths),
         "scores0": scores0, "scores1": rng.uniform(0.1, 1, lengths),
         "image_size0": size, "image_size1": np.broadcast_to(size, (shapes.candidates, 2)),
         "index0": numbers, "index1": numbers, "count0": shapes.keypoints, "count1": np.full(lengths[0], lengths[1]),

@@ -72,7 +72,7 @@ class ExportedProgram:
 
 def export(
     folder: Path | str, method: Scorer | System, shapes: ExportShapes, *, with_shift: bool = False,
-    onnx: bool | None = None,
+    with_confidence: bool = False, onnx: bool | None = None,
 ) -> ExportedProgram:  # fmt: skip
     """Write a scorer, or the matcher and scorers of a system, as a program that runs without Python.
 
@@ -86,6 +86,7 @@ def export(
         method: a scorer takes matches; a system takes features, and returns the scores of all of its scorers.
         shapes: sizes of all arrays.
         with_shift: also return the refined dominant shifts of the deciding `HistogramOfShifts`, `[C, 2]` px.
+        with_confidence: whether a scorer takes the confidence of each match; if not, matches count fully.
         onnx: write an ONNX model as well; None = if the package jax2onnx is installed and has the operations.
 
     Raises:
@@ -97,7 +98,8 @@ def export(
     if is_other or folder.is_symlink() or folder.resolve() == Path.cwd():
         raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     with jax.enable_x64(False):
-        program = stablehlo.without_unused_inputs(make_program(method, shapes, with_shift=with_shift))
+        program = make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
+        program = stablehlo.without_unused_inputs(program)
         content = stablehlo.serialize(program)
         inputs = check_inputs(program)
         run = jax.jit(stablehlo.deserialize(content, str(folder)).call)

@@ -30,6 +30,7 @@ FIELDS = {
     "image_size0": ("2", "float32", "px"),
     "image_size1": ("C2", "float32", "px"),
     "ratio": ("CK", "float32", ""),
+    "confidence": ("CK", "float32", ""),
     "index0": ("CK", "int32", ""),
     "index1": ("CK", "int32", ""),
     "count0": ("", "int32", ""),
@@ -111,14 +112,18 @@ class Program:
         return self.function(dict(zip((each.name for each in self.inputs), arrays, strict=True)), form)
 
 
-def make_program(method: Scorer | System, shapes: ExportShapes, *, with_shift: bool) -> Program:
+def make_program(
+    method: Scorer | System, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
+) -> Program:
     """The program of a scorer or of a system."""
     if isinstance(method, System):
+        if with_confidence:
+            raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
         return _system_program(method, shapes, with_shift=with_shift)
-    return _scorer_program(method, shapes, with_shift=with_shift)
+    return _scorer_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
 
 
-def _scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool) -> Program:
+def _scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool) -> Program:
     """Matches of C candidates -> their scores."""
     scorers = _scorers({"scores": scorer}, shapes)
 
@@ -129,7 +134,8 @@ def _scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool) -
         }
         return _over(_score_pair(scorers, with_shift), Matches(**(arrays | copies)), form)
 
-    return Program(shapes, _tensors(FIELDS, shapes), _outputs(scorers, shapes, with_shift), function, scorers)
+    inputs = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
+    return Program(shapes, _tensors(inputs, shapes), _outputs(scorers, shapes, with_shift), function, scorers)
 
 
 def _system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -> Program:

@@ -194,3 +194,12 @@ def test_systems_that_cannot_be_exported_are_refused(system, options, message):
 def test_shapes_out_of_bounds_are_refused(name, number):
     with pytest.raises(InputError, match=f"{name}=.*: expected"):
         replace(SHAPES, **{name: number})
+
+
+def test_matches_may_have_a_confidence():
+    program = make_program(mfvpr.MatchCount(), SHAPES, with_shift=False, with_confidence=True)
+    inputs = check_inputs(program)
+    [scores] = program.call(*inputs.values())
+    np.testing.assert_allclose(scores, (inputs["confidence"] * inputs["mask"]).sum(axis=1), rtol=1e-5)
+    with pytest.raises(InputError, match="with_confidence=True: expected a scorer"):
+        make_program(make_system({"count": mfvpr.MatchCount()}), SHAPES, with_shift=False, with_confidence=True)
