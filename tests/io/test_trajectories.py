@@ -148,3 +148,9 @@ def test_files_of_times(write):
         read_stamps(write(["1", "2"]), 3)
     with one_line_error("line 2: expected a time in s, .* got '2 3'"):
         read_stamps(write(["1", "2 3"]), 2)
+
+
+def test_times_before_0_are_refused(tmp_path):
+    with one_line_error("expected times from 0 ns, got -1"):
+        write_trajectory(tmp_path / "out.txt", ["0 0 0 0 0 0 1"] * 2, [-1, 5])
+    assert not (tmp_path / "out.txt").exists()
