@@ -21,6 +21,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
 from tests.builders import read_golden
+from tests.io.match_files import write_tool_files
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
@@ -120,6 +121,12 @@ def weights(tmp_path_factory) -> Path:
 def small_street(tmp_path_factory) -> Path:
     """Ten frames of the synthetic street: database/, queries/, ground_truth.csv."""
     return streets_folder(tmp_path_factory.mktemp("cache"), num_frames=10, image_size=(320, 240))
+
+
+@pytest.fixture(scope="session")
+def tools(tmp_path_factory) -> Path:
+    """Files of matches by hloc, kapture, COLMAP and vismatch."""
+    return write_tool_files(tmp_path_factory.mktemp("tools"))
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.protocol import Split
-from mfvpr.evaluation.sequence_matching import matches_recipe, scales_of
+from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matching import MatchSet, Scales
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -51,7 +51,7 @@ class Inputs:
     def matches_recipe(self) -> dict[str, Any]:
         """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
         recipe = matches_recipe(self.dataset, self.dataset.only, self.pipeline, self.cache)
-        scales = scales_of(self.pipeline)
+        scales = self.pipeline.scales
         return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
 
 

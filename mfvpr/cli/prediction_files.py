@@ -1,7 +1,6 @@
 """Convert the predictions of a run folder, or of lines of `mfvpr localize`, to files of other programs."""
 
 import json
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.systems.settings import SettingsError
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 
 _CANDIDATES = ("preds", "hloc", "kapture")
@@ -102,10 +100,7 @@ def _write_localized(
     times: Path | None,
 ) -> None:  # fmt: skip
     names = [image.name for image in images]
-    try:
-        stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
-    except InputError as error:
-        raise SettingsError(re.sub("give a file of times$", "add --times FILE", str(error))) from error
+    stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
     if layout == "shifts":
         prediction_files.write_shift_table(path, images, stamps)
     elif poses is not None:

@@ -68,7 +68,7 @@ class ExportShapes:
 
     candidates: int
     keypoints: int
-    image_size: tuple[int, int]
+    image_size: tuple[float, float]
     dimension: int | None = None
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.images import gray, resize, write_image
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.evaluation import RankedDataset, Reason
-from mfvpr.evaluation.sequence_matching import image_source, match_sequence
+from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import Pipeline, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.reranking.ranking import score_candidates
@@ -130,7 +130,7 @@ def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Re
 
 def _strengths(images: ImageFolder, pipeline: Pipeline, cache: FeatureCache, rows: range) -> Float[np.ndarray, " rows"]:
     """Strengths of images, of all scales; 0 if an image cannot be read, NaN if images are matched without features."""
-    if image_source(pipeline) is not None:
+    if pipeline.image_source is not None:
         return np.full(len(rows), np.nan)
     strengths = dict.fromkeys(rows, 0.0)
     for scale in cache.local(images, pipeline.extractor, rows):

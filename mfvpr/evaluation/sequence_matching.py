@@ -14,8 +14,7 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.system import Pipeline
 from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
-from mfvpr.features.extractor import Scale
-from mfvpr.matching.host import PairSource, Side
+from mfvpr.matching.host import Side
 from mfvpr.matching.match_set import MatchSet
 from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.fitting import fit_to_database
@@ -29,7 +28,6 @@ from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
-TYPICAL_MATCHES = 1000  # assumed matches of a pair of images, for forecasts of disk space
 _REMARKS = "images.json"  # beside the matches: which images are bad
 
 
@@ -51,7 +49,7 @@ class _Work:
         cache = replace(cache, watch=cache.watch or watch)
         if pipeline.pixels is not None:
             pipeline = pipeline.with_image_size(pipeline.size_for_images(folders_of(dataset), cache.warn))
-        if image_source(pipeline) is None:
+        if pipeline.image_source is None:
             with watch("features"):
                 pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, dataset.database, cache))
         with watch("retrieval"):
@@ -82,7 +80,7 @@ def match_sequence(
             retrieved = _find_candidates(work)
             matches, remarks = _match(work, retrieved, stores)
             matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
-    if image_source(work.pipeline) is not None:
+    if work.pipeline.image_source is not None:
         for line in empty_pairs_warning(sequence.name, matched):
             cache.warn(line)
     missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
@@ -90,7 +88,7 @@ def match_sequence(
         images = sequence.images
         cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
                      "counts as a failure")  # fmt: skip
-    return replace(matched, weights=tuple(scale.weight for scale in scales_of(work.pipeline)))
+    return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.scales))
 
 
 def match_rows(
@@ -133,7 +131,7 @@ def _match(
 def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Side, Side]], dict[str, Any]]:
     """Features of the queries and of all candidates by scale, or their images, and remarks on bad images."""
     dataset, sequence, extractor = work.dataset, work.sequence, work.pipeline.extractor
-    if (source := image_source(work.pipeline)) is not None:
+    if (source := work.pipeline.image_source) is not None:
         sides = sequence.images, dataset.database
         remarks = {"queries": retrieved.bad_queries, "database": retrieved.bad_database}
         return [sides], {**remarks, "warnings": source.open(*sides).warnings(retrieved.candidates)}
@@ -146,17 +144,6 @@ def _extract(work: _Work, retrieved: RetrievalResult) -> tuple[list[tuple[Side, 
     warnings += image_warnings(sequence.images, queries[0], bad_queries)
     remarks = {"queries": bad_queries, "database": bad_database, "warnings": warnings}
     return list(zip(queries, database, strict=True)), remarks
-
-
-def image_source(pipeline: Pipeline) -> PairSource | None:
-    """The matcher, if it takes images or files instead of features."""
-    matcher = pipeline.matcher
-    return matcher if isinstance(matcher, PairSource) and matcher.inputs == "images" else None
-
-
-def scales_of(pipeline: Pipeline) -> tuple[Scale, ...]:
-    """Scales of the matches."""
-    return pipeline.extractor.scales if image_source(pipeline) is None else (Scale(0, TYPICAL_MATCHES),)
 
 
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
@@ -193,7 +180,7 @@ def matches_recipe(
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matcher."""
     excluded, database = sequence.excluded, dataset.database
     extractor = None
-    if image_source(pipeline) is None:
+    if pipeline.image_source is None:
         extractor = fit_to_database(pipeline.extractor, database, cache)
     return {
         "database": cache.recipes.of_folder(database, extractor),
@@ -212,7 +199,7 @@ def _match_stores(work: _Work, rows: Sequence[int] | None = None) -> Iterator[li
 
     There are none if the cache is in memory.
     """
-    cache, scales, number = work.cache, scales_of(work.pipeline), len(work.sequence.images)
+    cache, scales, number = work.cache, work.pipeline.scales, len(work.sequence.images)
     if cache.root is None:
         yield []
         return

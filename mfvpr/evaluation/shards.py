@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.evaluation.image_sizes import folders_of
-from mfvpr.evaluation.sequence_matching import image_source, match_rows, matches_recipe
+from mfvpr.evaluation.sequence_matching import match_rows, matches_recipe
 from mfvpr.evaluation.system import Pipeline, System
 from mfvpr.features.extractor import Aggregated, Extractor, Source
 from mfvpr.reranking.cohort_normalization import cohort_sequence
@@ -89,7 +89,7 @@ def _describe(part: ImageFolder, database: ImageFolder, pipeline: Pipeline, cach
     retriever = fit_to_database(pipeline.retriever, database, cache)
     describer = getattr(retriever, "describer", None)
     describers = [describer.extractor if isinstance(describer, Aggregated) else describer]
-    if image_source(pipeline) is None:
+    if pipeline.image_source is None:
         describers.append(fit_to_database(pipeline.extractor, database, cache))
     for extractor in describers if len(part) else ():
         if isinstance(extractor, Extractor) and not isinstance(extractor, Source):

@@ -45,7 +45,7 @@ def match(
     queries: Side, database: Side, candidates: Shortlist, matcher: Matcher | PairSource = NEIGHBORS, *,
     store: MatchStore | None = None, rows: Sequence[int] | None = None, runtime: Runtime = DEFAULT_RUNTIME,
 ) -> MatchSet:  # fmt: skip
-    """Match every query with its candidates; matches include their ratio, which some weights use.
+    """Match every query with its candidates. Matches of compiled matchers include their ratio, which some weights use.
 
     Args:
         queries: features of Q images; or the images, if that is what the matcher takes.
@@ -63,7 +63,6 @@ def match(
     """
     if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
         _require_same_dimensions(queries, database)
-    on_host = isinstance(matcher, PairSource)
     sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
     if store is None:
         pairs = _match_queries(sides, requested, matcher, (runtime.memory, runtime.devices))
@@ -74,7 +73,7 @@ def match(
     if missing := [row for row in requested if not store.done[row]]:
         stored = {row: query.indices for row, query in store.read()}
         _require_candidates(store, candidates, stored)  # before anything is written
-        runtime = replace(runtime, cluster=None) if on_host else runtime
+        runtime = replace(runtime, cluster=None) if isinstance(matcher, PairSource) else runtime
         here, at_workers = (runtime.memory, runtime.devices), (runtime.memory or WORKER_MEMORY, None)
         shared = sides, matcher, here if runtime.cluster is None else at_workers, store
         for block, counts in runtime.map(_match_rows, shared, missing, "matching", batched.QUERIES):
@@ -92,7 +91,7 @@ def _match_rows(
     """Write the matches of queries to a store within limits of memory and devices; returns rows and numbers."""
     missing = [row for row in rows if not store.done[row]]
     tracked = iter(track(_match_queries(sides, missing, matcher, limits), len(missing)))
-    together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # which may take minutes for a query
+    together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # on the host, a query may take minutes
     while batch := dict(itertools.islice(tracked, together)):
         store.write(batch)
     return rows, store.counts[rows]

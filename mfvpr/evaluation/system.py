@@ -12,7 +12,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.image_sizes import Note, size_for_images
-from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matching.host import PairSource
@@ -30,6 +30,8 @@ from mfvpr.scoring.scorer import Scorer
 from mfvpr.types import Shortlist, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
+
+_TYPICAL_MATCHES = 1000  # assumed matches of a pair that no features limit, for forecasts of disk space
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,17 @@ class Pipeline:
                              f"{got}; see mfvpr.Matcher")  # fmt: skip
         if isinstance(self.matcher, LightGlueMatcher):
             _check_lightglue(self.matcher, self.extractor)
+
+    @property
+    def image_source(self) -> PairSource | None:
+        """The matcher, if it takes images or files instead of features."""
+        matcher = self.matcher
+        return matcher if isinstance(matcher, PairSource) and matcher.inputs == "images" else None
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """Scales of the matches."""
+        return self.extractor.scales if self.image_source is None else (Scale(0, _TYPICAL_MATCHES),)
 
     def image_size_for(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Size of about `pixels` in the shape of an image of `shape`, both (width, height)."""
@@ -171,7 +184,7 @@ class System:
         extractor, candidates = pipeline.extractor, pipeline.candidates
         if isinstance(extractor, Source):
             raise InputError(f"{type(extractor).__name__}: expected an extractor of images, got a reader of features")
-        if isinstance(pipeline.matcher, PairSource) and pipeline.matcher.inputs == "images":
+        if pipeline.image_source is not None:
             raise InputError(f"{type(pipeline.matcher).__name__}: expected a matcher of features, got one of images")
         rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
         shortlist = Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)

@@ -206,17 +206,19 @@ def content_paths(path: Path) -> list[Path]:
 
 
 def _open(path: Path, queries: Images, database: Images, verified: bool) -> PairReader:
-    if path.is_dir() and not KapturePairs.fits(path):
-        if PredictionPairs.fits(path):
-            return PredictionPairs(path, verified)
+    if not path.is_dir():
+        reader = choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})
+        if reader is ColmapPairs:
+            return ColmapPairs(path, verified)
+    elif KapturePairs.fits(path):
+        reader = KapturePairs
+    elif PredictionPairs.fits(path):
+        return PredictionPairs(path, verified)
+    else:
         return ResultFiles(path, (queries.names, database.names), verified)
-    if path.suffix.lower() == ".db":
-        return ColmapPairs(path, verified)
     if verified:
-        raise InputError(f"{path}: expected COLMAP's .db or vismatch's results with verified=True")
-    if path.is_dir():
-        return KapturePairs(path)
-    return choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})(path)
+        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
+    return reader(path)
 
 
 def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str | None], list[str | None]]:
@@ -224,8 +226,8 @@ def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str |
     names = tuple(
         match_paths(
             reader.path,
-            [*map(reader.written, side.names)],
-            [] if side.has_prefix else [*map(reader.written, side.paths)],
+            [*map(reader.spelling, side.names)],
+            [] if side.has_prefix else [*map(reader.spelling, side.paths)],
             reader.images,
         )
         for side in sides

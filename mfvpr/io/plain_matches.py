@@ -7,10 +7,10 @@ from jaxtyping import Float32, Num
 
 from mfvpr.io.checks import as_float32
 from mfvpr.io.features import require_inside
+from mfvpr.io.formats.pairs import Size
 from mfvpr.types import Features, Matches
 from mfvpr.utils.errors import InputError
 
-Size = tuple[float, float]  # (width, height), px
 _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
 
 

@@ -43,7 +43,8 @@ def stamps_in_names(names: Sequence[str]) -> list[int]:
         stem = PurePosixPath(name).stem
         if not _NAME.fullmatch(stem):
             raise InputError(f"{shorten(name)}: expected the time as the name of the file, such as "
-                             "1403636579763555584.png (ns) or 12.345.png (s); give a file of times")  # fmt: skip
+                             "1403636579763555584.png (ns) or 12.345.png (s); rename the images, or give a file of "
+                             "times (read_stamps, or --times FILE)")  # fmt: skip
         stamps.append(_stamp(shorten(name), stem))
     return stamps
 

@@ -73,9 +73,9 @@ class HostMatcher:
 
     Attributes:
         function: of the query and the candidate.
-        name: of the program, its version and weights: a cache takes matches of equal names for equal. The code of the
-            function is not compared.
-        inputs: what the function takes; with images, the extractor of a pipeline serves the retrieval alone.
+        name: of the program, its version and weights. A cache reuses the matches of a name; it does not compare the
+            code of the function.
+        inputs: what the function takes; with images, the extractor of a pipeline is used only for retrieval.
         image_size: (width, height) that images are resized to, px; None = their own size.
         interpolation: of the resizing.
         batch_size: None = the function takes one pair. A number = it takes two lists of up to that many, query and

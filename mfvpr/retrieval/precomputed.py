@@ -127,7 +127,7 @@ class MatchFiles:
         features = {folder.root: File("feats.h5") for folder in (data.queries, data.database)}
         pipeline = mfvpr.Pipeline(extractor, retriever, MatchFiles(files, features=features))
 
-    The extractor of the pipeline serves the retrieval alone.
+    The extractor of the pipeline is used only for retrieval.
 
     Attributes:
         files: by the root of the folder of queries, with the prefix of the queries' names.

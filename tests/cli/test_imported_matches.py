@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import draw_streets
-from tests.io.test_matches import tools  # noqa: F401
 from tests.programs import typed
 
 PAIRS = "queries/0000.png database/0000.png\nqueries/0000.png database/0001.png\n" \
@@ -38,7 +37,7 @@ def settings(street, *more):
         ("vismatch", ["matching.confidences=false"]),
     ],
 )
-def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_path, monkeypatch, capsys):
     """Names need no prefixes where folders have the names that the tool knew."""
     more = [setting.format(tools=tools) for setting in more]
     typed_here = settings(street, f"matching.matches={tools}/{tool}", *more, "scorer=count", "figures=1",
@@ -54,7 +53,7 @@ def test_an_evaluation_of_the_matches_of_a_tool(street, tools, tool, more, tmp_p
 
 
 @pytest.mark.parametrize("folder", ["kapture", "kapture/reconstruction/matches/sift", "link"])
-def test_changed_keypoints_are_read_again(street, tools, folder, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_changed_keypoints_are_read_again(street, tools, folder, tmp_path, monkeypatch, capsys):
     shutil.copytree(tools / "kapture", tmp_path / "kapture")
     (tmp_path / "link").mkdir()
     (tmp_path / "link" / "reconstruction").symlink_to(tmp_path / "kapture" / "reconstruction")
@@ -71,7 +70,7 @@ def test_changed_keypoints_are_read_again(street, tools, folder, tmp_path, monke
     assert scores[0] != scores[1]
 
 
-def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, capsys):
     typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=count", "figures=0", "retrieval=vlad",
                           "retrieval.num_words=4", "cache=null", f"out={tmp_path}/out")  # fmt: skip
     typed_here = [setting for setting in typed_here if not setting.startswith(("retrieval=pairs", "retrieval.queries"))]
@@ -80,7 +79,7 @@ def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, c
     assert "2 candidates (vlad), imported matches;" in stdout
 
 
-def test_swapped_folders_are_noticed(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_swapped_folders_are_noticed(street, tools, tmp_path, monkeypatch, capsys):
     typed_here = [*settings(street, f"matching.matches={tools}/kapture", f"out={tmp_path}/out"),
                   f"dataset.database={street}/queries", f"dataset.queries={street}/database"]  # fmt: skip
     typed_here = [setting for place, setting in enumerate(typed_here) if place not in (1, 2)]
@@ -89,7 +88,7 @@ def test_swapped_folders_are_noticed(street, tools, tmp_path, monkeypatch, capsy
     assert "exchange dataset.database and dataset.queries" in stderr.splitlines()[-1]
 
 
-def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsys):
     typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=histogram", "grid.sigma=[10,20]",
                           f"cache={tmp_path}/cache", f"out={tmp_path}/out")  # fmt: skip
     code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *typed_here)
@@ -112,7 +111,7 @@ def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsy
         (["matching.matches={tools}/kapture", "matching.max_distance=1"], "max_distance"),
     ],
 )
-def test_wrong_settings_are_one_line(street, tools, more, words, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_wrong_settings_are_one_line(street, tools, more, words, tmp_path, monkeypatch, capsys):
     more = [setting.format(tools=tools) for setting in more]
     typed_here = settings(street, *more, "cache=null", f"out={tmp_path}/out")
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)

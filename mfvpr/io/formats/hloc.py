@@ -23,7 +23,7 @@ class HlocPairs(PairReader):
         if not {"matches0", "keypoints0"} & {*arrays}:
             raise InputError(f"{path}: expected groups IMAGE/IMAGE of matches, as hloc writes them since 2021, got "
                              "others; give matches*.h5, not feats*.h5, or match again")  # fmt: skip
-        self._groups = {tuple(map(self.written, group.split("/"))): group for group in self._file.images}
+        self._groups = {tuple(map(self.spelling, group.split("/"))): group for group in self._file.images}
         if len(self._groups) < len(self._file.images):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
         self.images = tuple(dict.fromkeys(name for pair in self._groups for name in pair))
@@ -46,7 +46,7 @@ class HlocPairs(PairReader):
             numbers, scores = arrays["matches0"], arrays.get("matching_scores0")
             yield _numbered(f"{self.path}: {shorten(group)}", numbers, scores)
 
-    def written(self, name: str) -> str:
+    def spelling(self, name: str) -> str:
         return name.replace("-", "/")
 
 

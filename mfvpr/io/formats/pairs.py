@@ -65,6 +65,11 @@ class PairReader:
         """Size of an image; None = the file does not tell."""
         return None
 
-    def written(self, name: str) -> str:
+    def spelling(self, name: str) -> str:
         """The name of an image in the spelling of the file."""
         return name
+
+    def find_confidences(self, pairs: Sequence[Pair]) -> bool:
+        """Whether the first of the pairs that has matches has confidences."""
+        real = (matches for matches in self.read(pairs) if len(matches.first))
+        return next((matches.confidence is not None for matches in real), False)

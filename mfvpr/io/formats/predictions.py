@@ -18,6 +18,7 @@ from mfvpr.utils.files import printable
 
 QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
 _INLIERS = "num_inliers"
+_MEND = "expected results of To-Match's match_queries_preds.py"
 
 
 def read_predictions(path: Path) -> tuple[str, list[str]]:
@@ -40,7 +41,7 @@ def read_predictions(path: Path) -> tuple[str, list[str]]:
 def read_num_inliers(path: Path) -> list[int]:
     """Numbers of inliers of a query with its predictions, in their order; raises as `_read_results`."""
     results = _read_results(path)
-    with reading(path, mend="expected results of To-Match's match_queries_preds.py"):
+    with reading(path, mend=_MEND):
         if not all(_INLIERS in result for result in results):
             raise InputError(f"expected {_INLIERS} of each prediction, got results without")
         return [natural_number(result[_INLIERS]) for result in results]
@@ -62,8 +63,7 @@ class PredictionPairs(PairReader):
                                      "text file, got more; match the predictions of this run")  # fmt: skip
                 self._places.setdefault((query, predictions[position]), (file, position))
         self.images = tuple(dict.fromkeys(name for pair in self._places for name in pair))
-        real = (matches for matches in self.read([*self._places]) if len(matches.first))
-        self.has_confidences = next((matches.confidence is not None for matches in real), False)
+        self.has_confidences = self.find_confidences([*self._places])
 
     @staticmethod
     def fits(folder: Path) -> bool:
@@ -79,7 +79,7 @@ class PredictionPairs(PairReader):
             file, position = self._places[pair]
             if results is None or results[0] != file:
                 results = file, _read_results(file)
-            with reading(file, mend="expected results of To-Match's match_queries_preds.py"):
+            with reading(file, mend=_MEND):
                 parts = plain_parts(results[1][position])
             yield result_matches(file, parts, self._verified)
 
@@ -87,7 +87,7 @@ class PredictionPairs(PairReader):
 def _read_results(path: Path) -> list[dict[Any, Any]]:
     """A dictionary for each prediction; an InputError if the file is damaged, or holds other content."""
     with (
-        reading(path, mend="expected results of To-Match's match_queries_preds.py"),
+        reading(path, mend=_MEND),
         path.open("rb") as file,
         open_torch_archive(file) as archive,
     ):

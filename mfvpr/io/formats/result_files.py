@@ -1,7 +1,6 @@
 """Read folders with a file of matches for each pair: `.npz`, or `.torch` as vismatch writes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -55,11 +54,7 @@ class ResultFiles(PairReader):
             raise InputError(f"{path}: expected a file .npz or .torch for each pair of images, got {len(files)} files "
                              "of other images; see mfvpr/io/README.md")  # fmt: skip
         self.images = tuple(dict.fromkeys(chain(*self._files)))
-
-    @cached_property
-    def has_confidences(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        real = (matches for matches in self.read([*self._files]) if len(matches.first))
-        return next((matches.confidence is not None for matches in real), False)
+        self.has_confidences = self.find_confidences([*self._files])
 
     def __contains__(self, pair: Pair) -> bool:
         return pair in self._files
