@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from mfvpr.cli.launch import Parser, run_command
+from mfvpr.systems.settings import SettingsError
 
 PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
@@ -17,6 +18,7 @@ BENCHMARKS = {
     "search": "nearest global descriptors of 1, 20 and 100 queries among 10,000 and 100,000 (5 rounds; 6 GB)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
     "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
+    "accelerator": "correct and fast on a GPU? All steps beside torch there (30 rounds; 5 minutes, 1 with --quick)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
 }
 
@@ -31,16 +33,24 @@ def add_arguments(parser: Parser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "\n".join(["benchmarks:", *(f"  {name:<12} {about}" for name, about in BENCHMARKS.items())])
     parser.add_argument("benchmark", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")
+    parser.add_argument("groups", nargs="*", help="accelerator: groups of steps, in this order (default: all)")
     parser.add_argument("--rounds", type=positive_int, help="timed calls of each implementation (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default: runs/benchmark_BENCHMARK.json)")
+    parser.add_argument("--quick", action="store_true", dest="is_quick", help="accelerator: fewer steps, in a minute")
     parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
-def run(benchmark: str, rounds: int | None, out: Path | None) -> None:
+def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None, *, is_quick: bool) -> None:
     """Run a benchmark."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module = import_module(f"experiments.benchmark.{benchmark}")
-    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"))
+    out = out or Path(f"runs/benchmark_{benchmark}.json")
+    if benchmark == "accelerator":
+        module.run(rounds, out, groups, is_quick=is_quick)
+    elif groups or is_quick:
+        raise SettingsError(f"{benchmark} has no groups and no --quick, which belong to accelerator")
+    else:
+        module.run(rounds, out)
 
 
 def positive_int(text: str) -> int:

@@ -66,7 +66,7 @@ def run(rounds: int | None, out: Path) -> Results:
             extractor = contest.extractor(model, batch_size=count)
             entries.append((f"{contest.step}, batch {count}", "mfvpr", partial(extractor, batch[:count])))
         if contest.peer and find_spec("torch"):
-            entries += torch_entries(contest, arrays, batch)
+            entries += torch_entries(contest, arrays, batch, BATCHES)
     sizes = (f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px, SelaVPR at "
              f"{SELAVPR_SIZE[0]} px, others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px")  # fmt: skip
     published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
@@ -154,7 +154,9 @@ def _random(path: str, shape: tuple[int, ...]) -> np.ndarray:
     return normal * np.float32(math.sqrt(2 / math.prod(shape[:-1])))
 
 
-def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np.ndarray) -> list[Entry]:
+def torch_entries(
+    contest: Contest, arrays: Mapping[str, np.ndarray], images: np.ndarray, batches: tuple[int, ...]
+) -> list[Entry]:
     """Torch in both memory layouts, in float32 on a GPU; on a CPU also one image after the other, as in mfvpr."""
     import torch
 
@@ -172,7 +174,7 @@ def torch_entries(contest: Contest, arrays: Mapping[str, np.ndarray], images: np
 
     default, channels_last = run_with(torch.contiguous_format), run_with(torch.channels_last)
     entries: list[Entry] = []
-    for count in BATCHES:
+    for count in batches:
         batch, step = images[:count], f"{contest.step}, batch {count}"
         entries.append((step, f"torch{contest.note}", partial(default, [batch])))
         entries.append((step, f"torch, channels last{contest.note}", partial(channels_last, [batch])))

@@ -188,6 +188,8 @@ def torch_entries(data: Data) -> list[Entry]:
     import torch
     from torch import Tensor
 
+    from experiments.benchmark import torch_scores
+
     # Votes for far bins are denormal floats, which make torch four times as slow. XLA flushes them to zero, so torch
     # does too: its threads inherit the flag from the thread that starts them. NumPy has no such switch.
     torch.set_flush_denormal(True)
@@ -198,29 +200,25 @@ def torch_entries(data: Data) -> list[Entry]:
         return torch.from_numpy(np.array(array))
 
     query, candidates = jax.tree.map(tensor, (data.query, data.candidates))
-    m, centers, rows = data.matches, tensor(CENTERS), torch.arange(KEYPOINTS)
+    m, centers = data.matches, tensor(CENTERS)
     weights = torch.where(tensor(m.mask), tensor(m.scores0) + tensor(m.scores1), 0.0)
     shifts = tensor(jnp.nan_to_num(m.points1 - m.points0))
 
     @torch.inference_mode()
     def match() -> tuple[Tensor, Tensor]:
-        similarity = torch.matmul(query.descriptors, candidates.descriptors.mT)
-        nearest1, nearest0 = similarity.argmax(2), similarity.argmax(1)
-        return nearest1, torch.gather(nearest0, 1, nearest1) == rows
+        return torch_scores.match(query.descriptors, candidates.descriptors)
 
     @torch.inference_mode()
     def histogram(shifts: Tensor, weights: Tensor) -> Tensor:
         torch.set_flush_denormal(True)
-        votes_x = torch.exp(-0.5 * ((shifts[:, :, 0, None] - centers) / SIGMA) ** 2)  # [C, K, B]
-        votes_y = torch.exp(-0.5 * ((shifts[:, :, 1, None] - centers) / SIGMA) ** 2) * weights[:, :, None]
-        scores = torch.matmul(votes_y.mT, votes_x).amax((1, 2))
+        scores = torch_scores.histogram(shifts, weights, centers, SIGMA)
         torch.set_flush_denormal(False)
         return scores
 
     @torch.inference_mode()
     def both() -> Tensor:
         nearest1, mutual = match()
-        moved = torch.gather(candidates.keypoints, 1, nearest1[..., None].expand(-1, -1, 2)) - query.keypoints
+        moved = torch_scores.take(candidates.keypoints, nearest1) - query.keypoints
         sums = query.scores + torch.gather(candidates.scores, 1, nearest1)
         return histogram(moved, torch.where(mutual, sums, 0.0))
 

@@ -73,7 +73,9 @@ def version() -> str:
     """Versions of mfvpr, JAX and Python in one line."""
     from importlib.metadata import version
 
-    return f"mfvpr {version('mfvpr')} (jax {version('jax')}, Python {sys.version.split()[0]})"
+    from mfvpr import __version__
+
+    return f"mfvpr {__version__} (jax {version('jax')}, Python {sys.version.split()[0]})"
 
 
 @contextmanager
