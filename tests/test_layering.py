@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,7 @@ def imported_modules(path):
             yield node.module
 
 
+@cache
 def imports_of(package):
     """All modules that a package, or a module at the root, imports from elsewhere."""
     paths = (ROOT / package).rglob("*.py") if (ROOT / package).is_dir() else [ROOT / f"{package}.py"]
