@@ -73,7 +73,7 @@ def imported_modules(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module == "mfvpr":
-            yield from (f"mfvpr.{alias.name}" for alias in node.names)
+            yield from (f"mfvpr.{alias.name}" for alias in node.names if alias.name != "__version__")
         elif isinstance(node, ast.ImportFrom):
             yield node.module
 
