@@ -1,4 +1,4 @@
-"""What some tests need beside the clone and the library's own dependencies; without it they skip, for one reason."""
+"""Files, programs and packages that some tests need beside a clone; without them, those tests skip for one reason."""
 
 import re
 import shutil
