@@ -47,7 +47,7 @@ from mfvpr.storage import FeatureCache
 def public_objects():
     """Names of `mfvpr` and `mfvpr.datasets`, and names in modules of `mfvpr.datasets` that the pages use."""
     paths = [f"{module.__name__}.{name}" for module in (mfvpr, mfvpr.datasets) for name in module.__all__]
-    for text in (page.read_text() for page in PAGES):
+    for text in (page.read_text() for page in PAGES if page.is_file()):  # not where the wheel alone is
         for module, names in re.findall(r"^from (mfvpr\.datasets\.[\w.]+) import (.+)$", text, flags=re.MULTILINE):
             paths += [f"{module}.{name}" for name in names.split(", ")]
         paths += re.findall(r"`(mfvpr\.datasets\.\w+\.\w+)\(", text)
