@@ -48,7 +48,7 @@ def ratio_oracle(values):
 def effect_oracle(hits):
     """The design effect of hits that are not all equal."""
     ratio, rarer = ratio_oracle(hits), min(sum(hits), len(hits) - sum(hits))
-    weight = (rarer / ratio) ** 3 / 4
+    weight = (rarer / ratio) ** 3 / 6
     return min((weight * ratio + 10 * len(hits) ** (1 / 3)) / (weight + 1), len(hits))
 
 
