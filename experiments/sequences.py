@@ -28,7 +28,7 @@ from mfvpr.cli.systems import load_system
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset
 from mfvpr.evaluation.calibration import CalibrationData, calibration_data
-from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.evaluation.statistics import path_test
 from mfvpr.reranking.drives import Drive
 from mfvpr.reranking.fusion import FrameCorrelation
 from mfvpr.reranking.results import Ranked
@@ -143,11 +143,12 @@ def _joined(hits: Sequence[Hits], method: str) -> Bool[np.ndarray, " images"]:
 
 
 def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"]) -> str:
-    """Recall over all sets, and its gain over single images, with p by blocks of the path."""
+    """Recall over all sets, and its gain over single images, with p along the path."""
     correct, alone = _joined(hits, method), _joined(hits, "single")
     if method == "single":
         return f"{100 * alone.mean():.1f}"
-    p = block_sign_flips(correct, alone, places=places).p_value
+    path = np.argsort(places, kind="stable")
+    p = path_test(correct[path], alone[path]).p_value
     return f"{100 * correct.mean():.1f} ({100 * (correct.mean() - alone.mean()):+.1f}, p {p:.3f})"
 
 

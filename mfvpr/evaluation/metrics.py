@@ -12,7 +12,6 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array
 
 BINS = 10
-_DRAWS = 400
 
 
 def hits(
@@ -40,15 +39,17 @@ def recall_at_k(
     Args:
         order: `[Q, C]` database rows, best first; -1 = none.
         positives: a query without positives counts as a failure.
-        ks: depths; beyond C all C candidates count.
+        ks: depths from 1; beyond C all C candidates count.
 
     Raises:
-        InputError: `order` has other axes.
+        InputError: `order` has other axes, or a depth is below 1.
     """
     order = np.asarray(as_array(order))
     if order.ndim != 2:
         raise InputError(f"order: expected database rows [Q, C], best first, got {list(order.shape)}; count each "
                          "ranking of several by itself")  # fmt: skip
+    if min(ks, default=1) < 1:
+        raise InputError(f"ks: expected depths from 1, got {min(ks)}")
     sets = positives if isinstance(positives, Positives) else Positives.from_matrix(as_array(positives))
     return count_correct(order, sets, ks) / max(len(order), 1)
 
@@ -118,7 +119,7 @@ def reliability(
     """Compare probabilities with the fractions of correct predictions; NaN probabilities are left out."""
     there = ~np.isnan(probability)
     probability, correct = probability[there], np.asarray(correct, bool)[there]
-    place = np.clip((probability * bins).astype(int), 0, bins - 1)
+    place = _bin_numbers(probability, bins)
     count = np.bincount(place, minlength=bins)
     divisor = np.where(count > 0, count, np.nan)
     mean, share = (np.bincount(place, weights=values, minlength=bins) / divisor for values in (probability, correct))
@@ -126,7 +127,18 @@ def reliability(
 
 
 def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> float:
-    """Mean `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries."""
-    rng = np.random.default_rng(0)
-    draws = (rng.random(len(probability)) < probability for _ in range(_DRAWS))
-    return float(np.mean([reliability(probability, correct).calibration_error for correct in draws]))
+    """Expected `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries; exact."""
+    probability = probability[~np.isnan(probability)]
+    if not len(probability):
+        return float("nan")
+    place, distance = _bin_numbers(probability, BINS), 0.0
+    for number in range(BINS):
+        inside, chances = probability[place == number], np.ones(1)  # of 0 ... correct predictions in the bin
+        for value in inside:
+            chances = np.convolve(chances, (1 - value, value))
+        distance += chances @ np.abs(np.arange(len(chances)) - inside.sum())
+    return float(distance / len(probability))
+
+
+def _bin_numbers(probability: np.ndarray, bins: int) -> np.ndarray:
+    return np.clip((probability * bins).astype(int), 0, bins - 1)

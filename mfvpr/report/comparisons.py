@@ -11,7 +11,7 @@ import numpy as np
 
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
-from mfvpr.evaluation.statistics import SignFlips, block_sign_flips, estimate, mcnemar, recall_interval
+from mfvpr.evaluation.statistics import estimate, mcnemar, path_test, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_value
@@ -27,7 +27,7 @@ SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
 def comparison_table(comparison: Comparison) -> Table:
     """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row.
 
-    p is McNemar's, which takes queries for independent, and that of blocks of the path.
+    p is McNemar's, which takes queries for independent, and that of `path_test`.
     """
     protocol = comparison.protocol
     lines, first = [], None
@@ -37,14 +37,14 @@ def comparison_table(comparison: Comparison) -> Table:
         differences = [""] * 3
         if hits is not first:
             pair = hits[protocol.main], first[protocol.main]
-            test, flips = mcnemar(*pair), _flips(protocol, *pair)
-            differences = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{flips.p_value:.2g}"]
+            test, path = mcnemar(*pair), path_test(*pair)
+            differences = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{path.p_value:.2g}"]
         recalls = [f"{100 * values.mean():.1f}" for values in (*hits, *_by_set(protocol, hits[protocol.main]).values())]
         lines.append([name, *recalls, f"[{100 * low:.1f}, {100 * high:.1f}]", *differences])
     words = threshold_words(protocol.unit, protocol.thresholds[protocol.main])
     header = [protocol.label(1, threshold) for threshold in protocol.thresholds]
     header += [f"{name}{words}" for name in protocol.reported_sets]
-    header += [f"95 % at{words}" if words else "95 %", f"against {lines[0][0]}", "p", "p by blocks"]
+    header += [f"95 % at{words}" if words else "95 %", f"against {lines[0][0]}", "p", "p along the path"]
     return Table(["score", *header], lines)
 
 
@@ -52,10 +52,6 @@ def _by_set(protocol: EvaluationProtocol, hits: np.ndarray) -> dict[str, np.ndar
     """Hits `[R]` of each data set, where several are reported on."""
     ends = np.cumsum([*protocol.reported_sets.values()])
     return dict(zip(protocol.reported_sets, np.split(hits, ends[:-1]), strict=False)) if len(ends) else {}
-
-
-def _flips(protocol: EvaluationProtocol, hits: np.ndarray, first: np.ndarray) -> SignFlips:
-    return block_sign_flips(hits, first, sequences=[*protocol.reported_sets.values()] or None)
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -83,7 +79,7 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
             "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
             "interval": by_threshold(map(recall_interval, hits)),
             "against_first": by_threshold(
-                {"mcnemar": mcnemar(*pair)._asdict(), "sign_flips": _flips(protocol, *pair)._asdict()}
+                {"mcnemar": mcnemar(*pair)._asdict(), "path_test": path_test(*pair)._asdict()}
                 for pair in zip(hits, first, strict=True)
             ),
             "by_set": {set_name: by_threshold(set_hits.mean(axis=0).tolist())

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.evaluation import RankedDataset
 from mfvpr.evaluation.selection import places_along_path
-from mfvpr.evaluation.statistics import McNemar, SignFlips, block_sign_flips, mcnemar
+from mfvpr.evaluation.statistics import McNemar, PathTest, mcnemar, path_test
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table, format_number, write_csv
@@ -135,31 +135,31 @@ class Difference(NamedTuple):
     first: str
     second: str
     mcnemar: McNemar
-    sign_flips: SignFlips
+    path: PathTest
 
     @property
     def cells(self) -> list[str]:
         """A line of `differences.csv`."""
-        counts, flips = self.mcnemar, self.sign_flips
-        numbers = map(format_number, (counts.p_value, flips.block, flips.blocks, flips.p_value))
+        counts = self.mcnemar
+        numbers = map(format_number, (counts.p_value, *self.path))
         return [self.first, self.second, str(counts.only_first), str(counts.only_second), *numbers]
 
 
 def differences(evaluation: EvaluationReport) -> list[Difference]:
     """Tests of every two systems, in their order, with ground truth."""
-    hits, places = {name: evaluation.hits(name) for name in evaluation.ranked.systems}, _places(evaluation)
+    path = np.argsort(_places(evaluation), kind="stable")
+    hits = {name: evaluation.hits(name)[path] for name in evaluation.ranked.systems}
     return [
-        Difference(first, second, mcnemar(hits[first], hits[second]),
-                   block_sign_flips(hits[first], hits[second], places=places))
+        Difference(first, second, mcnemar(hits[first], hits[second]), path_test(hits[first], hits[second]))
         for first, second in itertools.combinations(hits, 2)
-    ]  # fmt: skip
+    ]
 
 
-def _places(evaluation: EvaluationReport) -> np.ndarray | None:
-    """`[Q]` places of all queries along the map; None for one sequence in the order of its path."""
+def _places(evaluation: EvaluationReport) -> np.ndarray:
+    """`[Q]` places of all queries along the map; those of one sequence without positions are in their order."""
     truth = evaluation.sequences[0].truth
     if truth is None or (len(evaluation.sequences) == 1 and truth.unit != "m"):
-        return None
+        return np.arange(evaluation.num_queries)
     known = [positives for positives in evaluation.positives if positives is not None]
     return places_along_path(stack_positives(known), truth.unit)
 
@@ -172,8 +172,7 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
     """
     if not evaluation.thresholds:
         return
-    systems, places = [*evaluation.ranked.systems], _places(evaluation)
-    places = evaluation.by_sequence(np.arange(evaluation.num_queries) if places is None else places)
+    systems, places = [*evaluation.ranked.systems], evaluation.by_sequence(_places(evaluation))
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
     for part, sequence in enumerate(evaluation.sequences):
         columns = [sequence.images.names, places[part].tolist()]
@@ -183,10 +182,10 @@ def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
             columns += [correct[:, 0].astype(int).tolist(), [rank or "" for rank in ranks.tolist()]]
         write_csv(evaluation.folder(folder, part) / "gains.csv", header, zip(*columns, strict=True))
     tests, counts = differences(evaluation), {}
-    for first, second, test, flips in tests:
-        counts[first, second] = f"{test.only_first} (p {flips.p_value:.2g})"
-        counts[second, first] = f"{test.only_second} (p {flips.p_value:.2g})"
+    for first, second, test, path in tests:
+        counts[first, second] = f"{test.only_first} (p {path.p_value:.2g})"
+        counts[second, first] = f"{test.only_second} (p {path.p_value:.2g})"
     rows = [[name, *(counts.get((name, other), "") for other in systems)] for name in systems]
-    header = ["system", "other", "only_system", "only_other", "mcnemar_p", "block", "blocks", "blocks_p"]
+    header = ["system", "other", "only_system", "only_other", "mcnemar_p", "design_effect", "path_p"]
     write_csv(folder / "differences.csv", header, [test.cells for test in tests])
     write_text(folder / "differences.md", Table(["only this is correct, not", *systems], rows).markdown())

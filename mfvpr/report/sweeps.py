@@ -155,7 +155,7 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
         "report": [
             {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
              "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict(),
-             "sign_flips": verdict.sign_flips._asdict()}
+             "path_test": verdict.path_test._asdict()}
             for verdict in outcome.report
         ],
         "settings": [
@@ -199,9 +199,8 @@ def _verdicts(outcome: Outcome) -> Iterator[str]:
         yield (
             f"{protocol.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
             f"{_with_interval(verdict.own)}; only one of them correct: {verdict.mcnemar.only_first} and "
-            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}, by "
-            f"{verdict.sign_flips.blocks} blocks of {verdict.sign_flips.block} queries "
-            f"p = {verdict.sign_flips.p_value:.2g}"
+            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}, "
+            f"along the path p = {verdict.path_test.p_value:.2g}"
         )
     if not protocol.halves:
         yield (

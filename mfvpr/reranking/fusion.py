@@ -32,8 +32,8 @@ class Fusion:
     Attributes:
         c: the combined score is main score + c * retrieval score; None = `balancing_c` of each query. "zscore" = the
             sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
-            equal). With retrieval and main score only, "zscore" ranks as None does, but its values have the same unit
-            for every query. A score that is not finite affects only its own candidate.
+            equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
+            the same unit for every query. A score that is not finite affects only its own candidate.
         retrieval_score: kind of retrieval score, see `mfvpr.reranking.ranking.retrieval_scores`.
         weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
             and of further scorers, which take part only if they are named here.

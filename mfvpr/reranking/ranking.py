@@ -101,14 +101,11 @@ def balancing_c(
 
         mfvpr.balancing_c(shortlist.scores[0], scores[0], shortlist.mask[0])
 
-    `retrieval_scores` and `rerank_scores` count where they are finite and `mask` is True.
+    Candidates count if `mask` is True and both scores are finite.
     """
-
-    def deviation(scores: Array) -> Array:
-        return masked_std(_wide(scores), mask & jnp.isfinite(scores))
-
-    retrieval_deviation = deviation(retrieval_scores)
-    c = deviation(rerank_scores) / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
+    both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
+    retrieval_deviation, deviation = (masked_std(_wide(scores), both) for scores in (retrieval_scores, rerank_scores))
+    c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
     return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
 
 

@@ -60,7 +60,7 @@ def test_all_rows_in_every_file(learned):
     assert [row["score"] for row in content["rows"]] == ROWS
     with (out / "table.csv").open() as file:
         header, *lines = csv.reader(file)
-    assert header == ["score", "R@1 ±0", "R@1 ±1", "95 % at ±1", "against paper", "p", "p by blocks"]
+    assert header == ["score", "R@1 ±0", "R@1 ±1", "95 % at ±1", "against paper", "p", "p along the path"]
     assert [line[0] for line in lines] == ROWS
     for line, row in zip(lines, content["rows"], strict=True):
         assert [float(cell) for cell in line[1:3]] == [round(100 * value, 1) for value in row["recall_at_1"].values()]

@@ -22,7 +22,7 @@ from mfvpr.cli import console, evaluation, run_folder
 from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import mcnemar
-from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.evaluation.statistics import path_test
 from mfvpr.report import runs
 from mfvpr.report.query_figures import SequenceFigures
 from mfvpr.systems.settings import SettingsError
@@ -104,7 +104,7 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
         first, second = (hits[name] for name in pair)
         assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
         assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
-        assert float(line["blocks_p"]) == pytest.approx(block_sign_flips(first, second).p_value, rel=1e-6)
+        assert float(line["path_p"]) == pytest.approx(path_test(first, second).p_value, rel=1e-6)
     header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
     assert header == "| only this is correct, not | retrieval | histogram | histogram + retrieval |"
     assert line.startswith(f"| histogram | {(hits['histogram'] > hits['retrieval']).sum()} (p ")

@@ -99,8 +99,7 @@ def test_the_best_setting_is_chosen_and_told(swept):
     assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
     assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
     assert "this flatters" in text
-    flips = content["report"][1]["sign_flips"]
-    assert f"by {flips['blocks']} blocks of {flips['block']} queries p = {flips['p_value']:.2g}" in text
+    assert f"along the path p = {content['report'][1]['path_test']['p_value']:.2g}" in text
 
 
 def test_heat_maps_are_pictures(swept):

@@ -11,7 +11,9 @@ import pytest
 from scipy import special
 
 from mfvpr.datasets import Positives
+from mfvpr.datasets.truth import FrameTruth
 from mfvpr.evaluation import confidence_inputs, fit_confidence, read_confidences, write_confidences
+from mfvpr.evaluation.calibration import absent_rankings
 from mfvpr.report.confidences import recalls_by_share
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.reranking import Ranked
@@ -84,6 +86,14 @@ def test_few_candidates_of_other_places_make_no_answer_certain(num_others):
     assert 0.02 < model(few, few)[0] < 0.7
     place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other: what is known of all predictions
     assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
+
+
+@pytest.mark.parametrize(("tolerance", "around"), [(0, 5), (1, 5), (2, 10)])
+def test_an_absent_place_is_five_times_as_far_as_a_correct_prediction_at_least_five_frames(tolerance, around):
+    ranked = Ranked(np.arange(30)[None], -np.arange(30.0)[None])
+    absent, _ = absent_rankings(ranked, ranked, FrameTruth(((0,),), 30), tolerance)
+    assert absent.rows[0, : 29 - around].tolist() == list(range(around + 1, 30))
+    assert (absent.rows[0, 29 - around :] == -1).all()
 
 
 def draw_answers(weights, bias, queries=4000, seed=1):

@@ -15,7 +15,7 @@ from mfvpr import datasets
 from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence
 from mfvpr.evaluation.evaluation import KS
-from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
@@ -86,9 +86,9 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     hits = {
         name: np.concatenate([evaluation.is_correct(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems
     }
-    for first, second, counts, flips in differences(evaluation):
+    for first, second, counts, path in differences(evaluation):
         assert counts.only_first == (hits[first] > hits[second]).sum()
-        assert flips == block_sign_flips(hits[first], hits[second], places=np.arange(10))
+        assert path == path_test(hits[first], hits[second])
     with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match=r"sequences .*got first twice"):

@@ -1,5 +1,6 @@
 """Precision, recall and calibration against explicit loops and closed forms."""
 
+import itertools
 import math
 
 import numpy as np
@@ -72,8 +73,17 @@ def test_reliability_is_that_of_loops_over_bins(bins):
 
 
 def test_calibration_error_by_chance_is_that_of_probabilities_that_are_true():
-    """One bin of p = 1/2: the mean distance of a fair coin's share of heads, sqrt(2 / (pi n)) / 2 of n throws."""
-    assert chance_calibration_error(np.full(100, 0.5)) == pytest.approx(math.sqrt(2 / (math.pi * 100)) / 2, rel=0.1)
+    """One bin of n fair coins, and all 2^n outcomes of a few predictions in several bins."""
+    expected = sum(math.comb(100, heads) / 2**100 * abs(heads - 50) / 100 for heads in range(101))
+    assert chance_calibration_error(np.full(100, 0.5)) == pytest.approx(expected, rel=1e-9)
+    probability, expected = np.array([0.05, 0.07, 0.31, 0.35, 0.38, 0.9, 1.0]), 0.0
+    for outcome in itertools.product([False, True], repeat=7):
+        correct = np.array(outcome)
+        expected += np.where(correct, probability, 1 - probability).prod() * (
+            reliability(probability, correct).calibration_error
+        )
+    assert chance_calibration_error(np.append(probability, np.nan)) == pytest.approx(expected, rel=1e-9)
+    assert np.isnan(chance_calibration_error(np.full(3, np.nan)))
     assert chance_calibration_error(np.array([0.0, 1.0, np.nan])) == 0
     assert np.isnan(reliability(np.full(3, np.nan), np.zeros(3, bool)).calibration_error)
 

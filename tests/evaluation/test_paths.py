@@ -5,7 +5,7 @@ import pytest
 
 from mfvpr.datasets import Positives
 from mfvpr.evaluation.selection import places_along_path
-from mfvpr.evaluation.statistics import block_sign_flips
+from mfvpr.evaluation.statistics import path_test
 
 PLACES = 60
 DRIVES = [*range(PLACES), *reversed(range(0, PLACES, 2))]  # there and back
@@ -44,17 +44,17 @@ def test_places_that_the_map_does_not_show_are_none(unit):
         assert places_along_path(Positives.from_rows([[]] * queries, 4), unit).tolist() == [-1] * queries
 
 
-def test_p_by_blocks_is_rarely_low_without_a_difference_however_the_names_are_sorted():
+def test_p_along_the_path_is_rarely_low_without_a_difference_however_the_names_are_sorted():
     """Two systems that are equally good, each with its own weak stretches of the street, which drives share."""
     rng, draws, low = np.random.default_rng(0), 200, {"sorted by chance": 0, "along the path": 0}
     names = rng.permutation(len(DRIVES))  # queries in the order of files
-    places = places_along_path(shown(0).take(names), "m")
+    path = np.argsort(places_along_path(shown(0).take(names), "m"), kind="stable")
     for _ in range(draws):
         hits = []
         for _ in range(2):
             latent = np.convolve(rng.normal(size=PLACES + 14), np.ones(15), "valid") / np.sqrt(15)
             hits.append((latent[DRIVES] > -0.5)[names])
-        low["sorted by chance"] += block_sign_flips(*hits).p_value <= 0.05
-        low["along the path"] += block_sign_flips(*hits, places=places).p_value <= 0.05
+        low["sorted by chance"] += path_test(*hits).p_value <= 0.05
+        low["along the path"] += path_test(*np.array(hits)[:, path]).p_value <= 0.05
     assert low["along the path"] <= 0.1 * draws
     assert low["sorted by chance"] >= 0.3 * draws

@@ -1,6 +1,5 @@
 """Intervals and tests against closed forms, explicit loops and simulated paths."""
 
-import itertools
 import math
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from scipy import signal, stats
 
 from mfvpr.evaluation import mcnemar
-from mfvpr.evaluation.statistics import block_sign_flips, design_effect, recall_interval
+from mfvpr.evaluation.statistics import design_effect, path_test, recall_interval
 from mfvpr.utils import InputError
 
 
@@ -21,52 +20,64 @@ def latent_paths(recall, correlation, queries, count=200, systems=1, shared=0.0,
     return math.sqrt(shared) * common + math.sqrt(1 - shared) * np.array(separate) < stats.norm.ppf(recall)
 
 
-def effect_oracle(values, events, sequences=None):
-    """The design effect, with loops over lags and queries, of which so many tell something."""
-    total, mean = len(values), sum(values) / len(values)
-    ends = np.cumsum(sequences or [total])
-    owner = np.searchsorted(ends, np.arange(total), side="right")
-    covariances = [
-        sum((values[query] - mean) * (values[query + lag] - mean) for query in range(total - lag)
-            if owner[query] == owner[query + lag])
-        for lag in range(total)
-    ]  # fmt: skip
-    correlations = [covariance / covariances[0] for covariance in covariances]
-    bound = 2 * math.sqrt(math.log10(total) / total)
-    half = 0
-    while any(abs(value) >= bound for value in correlations[half + 1 : half + 6]) and half < math.sqrt(total):
-        half += 1
-    half = max(half, 1)
-    flat = 1 + 2 * sum(value * min(1, max(0, 2 - lag / half)) for lag, value in enumerate(correlations) if lag)
-    first = min(max((total * correlations[1] + 1) / (total - 3), 0), 0.98)
-    return min((events * max(1, flat, (1 + first) / (1 - first)) + total ** (1 / 3)) / (events + 1), total)
+def averaged_paths(recall, window, queries, count=200, seed=0):
+    """Hits of single queries, whose latent path has noise, and hits after averages in a window: [2, count, queries]."""
+    rng = np.random.default_rng(seed)
+    shape = count, queries + len(window) - 1
+    latent = math.sqrt(0.3) * signal.lfilter([math.sqrt(0.75)], [1, -0.5], rng.standard_normal(shape))
+    latent += math.sqrt(0.7) * rng.standard_normal(shape)
+    average = signal.fftconvolve(latent, window[None], mode="valid", axes=1)
+    return np.array([path / path.std() < stats.norm.ppf(recall) for path in (latent[:, :queries], average)])
+
+
+def ratio_oracle(values):
+    """The larger variance ratio of a Markov chain of queries and of blocks of queries, with loops."""
+    total, mean, ratios = len(values), sum(values) / len(values), [1.0]
+    variance = sum((value - mean) ** 2 for value in values) / total
+    for size in (1, round(math.sqrt(total))):
+        count = total // size
+        sums = [sum(value - mean for value in values[start * size : (start + 1) * size]) for start in range(count)]
+        center = sum(sums) / count
+        squares = sum((value - center) ** 2 for value in sums)
+        products = sum((sums[place] - center) * (sums[place + 1] - center) for place in range(count - 1))
+        first = min(max((count * products / squares + 1) / (count - 3), 0), 0.98)
+        ratios.append(squares / (count * size) / variance * (1 + first) / (1 - first))
+    return min(max(ratios), total)
+
+
+def effect_oracle(hits):
+    """The design effect of hits that are not all equal."""
+    ratio, rarer = ratio_oracle(hits), min(sum(hits), len(hits) - sum(hits))
+    weight = (rarer / ratio) ** 3 / 6
+    return min((weight * ratio + 10 * len(hits) ** (1 / 3)) / (weight + 1), len(hits))
 
 
 @pytest.mark.parametrize("correlation", [0, 0.6, 0.9])
 def test_design_effect_equals_the_loops(correlation):
     for hits in latent_paths(0.7, correlation, 80, count=10, seed=1)[0]:
-        if hits.all() or not hits.any():
-            continue
-        rarer = min(hits.sum(), 80 - hits.sum())
-        assert design_effect(hits) == pytest.approx(effect_oracle(hits.tolist(), rarer), rel=1e-9)
+        assert design_effect(hits) == pytest.approx(effect_oracle(hits.astype(int).tolist()), rel=1e-9)
 
 
 @pytest.mark.parametrize("level", [0.9, 0.95])
 def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth(level):
     for hits in latent_paths(0.8, 0.5, 60, count=10, seed=2)[0]:
         worth = 60 / design_effect(hits)
-        worth *= (stats.t(59).ppf((1 + level) / 2) / stats.t(worth - 1).ppf((1 + level) / 2)) ** 2
         correct, tail = hits.mean() * worth, (1 - level) / 2
         low, high = recall_interval(hits, level=level)
         assert stats.beta(correct, worth - correct + 1).cdf(low) == pytest.approx(tail)
-        assert stats.beta(correct + 1, worth - correct).sf(high) == pytest.approx(tail)
+        assert stats.beta(worth - correct, correct + 1).cdf(1 - high) == pytest.approx(
+            tail, rel=1e-3
+        )  # 1 - high is small
 
 
-@pytest.mark.parametrize("recall", [0.5, 0.65, 0.8, 0.95])
-def test_along_a_path_the_recall_is_in_nine_of_ten_intervals(recall):
-    """Thresholded Gaussian sequences of 101 queries; two standard errors are allowed for."""
-    low, high = np.array([recall_interval(hits) for hits in latent_paths(recall, 0.8, 101, count=400)[0]]).T
-    assert np.mean((low <= recall) & (recall <= high)) >= 0.9 - 2 * math.sqrt(0.9 * 0.1 / 400)
+# Autocorrelations of the latent path for which the hits have 0.9 from query to query.
+@pytest.mark.parametrize(("recall", "latent"), [(0.5, 0.988), (0.65, 0.988), (0.8, 0.99), (0.95, 0.993)])
+@pytest.mark.parametrize("queries", [101, 300])
+def test_along_a_path_the_recall_is_in_nine_of_ten_intervals(recall, latent, queries):
+    """Two standard errors are allowed for."""
+    paths = latent_paths(recall, latent, queries, count=300)[0]
+    low, high = np.array([recall_interval(hits) for hits in paths]).T
+    assert np.mean((low <= recall) & (recall <= high)) >= 0.9 - 2 * math.sqrt(0.9 * 0.1 / 300)
 
 
 @pytest.mark.parametrize("queries", [1, 2, 9, 100])
@@ -106,79 +117,44 @@ def test_mcnemar_is_a_fair_coin_on_the_queries_that_differ(only_first, only_seco
     assert got.p_value == pytest.approx(min(1.0, 2 * tail))
 
 
-def flips_oracle(differences, sequences, block):
-    """Number of blocks in which one is ahead, and the share of all their flips that sum to as much, either way."""
-    sums, start = [], 0
-    for length in sequences:
-        path = differences[start : start + length]
-        start += length
-        sums += [sum(path[place : place + block]) for place in range(0, length, block)]
-    sums = [value for value in sums if value]
-    flips = [
-        abs(sum(sign * value for sign, value in zip(signs, sums, strict=True))) >= abs(sum(sums))
-        for signs in itertools.product((1, -1), repeat=len(sums))
-    ]
-    return len(sums), sum(flips) / len(flips)
+def test_path_test_is_a_fair_coin_on_as_many_queries_as_the_path_is_worth():
+    for first, second in latent_paths(0.6, 0.5, 101, count=20, systems=2).swapaxes(0, 1):
+        paths = [values.tolist() for values in (first.astype(int), second.astype(int), first.astype(int) - second)]
+        effect = max(effect_oracle(paths[0]), effect_oracle(paths[1]), ratio_oracle(paths[2]))
+        more, fewer = sorted([(first > second).sum() / effect, (first < second).sum() / effect], reverse=True)
+        tail = stats.beta(more, fewer + 1).cdf(0.5)  # P(at most `fewer` of `more + fewer` tosses)
+        assert path_test(first, second) == path_test(second, first)
+        assert path_test(first, second) == pytest.approx((effect, 1.0 if more == fewer else min(1.0, 2 * tail)))
 
 
-@pytest.mark.parametrize("sequences", [[30], [13, 17], [1, 20, 0, 9]])
-@pytest.mark.parametrize("block", [1, 3, 4, 50])
-def test_block_sign_flips_count_all_flips_of_blocks_within_a_sequence(sequences, block):
-    for first, second in latent_paths(0.7, 0.6, 30, count=8, systems=2).swapaxes(0, 1):
-        expected = flips_oracle((first.astype(int) - second).tolist(), sequences, block)
-        got = block_sign_flips(first, second, block=block, sequences=sequences)
-        assert got == (block, expected[0], pytest.approx(expected[1], rel=1e-12))
-        assert block_sign_flips(second, first, block=block, sequences=sequences) == got
-
-
-@pytest.mark.parametrize("sequences", [[101], [60, 41]])
-def test_blocks_are_longer_where_neighbors_differ_together(sequences):
-    lengths = {}
-    for correlation in (0, 0.8):
-        pairs = latent_paths(0.7, correlation, 101, count=10, systems=2, shared=0.3).swapaxes(0, 1)
-        lengths[correlation] = [block_sign_flips(*pair, sequences=sequences).block for pair in pairs]
-        for (first, second), length in zip(pairs, lengths[correlation], strict=True):
-            differences = first.astype(int) - second
-            effect = effect_oracle(differences.tolist(), np.count_nonzero(differences), sequences)
-            assert length == min(math.ceil(101 ** (1 / 3) * effect), 101)
-    assert np.median(lengths[0]) < 8
-    assert np.median(lengths[0.8]) > 12
-
-
+@pytest.mark.parametrize("queries", [101, 300, 1000])
 @pytest.mark.parametrize("recall", [0.5, 0.8])
-def test_equal_systems_seldom_differ_by_blocks_and_often_by_mcnemar(recall):
-    """At 5 %; at most 8 % are promised."""
-    pairs = latent_paths(recall, 0.8, 101, count=300, systems=2, shared=0.3).swapaxes(0, 1)
-    flips, coins = ([test(*pair).p_value <= 0.05 for pair in pairs] for test in (block_sign_flips, mcnemar))
-    assert np.mean(flips) <= 0.08
-    assert np.mean(coins) > 0.25
+def test_a_sequence_seldom_differs_from_equally_good_single_queries(queries, recall):
+    """At 5 %; two standard errors are allowed for. Windows are causal and smoothed averages."""
+    causal, smoothed = 0.9 ** np.arange(60), np.convolve(np.ones(12), np.ones(12))
+    pairs = [averaged_paths(recall, window, queries, count=100) for window in (causal, smoothed)]
+    single = latent_paths(recall, 0, queries, count=100, seed=1)
+    pairs += [np.concatenate([single, latent_paths(recall, latent, queries, count=100)]) for latent in (0.95, 0.99)]
+    for pair in pairs:
+        assert np.mean([path_test(*hits).p_value <= 0.05 for hits in pair.swapaxes(0, 1)]) <= 0.05 + 0.044
 
 
-def test_systems_that_agree_do_not_differ_and_one_always_ahead_does():
-    hits = np.arange(20) < 15
-    assert block_sign_flips(hits, hits) == (8, 0, 1.0)  # the cube root, squared
-    assert block_sign_flips(hits[:0], hits[:0]) == (1, 0, 1.0)
-    ahead = np.ones(40, bool)
-    assert block_sign_flips(ahead, ~ahead, block=4) == (4, 10, pytest.approx(2 / 2**10))
-    assert block_sign_flips(ahead, ~ahead).block == 12
+def test_equal_systems_often_differ_by_mcnemar_along_a_path_and_a_better_one_is_found():
+    pairs = latent_paths(0.8, 0.8, 300, systems=2, shared=0.3).swapaxes(0, 1)
+    assert np.mean([mcnemar(*pair).p_value <= 0.05 for pair in pairs]) > 0.25
+    assert np.mean([path_test(*pair).p_value <= 0.05 for pair in pairs]) <= 0.07
+    worse, better = latent_paths(0.8, 0, 300, seed=1)[0], latent_paths(0.9, 0, 300, seed=2)[0]
+    assert np.mean([path_test(*pair).p_value <= 0.05 for pair in zip(worse, better, strict=True)]) > 0.6
 
 
-@pytest.mark.parametrize("options", [{"sequences": [3, 3]}, {"sequences": [6, -1]}, {"block": 0}])
-def test_blocks_of_other_queries_are_refused(options):
-    with pytest.raises(InputError, match="expected"):
-        block_sign_flips(np.ones(5), np.ones(5), **options)
+@pytest.mark.parametrize("queries", [0, 1, 3, 4, 20])
+def test_systems_that_agree_or_are_equally_often_ahead_do_not_differ(queries):
+    hits = np.arange(queries) % 2 > 0
+    assert path_test(hits, hits).p_value == 1.0
+    if queries % 2 == 0:
+        assert path_test(hits, ~hits).p_value == 1.0
+
+
+def test_a_path_needs_the_same_queries():
     with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
-        block_sign_flips(np.ones(5), np.ones(4))
-
-
-@pytest.mark.parametrize("block", [2, 5])
-def test_queries_of_one_place_differ_together(block):
-    """Against all flips of blocks of the sums by place, in whatever order queries are given."""
-    rng = np.random.default_rng(0)
-    for first, second in latent_paths(0.7, 0.6, 40, count=8, systems=2).swapaxes(0, 1):
-        places = rng.integers(-1, 25, 40)
-        sums = [int((first.astype(int) - second)[places == place].sum()) for place in np.unique(places)]
-        expected = flips_oracle(sums, [len(sums)], block)
-        assert block_sign_flips(first, second, block=block, places=places) == (
-            block, expected[0], pytest.approx(expected[1], rel=1e-12),
-        )  # fmt: skip
+        path_test(np.ones(5), np.ones(4))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mfvpr.evaluation import mcnemar
-from mfvpr.evaluation.statistics import block_sign_flips, recall_interval
+from mfvpr.evaluation.statistics import path_test, recall_interval
 from mfvpr.report import write_json
 from mfvpr.report.pages import one_run, several_runs
 from mfvpr.report.pages.files import read_run
@@ -195,10 +195,9 @@ def test_runs_are_compared_query_by_query(tmp_path):
     write_comparison(runs, tmp_path / "page.html")
     page = Parsed(tmp_path / "page.html")
     hits = [np.array(ranks[HEADLINE]) == 1 for ranks in (RANKS, other)]
-    test, flips = mcnemar(*hits), block_sign_flips(*hits)
+    test, path = mcnemar(*hits), path_test(*hits)
     [row] = [row for row in page.rows if row and row[0] == f"a: {HEADLINE}"]
-    assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", f"{test.p_value:.2g}", str(flips.block),
-                   str(flips.blocks), f"{flips.p_value:.2g}"]  # fmt: skip
+    assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", *(f"{value:.2g}" for value in (test.p_value, *path))]
     assert [bar["x"] for bar in page.charts["intervals"]["data"]] == [[80.0, 50.0]]
     assert "Not comparable" not in "".join(page.text)
     assert len(page.scripts) == 3

@@ -84,9 +84,11 @@ def test_balancing_c_equalizes_the_spread_of_real_candidates():
 
 def test_a_score_that_is_no_number_takes_no_part_in_the_balance():
     retrieval_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
-    expected = np.std([10.0, 50.0, 30.0]) / np.std(retrieval_scores)  # the similarity of its candidate counts
+    expected = np.std([10.0, 50.0, 30.0]) / np.std(retrieval_scores[:3])  # without its candidate
     for broken in (np.nan, np.inf):
         c = balancing_c(retrieval_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
+        np.testing.assert_allclose(c, expected, rtol=1e-6)
+        c = balancing_c(retrieval_scores.at[3].set(broken), jnp.array([10.0, 50.0, 30.0, 20.0]), mask)
         np.testing.assert_allclose(c, expected, rtol=1e-6)
     assert balancing_c(retrieval_scores, jnp.full(4, jnp.nan), mask) == 0.0
 

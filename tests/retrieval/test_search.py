@@ -136,6 +136,8 @@ def test_unsigned_frame_numbers_do_not_wrap():
 def test_rankings_of_several_systems_are_refused():
     with pytest.raises(InputError, match=r"^order: expected database rows \[Q, C\].* got \[1, 2, 2\]"):
         recall_at_k(np.zeros((1, 2, 2), int), np.eye(2, dtype=bool), [1])
+    with pytest.raises(InputError, match="ks: expected depths from 1, got -1"):
+        recall_at_k(np.zeros((2, 2), int), np.eye(2, dtype=bool), [1, -1])
 
 
 def test_no_database_and_no_queries_recall_nothing():

@@ -23,7 +23,7 @@ _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
 _SIZES = {"queries": "queries", "database": "database images", "candidates": "candidates of a query",
           "bytes_per_image": "bytes on disk of an image's features, about"}  # fmt: skip
-_P_VALUES = (4, 7)  # columns of differences.csv
+_NUMBERS = (4, 5, 6)  # columns of differences.csv with two digits
 _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
 
@@ -178,11 +178,11 @@ def paired_tests(kind: str, lines: Sequence[Sequence[str]]) -> tuple[str, Table]
     """Explanation and table of paired tests of systems or of runs (`kind`), of lines as in `differences.csv`."""
     words = (
         f"How many queries only one of two {kind}s predicts correctly, and how probable that is if neither is better, "
-        "by McNemar's exact test, which takes queries for independent, and by blocks of neighbors along the path."
+        "by McNemar's exact test, which takes queries for independent, and by a test along the path."
     )
-    rows = [[f"{float(cell):.2g}" if column in _P_VALUES else cell for column, cell in enumerate(line)]
+    rows = [[f"{float(cell):.2g}" if column in _NUMBERS else cell for column, cell in enumerate(line)]
             for line in lines]  # fmt: skip
-    columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries in a block", "blocks", "p by blocks"
+    columns = kind, "other", f"only {kind}", "only other", "McNemar p", "queries worth one", "p along the path"
     return words, Table(columns, rows, text_columns=2)
 
 

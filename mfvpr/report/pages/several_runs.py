@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mfvpr.evaluation.statistics import block_sign_flips, mcnemar
+from mfvpr.evaluation.statistics import mcnemar, path_test
 from mfvpr.report.evaluation_files import Difference
 from mfvpr.report.pages import one_run
 from mfvpr.report.pages.charts import bar_chart
@@ -97,8 +97,8 @@ def _pairs(runs: Mapping[str, Run]) -> Section:
             incomparable.append([label, other, reason])
             continue
         pair = run.all_gains.hits(run.headline), second.all_gains.hits(second.headline)
-        tests = mcnemar(*pair), block_sign_flips(*pair, places=np.sort(run.all_gains.places))
-        rows.append(Difference(f"{label}: {run.headline}", f"{other}: {second.headline}", *tests).cells)
+        names = f"{label}: {run.headline}", f"{other}: {second.headline}"
+        rows.append(Difference(*names, mcnemar(*pair), path_test(*pair)).cells)
     words, tests = one_run.paired_tests("run", rows)
     tables = {"Every two runs of the same queries": tests} if rows else {}
     if incomparable:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
-from mfvpr.evaluation.statistics import Estimate, McNemar, SignFlips, block_sign_flips, estimate, mcnemar
+from mfvpr.evaluation.statistics import Estimate, McNemar, PathTest, estimate, mcnemar, path_test
 from mfvpr.matching.match_set import MatchSet, Scales
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.rankings import DEFAULT_OPTIONS, SweepOptions, duration, rank_settings
@@ -33,7 +33,7 @@ class Verdict(NamedTuple):
     chosen: Estimate
     own: Estimate
     mcnemar: McNemar
-    sign_flips: SignFlips  # by blocks of the path
+    path_test: PathTest
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Outcome:
         return [
             Verdict(
                 threshold, len(first), estimate(first), estimate(second),
-                mcnemar(first, second), block_sign_flips(first, second),
+                mcnemar(first, second), path_test(first, second),
             )
             for threshold, first, second in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True)
         ]  # fmt: skip

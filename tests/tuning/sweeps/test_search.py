@@ -116,7 +116,7 @@ def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     assert verdict.chosen == statistics.estimate(first) == (np.mean(first), verdict.chosen.interval)
     assert verdict.chosen.interval == statistics.recall_interval(first)
     assert verdict.mcnemar == statistics.mcnemar(first, of_scorer)
-    assert verdict.sign_flips == statistics.block_sign_flips(first, of_scorer)
+    assert verdict.path_test == statistics.path_test(first, of_scorer)
 
 
 @needs("optuna")
