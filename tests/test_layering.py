@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent / "mfvpr"
+import mfvpr
+
+ROOT = Path(mfvpr.__file__).parent
 # Packages and modules at the root, each with all that it imports of those above it.
 PERMISSIONS = {
     "utils": set(),

@@ -5,6 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.needs import needs
+
+pytestmark = needs("experiments")
+
 ROOT = Path(__file__).parent.parent
 # Words that say nothing of the value. A few fields of public values still have them.
 EMPTY_NAMES = {"found", "one", "kept", "told", "asked", "given", "made", "some", "others", "nothing", "who",

@@ -11,7 +11,10 @@ import pytest
 from mfvpr.cli import overrides
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
 from mfvpr.systems.settings import CONF, RULES, check, scorer_rules
+from tests.needs import needs
 from tests.programs import QUICK, ROOT, composed, run, typed
+
+pytestmark = needs("experiments")
 
 README = "README.md"
 PAGES = {

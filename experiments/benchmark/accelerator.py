@@ -106,6 +106,7 @@ def shortlist_of(candidates: int, keypoints: int, dimension: int) -> tuple[Featu
 @cache
 def matches_of(pairs: int) -> Matches:
     """Matches of pairs; a third of the matches of a pair agree."""
+
     @jax.jit
     def make() -> Matches:
         keys = jax.random.split(jax.random.key(3), 6)
@@ -340,7 +341,10 @@ def query(queries: int, images: int, candidates: int, keypoints: int, dimension:
 
     one, others = take(views, 0), take(database, rows[0])
     arrays = [field for side in (views, database) for field in (side.keypoints, side.descriptors, side.scores)]
-    separate: Calls = {"mfvpr": ready(rank_one, one, others), "mfvpr, in one jit": ready(jax.jit(rank_one), one, others)}
+    separate: Calls = {
+        "mfvpr": ready(rank_one, one, others),
+        "mfvpr, in one jit": ready(jax.jit(rank_one), one, others),
+    }
     together: Calls = {"mfvpr": ready(jax.jit(rank_all), views, database, rows)}
     product = Work(2 * queries * candidates * keypoints**2 * dimension / 1e12, "TFLOP")
     return (separate if queries == 1 else together) | with_torch(calls, rows, *arrays), product
@@ -387,7 +391,9 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
         raise InputError(f"group: expected {', '.join(SECONDS)}, got {', '.join(sorted(unknown))}")
     device, on_cpu = jax.devices()[0], jax.default_backend() == "cpu"
     report: dict[str, Any] = {"machine": _machine(), "versions": versions(), "quick": is_quick, "groups": {}}
-    print(*(f"{name}: {value}" for name, value in (report["machine"] | report["versions"]).items()), sep="; ", flush=True)
+    print(
+        *(f"{name}: {value}" for name, value in (report["machine"] | report["versions"]).items()), sep="; ", flush=True
+    )
     end = time.monotonic()
     for group in groups or SECONDS:
         start, end = time.monotonic(), end + SECONDS[group] / (5 if is_quick else 1)
@@ -434,7 +440,7 @@ def _rows(case: Case, rounds: int, *, on_cpu: bool, end: float) -> Iterator[dict
         try:
             first[who] = duration(call)
             times[who] = [duration(call)]
-        except Exception as error:  # noqa: BLE001 - such as memory that does not suffice: the other cases go on
+        except Exception as error:
             notes[who] = f"failed: {type(error).__name__} {str(error)[:80]}".replace("\n", " ")
     stop = min(time.monotonic() + CASE_SECONDS, end)
     for _ in range(rounds - 1):

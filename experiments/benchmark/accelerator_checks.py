@@ -58,6 +58,7 @@ def checks(*, is_small: bool, end: float) -> Iterator[Check]:
 
 def in_float64(function: Callable[..., Any], *inputs: Any) -> Any:
     """Result of a function with all numbers in float64 on the CPU, NumPy."""
+
     def widen(leaf: Any) -> Any:
         array = np.asarray(leaf)
         return array.astype(np.float64) if array.dtype == np.float32 else leaf if np.isscalar(leaf) else array
@@ -194,6 +195,7 @@ def _gradients(_: bool) -> Iterator[Check]:
     pairs, (query, candidates) = matches(4), sides(1, 128)
     candidate = jax.tree.map(lambda field: field[0], candidates)
     for name, scorer in SMOOTH.items():
+
         @jax.jit
         def by_points(pairs: Matches, scorer: Any = scorer) -> Any:
             return jax.grad(lambda points: jnp.sum(jax.vmap(scorer)(replace(pairs, points1=points))))(pairs.points1)
@@ -205,7 +207,12 @@ def _gradients(_: bool) -> Iterator[Check]:
 
             return jax.grad(score)(candidate.descriptors)
 
-        yield compare(f"gradient of {name}, points", by_points(pairs), in_float64(by_points, pairs), 5e-3 if name == "anchor" else 1e-4)
+        yield compare(
+            f"gradient of {name}, points",
+            by_points(pairs),
+            in_float64(by_points, pairs),
+            5e-3 if name == "anchor" else 1e-4,
+        )
         yield compare(f"gradient of {name}, descriptors", by_descriptors(query, candidate),
                       in_float64(by_descriptors, query, candidate), 5e-3 if name == "anchor" else 1e-4)  # fmt: skip
 

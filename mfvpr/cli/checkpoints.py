@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterable
 from http.client import HTTPException
 from pathlib import Path
+from urllib.error import HTTPError
 from urllib.request import urlopen
 
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
@@ -96,6 +97,8 @@ def _fetch(entry: Entry, target: Path) -> None:
             file.flush()
             check_sha256(file_sha256(temporary), entry, entry.source)
     except (OSError, HTTPException) as error:
+        if isinstance(error, HTTPError):
+            error.close()  # it is the server's response
         reason = getattr(error, "reason", None) or error
         raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
 

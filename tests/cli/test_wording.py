@@ -6,6 +6,7 @@ from PIL import Image
 
 from mfvpr.io import write_features, write_global_descriptors
 from tests.builders import make_features, unit
+from tests.needs import skip_without
 
 SIZE = 64
 
@@ -13,6 +14,7 @@ SIZE = 64
 @pytest.fixture(scope="module")
 def images(tmp_path_factory):
     """Three images on either side and their features, of another program: called by other paths, of other lengths."""
+    skip_without("h5py")
     root, rng = tmp_path_factory.mktemp("wording"), np.random.default_rng(0)
     names, features = [], []
     for side in ("database", "queries", "broken"):
