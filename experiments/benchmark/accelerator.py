@@ -7,7 +7,7 @@ and the work that one call does. Arrays are on the device beforehand; only the e
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -106,6 +106,7 @@ def shortlist_of(candidates: int, keypoints: int, dimension: int) -> tuple[Featu
 @cache
 def matches_of(pairs: int) -> Matches:
     """Matches of pairs; a third of the matches of a pair agree."""
+
     @jax.jit
     def make() -> Matches:
         keys = jax.random.split(jax.random.key(3), 6)
@@ -340,10 +341,12 @@ def query(queries: int, images: int, candidates: int, keypoints: int, dimension:
 
     one, others = take(views, 0), take(database, rows[0])
     arrays = [field for side in (views, database) for field in (side.keypoints, side.descriptors, side.scores)]
-    separate: Calls = {"mfvpr": ready(rank_one, one, others), "mfvpr, in one jit": ready(jax.jit(rank_one), one, others)}
-    together: Calls = {"mfvpr": ready(jax.jit(rank_all), views, database, rows)}
+    calls_of_one = ready(rank_one, one, others), ready(jax.jit(rank_one), one, others)
+    our_calls: Calls = dict(zip(("mfvpr", "mfvpr, in one jit"), calls_of_one, strict=True))
+    if queries > 1:
+        our_calls = {"mfvpr": ready(jax.jit(rank_all), views, database, rows)}
     product = Work(2 * queries * candidates * keypoints**2 * dimension / 1e12, "TFLOP")
-    return (separate if queries == 1 else together) | with_torch(calls, rows, *arrays), product
+    return our_calls | with_torch(calls, rows, *arrays), product
 
 
 HISTOGRAM, ANCHOR, SUM = (
@@ -360,19 +363,21 @@ CASES = [
          (3, 64, 32), False),
     *(Case("scores", f"{name}, {{:,}} pairs", step, (pairs,), (pairs // 50 or 1,), pairs != 1000)
       for pairs in (50, 1000, 10_000)
-      for name, step in (("histogram", HISTOGRAM), ("anchor", ANCHOR), ("sum", SUM)) if pairs <= 10_000),
+      for name, step in (("histogram", HISTOGRAM), ("anchor", ANCHOR), ("sum", SUM))),
     Case("grids", "1,000 settings, {} queries x {}", partial(grid, at_once=False), (100, 50), (1, 2)),
     Case("grids", "1,000 settings, {} queries x {}, in one call", partial(grid, at_once=True), (100, 50), (1, 2),
          False),
     *(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (queries, 2000, 16), queries != 100)
       for queries in (1, 100, 1000)),
     *(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,), batch == 8)
-      for step in (networks.MAP, networks.FEATURES, f"{networks.ALIKED[0]} features", "MixVPR descriptor")
-      for batch in (1, 8, 32)),
+      for batch in (1, 32, 8)
+      for step in (networks.MAP, networks.FEATURES, f"{networks.ALIKED[0]} features", "MixVPR descriptor")),
     Case("queries", "{} query, {} images, {} candidates x {} x {}", query, (1, 50, 50, 700, 512), (1, 4, 3, 64, 32)),
     Case("queries", "{} queries, {} images, {} candidates x {} x {}", query, (1000, 1000, 50, 700, 512),
          (3, 4, 3, 64, 32), False),
 ]  # fmt: skip
+TIMED = ("case", "who", "ms", "25 %", "75 %", "calls", "/ first", "rate", "per s", "first call, s", "note")
+CHECKED = ("what", "reference", "deviation", "allowed", "differ", "entries", "exact")
 # Group -> seconds that it may take on an accelerator, with compilation; with --quick a fifth.
 SECONDS = {"correct": 75, "rates": 10, "matching": 35, "scores": 40, "grids": 25, "search": 25, "networks": 60,
            "queries": 30}  # fmt: skip
@@ -387,20 +392,17 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
         raise InputError(f"group: expected {', '.join(SECONDS)}, got {', '.join(sorted(unknown))}")
     device, on_cpu = jax.devices()[0], jax.default_backend() == "cpu"
     report: dict[str, Any] = {"machine": _machine(), "versions": versions(), "quick": is_quick, "groups": {}}
-    print(*(f"{name}: {value}" for name, value in (report["machine"] | report["versions"]).items()), sep="; ", flush=True)
+    print(report["machine"], report["versions"], sep="\n", flush=True)
     end = time.monotonic()
     for group in groups or SECONDS:
         start, end = time.monotonic(), end + SECONDS[group] / (5 if is_quick else 1)
         if group == "correct":
             from experiments.benchmark.accelerator_checks import checks
 
-            rows = [asdict(check) for check in checks(is_small=on_cpu or is_quick, end=end)]
-            table = Table([*rows[0]], [[_cell(value) for value in row.values()] for row in rows], text_columns=2)
+            rows, names = list(checks(is_small=on_cpu or is_quick, end=end)), CHECKED
         else:
-            cases = [case for case in CASES if case.group == group and (case.is_quick or not is_quick)]
-            rows = [row for case in cases for row in _rows(case, rounds or ROUNDS, on_cpu=on_cpu, end=end)]
-            header = ["case", "who", "median, ms", "quartiles, ms", "/ first", "rate", "first call, s"]
-            table = Table(header, [_cells(row) for row in rows], text_columns=2)
+            rows, names = list(_rows(group, rounds or ROUNDS, is_quick=is_quick, on_cpu=on_cpu, end=end)), TIMED
+        table = Table(names, [[_cell(row.get(name, "")) for name in names] for row in rows], text_columns=2)
         peak = (device.memory_stats() or {}).get("peak_bytes_in_use")
         report["groups"][group] = {"seconds": time.monotonic() - start, "peak_bytes": peak, "rows": rows}
         memory = "" if peak is None else f", at most {peak / 1e9:.2f} GB so far"
@@ -412,7 +414,7 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
 
 def _machine() -> dict[str, Any]:
     machine = {"device": jax.devices()[0].device_kind, "backend": jax.default_backend(), "cores": available_cpus(),
-               "matmul precision": jax.config.jax_default_matmul_precision}  # fmt: skip
+               "matmul precision": jax.config.values["jax_default_matmul_precision"]}  # fmt: skip
     if HAS_TORCH:
         import torch
 
@@ -420,48 +422,39 @@ def _machine() -> dict[str, Any]:
     return machine
 
 
-def _rows(case: Case, rounds: int, *, on_cpu: bool, end: float) -> Iterator[dict[str, Any]]:
-    """Time one case; implementations that fail, and cases that begin too late, say so."""
-    sizes = case.small if on_cpu else case.sizes
-    row = {"case": case.title.format(*sizes), "who": ""}
-    if time.monotonic() > end:
-        yield row | {"note": "skipped: out of time"}
-        return
-    calls, work = case.make(*sizes)
+def _rows(group: str, rounds: int, *, is_quick: bool, on_cpu: bool, end: float) -> Iterator[dict[str, Any]]:
+    """Time the cases of a group; a CPU has small sizes, which are the same for some cases."""
+    cases = [case for case in CASES if case.group == group and (case.is_quick or not is_quick)]
+    sized = [(case, case.small if on_cpu else case.sizes) for case in cases]
+    for title, (case, sizes) in {case.title.format(*sizes): (case, sizes) for case, sizes in sized}.items():
+        if time.monotonic() > end:
+            yield {"case": title, "note": "skipped: out of time"}
+        else:
+            yield from _time(title, *case.make(*sizes), rounds, end)
+
+
+def _time(title: str, calls: Calls, work: Work, rounds: int, end: float) -> Iterator[dict[str, Any]]:
+    """Time calls in turns; a call that fails says so."""
+    rows: dict[str, dict[str, Any]] = {who: {"case": title, "who": who} for who in calls}
     times: dict[str, list[float]] = {}
-    notes, first = {}, {}
     for who, call in calls.items():
         try:
-            first[who] = duration(call)
+            rows[who]["first call, s"] = duration(call)
             times[who] = [duration(call)]
-        except Exception as error:  # noqa: BLE001 - such as memory that does not suffice: the other cases go on
-            notes[who] = f"failed: {type(error).__name__} {str(error)[:80]}".replace("\n", " ")
+        except Exception as error:  # such as memory that does not suffice: the other calls go on
+            rows[who]["note"] = " ".join(f"failed: {error!r}".split())[:80]
     stop = min(time.monotonic() + CASE_SECONDS, end)
-    for _ in range(rounds - 1):
-        if time.monotonic() > stop:
-            break
+    while times and len(next(iter(times.values()))) < rounds and time.monotonic() < stop:
         for who, seconds in times.items():
             seconds.append(duration(calls[who]))
-    reference = float(np.median(next(iter(times.values()), [np.nan])))
-    for who in calls:
-        if who in notes:
-            yield row | {"who": who, "note": notes[who]}
-            continue
-        low, median, high = (1e3 * float(np.quantile(times[who], share)) for share in (0.25, 0.5, 0.75))
-        yield row | {
-            "who": who, "median_ms": median, "quartiles_ms": [low, high], "calls": len(times[who]),
-            "ratio": 1e-3 * median / reference,
-            "rate": 1e3 * work.amount / median, "unit": f"{work.unit}/s", "first_call_s": first[who],
-        }  # fmt: skip
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    if "note" in row:
-        return [row["case"], row["who"], row["note"], "", "", "", ""]
-    low, high = row["quartiles_ms"]
-    return [row["case"], row["who"], f"{row['median_ms']:.3f}", f"{low:.3f} .. {high:.3f}", f"{row['ratio']:.2f}",
-            f"{row['rate']:.4g} {row['unit']}", f"{row['first_call_s']:.1f}"]  # fmt: skip
+    medians = {who: float(np.median(seconds)) for who, seconds in times.items()}
+    for who, seconds in times.items():
+        rows[who] |= {"ms": 1e3 * medians[who], "25 %": 1e3 * float(np.quantile(seconds, 0.25)),
+                      "75 %": 1e3 * float(np.quantile(seconds, 0.75)), "calls": len(seconds),
+                      "/ first": medians[who] / next(iter(medians.values())),
+                      "rate": work.amount / medians[who], "per s": work.unit}  # fmt: skip
+    yield from rows.values()
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.1e}" if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

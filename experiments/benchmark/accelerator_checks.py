@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,28 @@ from mfvpr.networks.imagenet import preprocess
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.types import Features, Matches
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.threads import ordered_map
 from tests import oracles
 
 SIZE = 336  # px
 TIE = 1e-6  # similarities that differ by less are equal in float32
 SIDE = 12  # the keypoints of an image are SIDE^2, as cells of a grid
-SMOOTH = {"histogram": mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48),
-          "anchor": mfvpr.AnchorPoints(temperature=0.1), "sum": mfvpr.AggregatedScore(temperature=2.0)}  # fmt: skip
+MATCHING: dict[str, dict[str, Any]] = {
+    "float32": {"product": "float32"}, "bfloat16": {"product": "bfloat16", "chunk_size": 1},
+    "with ratio": {"with_ratio": True},
+    **{name: {"cross_check": name} for name in ("none", "candidate", "opencv_legacy")},
+}  # fmt: skip
+GRIDS = (
+    (mfvpr.HistogramOfShifts(), {"sigma": [5.0, 22.5], "bin_size": [10.0, 15.0], "weight": ["fs", "dmf"],
+                                 "max_distance": [0.5, 1.2]}),
+    (mfvpr.AnchorPoints(), {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]}),
+)  # fmt: skip
+SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
+    "histogram": (mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48), 1e-4),
+    "anchor": (mfvpr.AnchorPoints(temperature=0.1), 5e-3),
+    "sum": (mfvpr.AggregatedScore(temperature=2.0), 1e-4),
+}
 NETWORKS = {  # checkpoint -> side of the images in px, result; weights are random unless they are installed
     networks.ALIKED[0]: (320, lambda model, images: model.levels(images / 255)[1]),
     networks.D2NET: (336, lambda model, images: model(preprocess(images, "caffe"))),
@@ -32,47 +47,58 @@ NETWORKS = {  # checkpoint -> side of the images in px, result; weights are rand
 }
 
 
-@dataclass(frozen=True)
-class Check:
-    """A result of the device, beside a reference."""
+class Task(NamedTuple):
+    """A check: `compute` returns the device's result and its reference, which deviate by a share `allowed` at most.
+
+    It may return how many entries differ, and of how many, without ties of float32.
+    """
 
     what: str
-    reference: str
-    deviation: float  # greatest, relative to the largest entry of the reference
-    allowed: float
-    differ: int = 0  # entries that differ, without ties of float32
-    entries: int = 0
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the result is as exact as float32 allows."""
-        return self.deviation <= self.allowed and not self.differ
+    compute: Callable[[], tuple[Any, ...]]
+    allowed: float = 1e-5
+    reference: str = "float64, CPU"
 
 
-def checks(*, is_small: bool, end: float) -> Iterator[Check]:
-    """All checks that begin before the time `end`."""
-    for check in (_products, _matching, _scores, _grids, _gradients, _search, _networks):
-        if time.monotonic() < end:
-            yield from check(is_small)
+def checks(*, is_small: bool, end: float) -> Iterator[dict[str, Any]]:
+    """Rows of all checks that begin before the time `end`; several at the same time, since most of it is compiling."""
+    parts = (_products, _matching, _networks, _scores, _grids, _gradients, _search)
+    tasks = [task for part in parts for task in part(is_small)]
+    return ordered_map(partial(_check, end=end), tasks, workers=available_cpus())
 
 
-def in_float64(function: Callable[..., Any], *inputs: Any) -> Any:
-    """Result of a function with all numbers in float64 on the CPU, NumPy."""
-    def widen(leaf: Any) -> Any:
-        array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else leaf if np.isscalar(leaf) else array
+def _check(task: Task, end: float) -> dict[str, Any]:
+    row: dict[str, Any] = {"what": task.what, "reference": task.reference}
+    if time.monotonic() > end:
+        return row | {"exact": "skipped: out of time"}
+    try:
+        got, expected, differ, entries = (*task.compute(), 0, 0)[:4]
+    except Exception as error:  # the other checks go on
+        return row | {"exact": f"failed: {error!r}"[:80]}
+    deviation = relative_deviation(got, expected)
+    is_exact = deviation <= task.allowed and not differ
+    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
+                  "exact": "yes" if is_exact else "NO"}  # fmt: skip
 
-    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, function(*jax.tree.map(widen, inputs)))
 
-
-def compare(what: str, got: Any, expected: Any, allowed: float = 1e-5, reference: str = "float64, CPU") -> Check:
-    """Greatest deviation of an array; infinite if one has a NaN where the other has none."""
+def relative_deviation(got: Any, expected: Any) -> float:
+    """Greatest deviation, relative to the largest entry; infinite if one has a NaN where the other has none."""
     got, expected = (np.asarray(values, np.float64) for values in (got, expected))
     same = (got == expected) | (np.isnan(got) & np.isnan(expected))
     difference = np.where(same, 0, np.nan_to_num(np.abs(got - expected), nan=np.inf))
     scale = np.max(np.abs(expected), initial=0, where=np.isfinite(expected)) or 1.0
-    return Check(what, reference, float(np.max(difference, initial=0) / scale), allowed)
+    return float(np.max(difference, initial=0) / scale)
+
+
+def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:
+    """Results of a function on the device, and on the CPU with all numbers in float64."""
+
+    def widen(leaf: Any) -> Any:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype == np.float32 else leaf
+
+    result = np.asarray(function(*jax.device_put(inputs)))
+    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+        return result, np.asarray(function(*jax.tree.map(widen, inputs)))
 
 
 def features(count: int, dimension: int) -> Features:
@@ -86,8 +112,10 @@ def features(count: int, dimension: int) -> Features:
         image[keypoints // 2 :] = image[: keypoints // 2] + 5e-5 * rng.normal(size=(keypoints // 2, dimension))
         images.append(image / np.linalg.norm(image, axis=1, keepdims=True))
     points, scores = rng.uniform(0, SIZE, (count, keypoints, 2)), rng.uniform(100, 1000, (count, keypoints))
-    arrays = (array.astype(np.float32) for array in (points, np.stack(images), scores))
-    return Features(*arrays, np.ones((count, keypoints), bool), np.full((count, 2), SIZE, np.float32))
+    points, descriptors, scores = (array.astype(np.float32) for array in (points, np.stack(images), scores))
+    return Features(
+        points, descriptors, scores, np.ones((count, keypoints), bool), np.full((count, 2), SIZE, np.float32)
+    )
 
 
 def sides(count: int, dimension: int) -> tuple[Features, Features]:
@@ -102,35 +130,33 @@ def matches(count: int, **options: Any) -> Matches:
         return jax.tree.map(np.asarray, mfvpr.match_candidates(*sides(count, 64), **options))
 
 
-def _products(_: bool) -> Iterator[Check]:
-    query, candidates = (side.descriptors for side in sides(1, 512))
-    expected = query.astype(np.float64) @ candidates[0].T.astype(np.float64)
-    default = jax.jit(lambda left, right: left @ right.T)(query, candidates[0])
-    yield compare("JAX's product, default precision", default, expected, 1.0, "float64, NumPy")
-    yield compare("products of descriptors", products(jnp.asarray(query), jnp.asarray(candidates[0])), expected, 1e-6,
-                  "float64, NumPy")  # fmt: skip
+def _products(_: bool) -> Iterator[Task]:
+    query, candidate = (side.descriptors for side in sides(1, 512))
+    expected = query.astype(np.float64) @ candidate[0].T.astype(np.float64)
+    for what, product, allowed in (("JAX's product, default precision", lambda left, right: left @ right.T, np.inf),
+                                   ("products of descriptors", products, 1e-6)):  # fmt: skip
+        compute = partial(lambda product: (jax.jit(product)(query, candidate[0]), expected), product)
+        yield Task(what, compute, allowed, "float64, NumPy")
 
 
-def _matching(is_small: bool) -> Iterator[Check]:
-    settings: list[dict[str, Any]] = [{"product": "float32"}, {"product": "bfloat16", "chunk_size": 1},
-                {"with_ratio": True}, {"cross_check": "none"}, {"cross_check": "candidate"},
-                {"cross_check": "opencv_legacy"}]  # fmt: skip
-    for dimension in (128, 512):
-        query, candidates = sides(3 if is_small else 8, dimension)
-        for options in settings:
-            matches = jax.tree.map(np.asarray, mfvpr.match_candidates(query, candidates, **options))
-            is_candidate = options.get("cross_check") == "candidate"
-            found = np.where(matches.mask, matches.index0 if is_candidate else matches.index1, -1)
-            expected, is_tie, distance = zip(
-                *(_nearest(query.descriptors, rows, options.get("cross_check", "mutual"))
-                  for rows in candidates.descriptors), strict=True)  # fmt: skip
-            same = (found == np.stack(expected)) & matches.mask
-            differ = int(np.sum((found != np.stack(expected)) & ~np.stack(is_tie)))
-            deviation = np.max(np.abs(matches.distance - np.stack(distance)), initial=0, where=same)
-            label = ", ".join(str(value) for name, value in options.items() if name != "chunk_size")
-            label = label.replace("True", "with ratio")
-            yield Check(f"matches of {dimension} dimensions, {label}", "float64, NumPy", float(deviation), 1e-5, differ,
-                        found.size)  # fmt: skip
+def _matching(is_small: bool) -> Iterator[Task]:
+    for dimension in (128,) if is_small else (128, 512):
+        for title, options in MATCHING.items():
+            compute = partial(_match, sides(3 if is_small else 8, dimension), options)
+            yield Task(f"matches of {dimension} dimensions, {title}", compute, 1e-6, "float64, NumPy")
+
+
+def _match(images: tuple[Features, Features], options: dict[str, Any]) -> tuple[Any, ...]:
+    """Distances of matches, and how many keypoints have another match than in float64."""
+    cross_check = options.get("cross_check", "mutual")
+    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*images, **options))
+    index = matches.index0 if cross_check == "candidate" else matches.index1
+    found = np.where(matches.mask, index, -1)
+    references = [_nearest(images[0].descriptors, rows, cross_check) for rows in images[1].descriptors]
+    expected, is_tie, distance = map(np.stack, zip(*references, strict=True))
+    same = (found == expected) & matches.mask
+    differ = int(np.sum((found != expected) & ~is_tie))
+    return np.where(same, matches.distance, 0), np.where(same, distance, 0), differ, found.size
 
 
 def _nearest(query: np.ndarray, candidate: np.ndarray, cross_check: str) -> tuple[np.ndarray, ...]:
@@ -154,63 +180,62 @@ def _nearest(query: np.ndarray, candidate: np.ndarray, cross_check: str) -> tupl
     return found, is_tie, np.linalg.norm(query - candidate[found], axis=1)
 
 
-def _scores(is_small: bool) -> Iterator[Check]:
+def _scores(is_small: bool) -> Iterator[Task]:
     pairs, cells = matches(4 if is_small else 20, with_ratio=True), matches(4, cross_check="candidate")
-    scores = {}
     for name, scorer in SCORERS.items():
         if hasattr(scorer, "score_pairs"):  # on the host
             continue
-        made, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
-        scores[name] = mfvpr.score_candidates(made, jax.device_put(of))
-        yield compare(f"score {name}", scores[name], in_float64(mfvpr.score_candidates, made, of))
-    for name, expected in zip(("histogram", "anchor", "sum"), zip(*(_by_loops(pairs, row) for row in range(3)), strict=True),
-                              strict=True):  # fmt: skip
-        yield compare(f"score {name}", scores[name][:3], expected, 1e-5, "the paper's equations, loops")
+        scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
+        yield Task(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
+        if name in ("histogram", "anchor", "sum"):
+            compute = partial(_beside_loops, name, scorer, pairs)
+            yield Task(f"score {name}", compute, reference="the paper's equation, loops")
 
 
-def _by_loops(pairs: Matches, row: int) -> tuple[float, ...]:
-    """Scores of a pair by the histogram, anchor points and the sum."""
-    pair = jax.tree.map(lambda field: field[row], pairs)
-    real = pair.mask
-    points0, points1, distance = pair.points0[real], pair.points1[real], pair.distance[real]
-    weights, size = (pair.scores0 + pair.scores1)[real], (SIZE, SIZE)
-    histogram, *_ = oracles.histogram_of_shifts(points1 - points0, weights, size, size)
-    anchor = oracles.anchor_points(points0, points1, weights, size, size)
-    return histogram.max(), anchor, oracles.aggregated_score(points1 - points0, 2 - distance, size)
+def _beside_loops(name: str, scorer: Any, pairs: Matches) -> tuple[Any, Any]:
+    pairs = jax.tree.map(lambda field: field[:3], pairs)
+    expected, size = [], (SIZE, SIZE)
+    for row, real in enumerate(pairs.mask):
+        points0, points1, distance, *scores = (
+            values[row][real] for values in (pairs.points0, pairs.points1, pairs.distance, pairs.scores0, pairs.scores1)
+        )
+        weights, shifts = np.sum(scores, axis=0, dtype=np.float64), points1.astype(np.float64) - points0
+        expected.append({
+            "histogram": lambda: oracles.histogram_of_shifts(shifts, weights, size, size)[0].max(),  # noqa: B023
+            "anchor": lambda: oracles.anchor_points(points0, points1, weights, size, size),  # noqa: B023
+            "sum": lambda: oracles.aggregated_score(shifts, 2 - distance.astype(np.float64), size),  # noqa: B023
+        }[name]())  # fmt: skip
+    return mfvpr.score_candidates(scorer, jax.device_put(pairs)), expected
 
 
-def _grids(is_small: bool) -> Iterator[Check]:
+def _grids(is_small: bool) -> Iterator[Task]:
     pairs = matches(4 if is_small else 20, with_ratio=True)
-    for name, scorer, axes in (
-        ("histogram", mfvpr.HistogramOfShifts(), {"sigma": [5.0, 22.5], "bin_size": [10.0, 15.0], "weight": ["fs", "dmf"],
-                                                  "max_distance": [0.5, 1.2]}),
-        ("anchor", mfvpr.AnchorPoints(), {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]}),
-    ):  # fmt: skip
-        score = partial(mfvpr.score_grid, scorer, **axes)
-        yield compare(f"grid of {name}", score(jax.device_put(pairs)), in_float64(score, pairs))
+    for scorer, axes in GRIDS:
+        compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
+        yield Task(f"grid of {type(scorer).__name__}", compute)
 
 
-def _gradients(_: bool) -> Iterator[Check]:
+def _gradients(_: bool) -> Iterator[Task]:
     pairs, (query, candidates) = matches(4), sides(1, 128)
     candidate = jax.tree.map(lambda field: field[0], candidates)
-    for name, scorer in SMOOTH.items():
-        @jax.jit
-        def by_points(pairs: Matches, scorer: Any = scorer) -> Any:
-            return jax.grad(lambda points: jnp.sum(jax.vmap(scorer)(replace(pairs, points1=points))))(pairs.points1)
 
-        @jax.jit
-        def by_descriptors(query: Features, candidate: Features, scorer: Any = scorer) -> Any:
-            def score(descriptors: Any) -> Any:
-                return scorer(mfvpr.soft_match(query, replace(candidate, descriptors=descriptors), temperature=0.02))
+    def by_points(scorer: Any, pairs: Matches) -> Any:
+        return jax.grad(lambda points: jnp.sum(jax.vmap(scorer)(replace(pairs, points1=points))))(pairs.points1)
 
-            return jax.grad(score)(candidate.descriptors)
+    def by_descriptors(scorer: Any, query: Features, candidate: Features) -> Any:
+        def score(descriptors: Any) -> Any:
+            return scorer(mfvpr.soft_match(query, replace(candidate, descriptors=descriptors), temperature=0.02))
 
-        yield compare(f"gradient of {name}, points", by_points(pairs), in_float64(by_points, pairs), 5e-3 if name == "anchor" else 1e-4)
-        yield compare(f"gradient of {name}, descriptors", by_descriptors(query, candidate),
-                      in_float64(by_descriptors, query, candidate), 5e-3 if name == "anchor" else 1e-4)  # fmt: skip
+        return jax.grad(score)(candidate.descriptors)
+
+    for name, (scorer, allowed) in SMOOTH.items():
+        for entries, function, inputs in (("points", by_points, (pairs,)),
+                                          ("descriptors", by_descriptors, (query, candidate))):  # fmt: skip
+            compute = partial(beside_float64, jax.jit(partial(function, scorer)), *inputs)
+            yield Task(f"gradient of {name}, {entries}", compute, allowed)
 
 
-def _search(is_small: bool) -> Iterator[Check]:
+def _search(is_small: bool) -> Iterator[Task]:
     rng, count = np.random.default_rng(0), 500 if is_small else 100_000
     rows = rng.normal(size=(count, 512))
     rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, 512))  # nearly equal in pairs
@@ -218,18 +243,25 @@ def _search(is_small: bool) -> Iterator[Check]:
     queries = database[:: count // 20]
     similarity = queries.astype(np.float64) @ database.T.astype(np.float64)
     expected = -np.sort(-similarity, axis=1)[:, :50]
-    for name, shortlist in (("retrieve", mfvpr.retrieve(queries, database, num_candidates=50)),
-                            ("ExactSearch", ExactSearch().shortlist(queries, database, 50))):  # fmt: skip
-        found = np.take_along_axis(similarity, np.asarray(shortlist.indices), axis=1)
-        check = compare(f"search, {name}", shortlist.scores, expected, 1e-6, "float64, NumPy")
-        yield replace(check, differ=int(np.sum(np.abs(found - expected) > TIE)), entries=found.size)
+
+    def search(shortlist: Callable[..., Any], **options: Any) -> tuple[Any, ...]:
+        candidates = shortlist(queries, database, num_candidates=50)
+        found = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
+        return candidates.scores, expected, int(np.sum(np.abs(found - expected) > TIE)), found.size
+
+    for function in (mfvpr.retrieve, ExactSearch().shortlist):
+        yield Task(f"search, {function.__name__}", partial(search, function), 2e-6, "float64, NumPy")
 
 
-def _networks(is_small: bool) -> Iterator[Check]:
+def _networks(is_small: bool) -> Iterator[Task]:
     for checkpoint, (side, function) in NETWORKS.items():
-        if is_small and checkpoint != networks.ALIKED[0]:
-            continue
-        images = networks.make_images(64 if is_small else side)[:1].astype(np.float32)
-        graph, state = nnx.split(networks.make_network(checkpoint)[0])
-        run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))  # noqa: B023
-        yield compare(f"{checkpoint}, {images.shape[2]} px", run(state, images), in_float64(run, state, images), 1e-4)
+        if not is_small or checkpoint == networks.ALIKED[0]:
+            compute = partial(_network, checkpoint, 64 if is_small else side, function)
+            yield Task(f"{checkpoint}, random weights", compute)
+
+
+def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[Any, Any]:
+    images = np.random.default_rng(0).uniform(0, 255, (1, side // 8, side // 8, 3)).repeat(8, axis=1).repeat(8, axis=2)
+    graph, state = nnx.split(networks.make_network(checkpoint)[0])
+    run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))
+    return beside_float64(run, state, images.astype(np.float32))

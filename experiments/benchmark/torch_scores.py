@@ -17,7 +17,7 @@ def take(rows: Tensor, index: Tensor) -> Tensor:
 
 
 def histogram(shifts: Tensor, weights: Tensor, centers: Tensor, sigma: float) -> Tensor:
-    """Tallest bins of pairs `[C]` from shifts `[C, K, 2]`, with separable Gaussians; `[C, W]` of weights `[C, W, K]`."""
+    """Tallest bins `[C]` from shifts `[C, K, 2]`, or `[C, W]` of weights `[C, W, K]`, by separable Gaussians."""
     votes_x, votes_y = (torch.exp(-0.5 * ((shifts[:, :, axis, None] - centers) / sigma) ** 2) for axis in (0, 1))
     if weights.ndim == 2:
         return torch.matmul((votes_y * weights[:, :, None]).mT, votes_x).amax((1, 2))
