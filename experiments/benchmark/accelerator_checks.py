@@ -27,8 +27,7 @@ TIE = 1e-6  # similarities that differ by less are equal in float32
 SIDE = 12  # the keypoints of an image are SIDE^2, as cells of a grid
 MATCHING: dict[str, dict[str, Any]] = {
     "float32": {"product": "float32"}, "bfloat16": {"product": "bfloat16", "chunk_size": 1},
-    "with ratio": {"with_ratio": True},
-    **{name: {"cross_check": name} for name in ("none", "candidate", "opencv_legacy")},
+    "one after the other": {"chunk_size": 1}, "without cross-check": {"cross_check": "none"},
 }  # fmt: skip
 GRIDS = (
     (mfvpr.HistogramOfShifts(), {"sigma": [5.0, 22.5], "bin_size": [10.0, 15.0], "weight": ["fs", "dmf"],
@@ -47,6 +46,9 @@ NETWORKS = {  # checkpoint -> side of the images in px, result; weights are rand
 }
 
 
+Images = tuple[Features, Features]  # a query `[N]`, and its candidates `[C, N]`
+
+
 class Task(NamedTuple):
     """A check: `compute` returns the device's result and its reference, which deviate by a share `allowed` at most.
 
@@ -61,12 +63,11 @@ class Task(NamedTuple):
 
 def checks(*, is_small: bool, end: float) -> Iterator[dict[str, Any]]:
     """Rows of all checks that begin before the time `end`; several at the same time, since most of it is compiling."""
-    parts = (_products, _matching, _networks, _scores, _grids, _gradients, _search)
-    tasks = [task for part in parts for task in part(is_small)]
-    return ordered_map(partial(_check, end=end), tasks, workers=available_cpus())
+    tasks = [task for part in PARTS for task in part(is_small)]
+    return ordered_map(partial(check, end=end), tasks, workers=available_cpus())
 
 
-def _check(task: Task, end: float) -> dict[str, Any]:
+def check(task: Task, end: float) -> dict[str, Any]:
     row: dict[str, Any] = {"what": task.what, "reference": task.reference}
     if time.monotonic() > end:
         return row | {"exact": "skipped: out of time"}
@@ -94,10 +95,11 @@ def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any
 
     def widen(leaf: Any) -> Any:
         array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else leaf
+        return array.astype(np.float64) if array.dtype == np.float32 else array
 
     result = np.asarray(function(*jax.device_put(inputs)))
-    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+    cpu = jax.devices("cpu")[0]
+    with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
         return result, np.asarray(function(*jax.tree.map(widen, inputs)))
 
 
@@ -118,7 +120,7 @@ def features(count: int, dimension: int) -> Features:
     )
 
 
-def sides(count: int, dimension: int) -> tuple[Features, Features]:
+def sides(count: int, dimension: int) -> Images:
     """A query `[N]` and its candidates `[count, N]`."""
     images = features(count + 1, dimension)
     return jax.tree.map(lambda field: field[0], images), jax.tree.map(lambda field: field[1:], images)
@@ -130,7 +132,7 @@ def matches(count: int, **options: Any) -> Matches:
         return jax.tree.map(np.asarray, mfvpr.match_candidates(*sides(count, 64), **options))
 
 
-def _products(_: bool) -> Iterator[Task]:
+def product_tasks(_: bool) -> Iterator[Task]:
     query, candidate = (side.descriptors for side in sides(1, 512))
     expected = query.astype(np.float64) @ candidate[0].T.astype(np.float64)
     for what, product, allowed in (("JAX's product, default precision", lambda left, right: left @ right.T, np.inf),
@@ -139,48 +141,35 @@ def _products(_: bool) -> Iterator[Task]:
         yield Task(what, compute, allowed, "float64, NumPy")
 
 
-def _matching(is_small: bool) -> Iterator[Task]:
+def matching_tasks(is_small: bool) -> Iterator[Task]:
     for dimension in (128,) if is_small else (128, 512):
         for title, options in MATCHING.items():
-            compute = partial(_match, sides(3 if is_small else 8, dimension), options)
-            yield Task(f"matches of {dimension} dimensions, {title}", compute, 1e-6, "float64, NumPy")
+            compute = partial(match, sides(3 if is_small else 8, dimension), options)
+            yield Task(f"matches of {dimension} dimensions, {title}", compute, 1e-5, "float64, NumPy")
 
 
-def _match(images: tuple[Features, Features], options: dict[str, Any]) -> tuple[Any, ...]:
-    """Distances of matches, and how many keypoints have another match than in float64."""
-    cross_check = options.get("cross_check", "mutual")
-    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*images, **options))
-    index = matches.index0 if cross_check == "candidate" else matches.index1
-    found = np.where(matches.mask, index, -1)
-    references = [_nearest(images[0].descriptors, rows, cross_check) for rows in images[1].descriptors]
-    expected, is_tie, distance = map(np.stack, zip(*references, strict=True))
-    same = (found == expected) & matches.mask
+def match(images: Images, options: dict[str, Any], matched: Images | None = None) -> tuple[Any, ...]:
+    """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
+    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*(matched or images), with_ratio=True, **options))
+    found, references = np.where(matches.mask, matches.index1, -1), []
+    query, rows = images[0].descriptors.astype(np.float64), np.arange(found.shape[1])
+    for candidate in images[1].descriptors.astype(np.float64):
+        similarity = query @ candidate.T
+        *_, second, expected = np.argsort(similarity, axis=1).T
+        distance, to_second = (np.linalg.norm(query - candidate[index], axis=1) for index in (expected, second))
+        is_tie = similarity[rows, expected] - similarity[rows, second] < TIE
+        if "cross_check" not in options:
+            *_, second0, largest0 = np.sort(similarity, axis=0)
+            is_tie |= (largest0 - second0 < TIE)[expected]
+            expected = np.where(similarity.argmax(0)[expected] == rows, expected, -1)
+        references.append((expected, is_tie, distance, distance / to_second))
+    expected, is_tie, *numbers = (np.stack(values) for values in zip(*references, strict=True))
+    compared = (found == expected) & (found >= 0) & ~is_tie
     differ = int(np.sum((found != expected) & ~is_tie))
-    return np.where(same, matches.distance, 0), np.where(same, distance, 0), differ, found.size
+    return np.where(compared, [matches.distance, matches.ratio], 0), np.where(compared, numbers, 0), differ, found.size
 
 
-def _nearest(query: np.ndarray, candidate: np.ndarray, cross_check: str) -> tuple[np.ndarray, ...]:
-    """Neighbor of every keypoint (-1 = none), whether float32 may decide otherwise, and the distance."""
-    query, candidate = query.astype(np.float64), candidate.astype(np.float64)
-    if cross_check == "candidate":
-        query, candidate, cross_check = candidate, query, "none"
-    similarity, rows = query @ candidate.T, np.arange(len(query))
-    forward, backward = similarity.argmax(1), similarity.argmax(0)
-    ordered0, ordered1 = np.sort(similarity, axis=1), np.sort(similarity, axis=0)
-    is_tie = ordered0[:, -1] - ordered0[:, -2] < TIE
-    if cross_check != "none":
-        close = (ordered1[-1] - ordered1[-2] < TIE) & (similarity >= ordered1[-2])  # keypoints that share a column
-        is_tie |= close.any(1) | close[:, forward].any(0)
-    found = forward
-    if cross_check == "mutual":
-        found = np.where(backward[forward] == rows, forward, -1)
-    if cross_check == "opencv_legacy":
-        picked = np.where(backward == rows[:, None], similarity, -np.inf)
-        found = np.where(np.isfinite(picked.max(1)), picked.argmax(1), -1)
-    return found, is_tie, np.linalg.norm(query - candidate[found], axis=1)
-
-
-def _scores(is_small: bool) -> Iterator[Task]:
+def score_tasks(is_small: bool) -> Iterator[Task]:
     pairs, cells = matches(4 if is_small else 20, with_ratio=True), matches(4, cross_check="candidate")
     for name, scorer in SCORERS.items():
         if hasattr(scorer, "score_pairs"):  # on the host
@@ -208,14 +197,14 @@ def _beside_loops(name: str, scorer: Any, pairs: Matches) -> tuple[Any, Any]:
     return mfvpr.score_candidates(scorer, jax.device_put(pairs)), expected
 
 
-def _grids(is_small: bool) -> Iterator[Task]:
+def grid_tasks(is_small: bool) -> Iterator[Task]:
     pairs = matches(4 if is_small else 20, with_ratio=True)
     for scorer, axes in GRIDS:
         compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
         yield Task(f"grid of {type(scorer).__name__}", compute)
 
 
-def _gradients(_: bool) -> Iterator[Task]:
+def gradient_tasks(_: bool) -> Iterator[Task]:
     pairs, (query, candidates) = matches(4), sides(1, 128)
     candidate = jax.tree.map(lambda field: field[0], candidates)
 
@@ -235,7 +224,7 @@ def _gradients(_: bool) -> Iterator[Task]:
             yield Task(f"gradient of {name}, {entries}", compute, allowed)
 
 
-def _search(is_small: bool) -> Iterator[Task]:
+def search_tasks(is_small: bool) -> Iterator[Task]:
     rng, count = np.random.default_rng(0), 500 if is_small else 100_000
     rows = rng.normal(size=(count, 512))
     rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, 512))  # nearly equal in pairs
@@ -253,7 +242,7 @@ def _search(is_small: bool) -> Iterator[Task]:
         yield Task(f"search, {function.__name__}", partial(search, function), 2e-6, "float64, NumPy")
 
 
-def _networks(is_small: bool) -> Iterator[Task]:
+def network_tasks(is_small: bool) -> Iterator[Task]:
     for checkpoint, (side, function) in NETWORKS.items():
         if not is_small or checkpoint == networks.ALIKED[0]:
             compute = partial(_network, checkpoint, 64 if is_small else side, function)
@@ -265,3 +254,6 @@ def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[
     graph, state = nnx.split(networks.make_network(checkpoint)[0])
     run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))
     return beside_float64(run, state, images.astype(np.float32))
+
+
+PARTS = (product_tasks, matching_tasks, network_tasks, score_tasks, grid_tasks, gradient_tasks, search_tasks)
