@@ -21,17 +21,16 @@ from experiments.benchmark import networks
 from experiments.benchmark.accelerator_checks import checks
 from experiments.benchmark.harness import duration, write_report
 from mfvpr.report import Table
-from mfvpr.retrieval.search import ExactSearch
 from mfvpr.types import Features, Matches
 from mfvpr.utils.errors import InputError
 
 SIZE, BINS = 336, 45  # px; bins of the histogram per axis
 SLOTS, MATCHES, SHARE = 384, 300, 0.4  # of a pair; share of the keypoints that two views of a place have in common
 NEAREST = 50
-AXES = {"sigma": np.linspace(8, 40, 10), "bin_size": np.array([10.0, 12.0, 15.0, 20.0, 24.0]), "weight": ("fs", "unit"),
+AXES = {"sigma": np.linspace(8, 40, 25), "bin_size": np.array([10.0, 15.0]), "weight": ("fs", "unit"),
         "max_distance": np.linspace(0.5, 1.4, 10)}  # fmt: skip
 GIGAFLOPS = {networks.D2NET: 120.0, networks.MIXVPR: 14.2, networks.ALIKED[0]: 2.1}  # of an image, by XLA
-ROUNDS, CASE_SECONDS = 30, 1.5  # timed calls at most, and about how long the timed calls of a case may take
+ROUNDS, LEAST_ROUNDS, CASE_SECONDS = 30, 3, 1.0  # timed calls; a case has more than the least for about this time
 EXACT = jax.lax.Precision.HIGHEST
 
 Calls = dict[str, Callable[[], Any]]  # implementation -> call; the others are compared with the first
@@ -46,7 +45,7 @@ class Case(NamedTuple):
     make: Callable[..., Timed]
     sizes: tuple[Any, ...]
     small: tuple[Any, ...]
-    is_quick: bool = True
+    is_quick: bool = False
 
 
 def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
@@ -54,7 +53,7 @@ def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callabl
     return lambda: jax.block_until_ready(function(*inputs, **options))
 
 
-def with_torch(name: str, *arrays: jax.Array, **options: Any) -> Calls:
+def with_torch(function: str, *arrays: jax.Array, **options: Any) -> Calls:
     """A call of `torch_scores` on the same arrays, without a copy; products are of float32, without TF32."""
     if find_spec("torch") is None:
         return {}
@@ -70,7 +69,7 @@ def with_torch(name: str, *arrays: jax.Array, **options: Any) -> Calls:
 
     def call() -> Any:
         with torch.inference_mode():
-            result = getattr(torch_scores, name)(*tensors, **options)
+            result = getattr(torch_scores, function)(*tensors, **options)
         if on_gpu:
             torch.cuda.synchronize()
         return result
@@ -78,74 +77,59 @@ def with_torch(name: str, *arrays: jax.Array, **options: Any) -> Calls:
     return {"torch": call}
 
 
-# --- data on the device --------------------------------------------------------------------------------------
-
-
-def _features(points: jax.Array, descriptors: jax.Array) -> Features:
-    shape, rows = points.shape[:-1], jnp.maximum(descriptors, 0)  # as D2-Net's
-    scores = 100 + 900 * jax.random.uniform(jax.random.key(1), shape)
-    descriptors = rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
-    return Features(points, descriptors, scores, jnp.ones(shape, bool), jnp.full((*shape[:-1], 2), float(SIZE)))
-
-
+@cache
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def places(count: int, keypoints: int, dimension: int) -> Features:
-    """Features of images that have nothing in common."""
-    key0, key1 = jax.random.split(jax.random.key(0))
-    points = jax.random.uniform(key0, (count, keypoints, 2), maxval=SIZE)
-    return _features(points, jax.random.normal(key1, (count, keypoints, dimension)))
+def scene(images: int, keypoints: int, dimension: int) -> tuple[Features, Features]:
+    """Features of images, and of another view of each: some keypoints move together, the others are new."""
+    keys = jax.random.split(jax.random.key(0, impl="rbg"), 6)
+    shape, is_common = (images, keypoints), (np.arange(keypoints) < SHARE * keypoints)[None, :, None]
+    points, elsewhere = (jax.random.uniform(key, (*shape, 2), maxval=SIZE) for key in keys[:2])
+    rows, others = (jax.random.normal(key, (*shape, dimension)) for key in keys[2:4])
+    moved = jnp.clip(points + 20 + 4 * jax.random.normal(keys[4], points.shape), 0, SIZE - 1)
+    scores, size = jax.random.uniform(keys[5], shape, minval=100, maxval=1000), jnp.full((images, 2), float(SIZE))
 
+    def features(points: jax.Array, rows: jax.Array) -> Features:
+        rows = jnp.maximum(rows, 0)  # as D2-Net's
+        rows = rows / jnp.linalg.norm(rows, axis=-1, keepdims=True)
+        return Features(points, rows, scores, jnp.ones(shape, bool), size)
 
-@jax.jit
-def views(places: Features) -> Features:
-    """Another view of each image: some keypoints move together, with noise; the others are new."""
-    keypoints, dimension = places.descriptors.shape[-2:]
     order = np.random.default_rng(0).permutation(keypoints)
-    is_common = (np.arange(keypoints) < SHARE * keypoints)[:, None]
-
-    def view(points: jax.Array, descriptors: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        keys = jax.random.split(key, 3)
-        moved = jnp.clip(points + 20 + 4 * jax.random.normal(keys[0], points.shape), 0, SIZE - 1)
-        elsewhere = jax.random.uniform(keys[1], points.shape, maxval=SIZE)
-        others = jax.random.normal(keys[2], descriptors.shape) / dimension**0.5
-        descriptors = jnp.where(is_common, descriptors + 0.5 * others, others)
-        return jnp.where(is_common, moved, elsewhere)[order], descriptors[order]
-
-    keys = jax.random.split(jax.random.key(2), len(places.mask))
-    return _features(*jax.vmap(view)(places.keypoints, places.descriptors, keys))
+    view = jnp.where(is_common, moved, elsewhere), jnp.where(is_common, rows + 0.5 * others, others)
+    return features(points, rows), features(*(values[:, order] for values in view))
 
 
 @cache
+@partial(jax.jit, static_argnums=0)
 def matches_of(pairs: int) -> Matches:
     """Matches of pairs; a third of the matches of a pair agree."""
-    keys = jax.random.split(jax.random.key(3), 6)
-    points = jax.random.uniform(keys[0], (pairs, SLOTS, 2), maxval=SIZE)
-    moved = jnp.clip(points + 20 + 5 * jax.random.normal(keys[1], points.shape), 0, SIZE - 1)
-    elsewhere = jax.random.uniform(keys[2], points.shape, maxval=SIZE)
+    keys = jax.random.split(jax.random.key(1, impl="rbg"), 6)
+    points, elsewhere = (jax.random.uniform(key, (pairs, SLOTS, 2), maxval=SIZE) for key in keys[:2])
+    moved = jnp.clip(points + 20 + 5 * jax.random.normal(keys[2], points.shape), 0, SIZE - 1)
     points1 = jnp.where((np.arange(SLOTS) % 3 == 0)[None, :, None], moved, elsewhere)
     distance, scores0, scores1 = (jax.random.uniform(key, (pairs, SLOTS), minval=0.1) for key in keys[3:])
-    real = jnp.broadcast_to(jnp.arange(SLOTS) < MATCHES, (pairs, SLOTS))
-    size = jnp.full((pairs, 2), float(SIZE))
+    real, size = jnp.broadcast_to(jnp.arange(SLOTS) < MATCHES, (pairs, SLOTS)), jnp.full((pairs, 2), float(SIZE))
     return Matches(points, points1, 1.4 * distance, scores0, scores1, real, size, size)
 
 
 @cache
+@partial(jax.jit, static_argnums=(0, 1))
 def database_of(images: int, dimension: int) -> jax.Array:
     """Global descriptors."""
-    rows = jax.random.normal(jax.random.key(4), (images, dimension))
+    rows = jax.random.normal(jax.random.key(2, impl="rbg"), (images, dimension))
     return rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
 
 
-# --- the steps -----------------------------------------------------------------------------------------------
+def rows_of(features: Features, index: Any) -> Features:
+    """Features of some images."""
+    return jax.tree.map(lambda field: field[index], features)
 
 
 def product_rate(side: int) -> Timed:
     """Product of square matrices."""
-    left, right = (jax.random.normal(jax.random.key(seed), (side, side)) for seed in (0, 1))
-    product = jax.jit(jnp.matmul, static_argnames="precision")
-    rounded = left.astype(jnp.bfloat16), right.astype(jnp.bfloat16)
+    left = right = jax.random.normal(jax.random.key(3), (side, side))
+    product, rounded = jax.jit(jnp.matmul, static_argnames="precision"), left.astype(jnp.bfloat16)
     calls = {"float32": ready(product, left, right, precision=EXACT), "JAX's default": ready(product, left, right),
-             "bfloat16": ready(product, *rounded)}  # fmt: skip
+             "bfloat16": ready(product, rounded, rounded)}  # fmt: skip
     return calls | with_torch("product", left, right), 2 * side**3 / 1e12, "TFLOP"
 
 
@@ -155,20 +139,16 @@ def memory_rate(gigabytes: float) -> Timed:
     return {"copy": ready(jax.jit(lambda array: array + 1), array)} | with_torch("copy", array), gigabytes, "GB"
 
 
-def matching(candidates: int, keypoints: int, dimension: int, **options: Any) -> Timed:
+def matching(candidates: int, keypoints: int, dimension: int, *, with_ratio: bool = False) -> Timed:
     """One query with its candidates: mutual nearest neighbors and their distances."""
-    place = places(1, keypoints, dimension)
-    query = jax.tree.map(lambda field: field[0], place)
-    images = views(jax.tree.map(lambda field: jnp.repeat(field, candidates, axis=0), place))
-    sides, match = (query.descriptors, images.descriptors), partial(mfvpr.match_candidates, **options)
-
-    @jax.jit
-    def product(query: jax.Array, candidates: jax.Array) -> jax.Array:
-        return jnp.einsum("nd,cmd->cnm", query, candidates, precision=EXACT)
-
-    calls = {"mfvpr": ready(match, query, images), "mfvpr, in one jit": ready(jax.jit(match), query, images),
-             "bare product": ready(product, *sides)}  # fmt: skip
-    calls |= with_torch("match_with_distances", *sides)
+    images, views = scene(candidates, keypoints, dimension)
+    query, match = rows_of(views, 0), partial(mfvpr.match_candidates, with_ratio=with_ratio)
+    sides = query.descriptors, images.descriptors
+    product = jax.jit(partial(jnp.einsum, "nd,cmd->cnm", precision=EXACT))
+    calls: Calls = {"mfvpr": ready(match, query, images)}
+    if not with_ratio:
+        calls |= {"mfvpr, in one jit": ready(jax.jit(match), query, images), "bare product": ready(product, *sides)}
+        calls |= with_torch("match_with_distances", *sides)
     return calls, 2 * candidates * keypoints**2 * dimension / 1e12, "TFLOP"
 
 
@@ -178,16 +158,12 @@ def scoring(pairs: int, *, name: str) -> Timed:
               "sum": mfvpr.AggregatedScore()}[name]  # fmt: skip
     m, score = matches_of(pairs), partial(mfvpr.score_candidates, scorer)
     arrays = m.points0, m.points1, m.scores0, m.scores1, m.distance, m.mask
-
-    @jax.jit
-    def read(*arrays: jax.Array) -> list[jax.Array]:
-        return [jnp.sum(array) for array in arrays]
-
+    read = jax.jit(lambda *arrays: [jnp.sum(array) for array in arrays])
     calls = {"mfvpr": ready(score, m), "mfvpr, in one jit": ready(jax.jit(score), m), "read": ready(read, *arrays)}
     return calls | with_torch("score", *arrays, scorer=name), pairs / 1e3, "1000 pairs"
 
 
-def grid(queries: int, candidates: int, *, at_once: bool) -> Timed:
+def grid(queries: int, candidates: int, *, at_once: bool = False) -> Timed:
     """1,000 settings of the histogram, for one query after the other, or for all pairs in one call."""
     m, score = matches_of(queries * candidates), partial(mfvpr.score_grid, mfvpr.HistogramOfShifts(), **AXES)
     pairs = queries * candidates if at_once else candidates
@@ -203,87 +179,74 @@ def grid(queries: int, candidates: int, *, at_once: bool) -> Timed:
 def searching(queries: int, images: int, dimension: int) -> Timed:
     """The nearest global descriptors."""
     database = database_of(images, dimension)
-    vectors = database[:queries] + 0.02 * jax.random.normal(jax.random.key(5), (queries, dimension))
-    product = jax.jit(partial(jnp.matmul, precision=EXACT))
-    search: Callable[..., Any] = ExactSearch().shortlist
+    vectors = database[:queries] + 0.02 * jax.random.normal(jax.random.key(4), (queries, dimension))
+    product = jax.jit(partial(jnp.einsum, "qd,nd->qn", precision=EXACT))
     calls = {"mfvpr": ready(mfvpr.retrieve, vectors, database, num_candidates=NEAREST),
-             "mfvpr, ExactSearch": partial(search, np.asarray(vectors), database, NEAREST),
-             "bare product": ready(product, vectors, database.T)}  # fmt: skip
+             "bare product": ready(product, vectors, database)}  # fmt: skip
     calls |= with_torch("search", vectors, database, candidates=NEAREST)
     return calls, 2 * queries * images * dimension / 1e12, "TFLOP"
-
-
-@cache
-def _network(checkpoint: str) -> tuple[Any, dict[str, np.ndarray]]:
-    return networks.make_network(checkpoint)
-
-
-@cache
-def _street() -> np.ndarray:
-    return networks.make_images(SIZE)
 
 
 def network(batch: int, *, step: str) -> Timed:
     """A network, from images on the host to features on the host; a dense map stays on the device."""
     contest = next(contest for contest in networks.contests() if contest.step == step)
     model, arrays = _network(contest.checkpoint)
-    images = np.stack([networks.resize(image, contest.size) for image in _street()])[np.arange(batch) % len(_street())]
+    street = np.stack([networks.resize(image, contest.size) for image in _images(SIZE)])
+    images = street[np.arange(batch) % len(street)]
     calls: Calls = {"mfvpr": partial(contest.extractor(model, batch_size=batch), images)}
     if find_spec("torch"):
-        calls |= {name: call for _, name, call in networks.torch_entries(contest, arrays, images, (batch,))}
+        entries = networks.torch_entries(contest, arrays, images, (batch,))
+        calls |= {name: call for _, name, call in entries if "channels last" not in name}
     return calls, batch * GIGAFLOPS[contest.checkpoint] / 1e3, "TFLOP"
 
 
-def ranking(queries: int, images: int, candidates: int, keypoints: int, dimension: int) -> Timed:
+_network, _images = cache(networks.make_network), cache(networks.make_images)
+
+
+def ranking(queries: int, candidates: int, keypoints: int, dimension: int) -> Timed:
     """From the features of queries and of their candidates to rankings by the histogram."""
-    database = places(images, keypoints, dimension)
-    rows = jnp.asarray((np.arange(queries)[:, None] + np.arange(candidates)) % images)
-    sides, scorer = (views(_rows(database, rows[:, 0])), database), mfvpr.HistogramOfShifts(max_bins=BINS)
+    images, views = scene(candidates, keypoints, dimension)
+    rows = jnp.asarray((np.arange(queries)[:, None] + np.arange(candidates)) % candidates)
+    scorer = mfvpr.HistogramOfShifts(max_bins=BINS)
 
     def rank(query: Features, candidates: Features) -> jax.Array:
         return mfvpr.rank(mfvpr.score_candidates(scorer, mfvpr.match_candidates(query, candidates)))
 
     @jax.jit
-    def rank_all(queries: Features, database: Features, rows: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda query: rank(query[0], _rows(database, query[1])), (queries, rows))
+    def rank_all(views: Features, images: Features, rows: jax.Array) -> jax.Array:
+        return jax.lax.map(lambda row: rank(rows_of(views, row[0]), rows_of(images, row)), rows)
 
-    first = _rows(sides[0], 0), _rows(database, rows[0])
-    calls: Calls = {"mfvpr, in one jit": ready(rank_all, *sides, rows)}
-    if queries == 1:
-        calls = {"mfvpr": ready(rank, *first), "mfvpr, in one jit": ready(jax.jit(rank), *first)}
-    calls |= with_torch("rank", rows, *(field for f in sides for field in (f.keypoints, f.descriptors, f.scores)))
+    calls: Calls = {"mfvpr": ready(rank, rows_of(views, 0), images)} if queries == 1 else {}
+    calls |= {"mfvpr, in one jit": ready(rank_all, views, images, rows)}
+    fields = [field for side in (views, images) for field in (side.keypoints, side.descriptors, side.scores)]
+    calls |= with_torch("rank", rows, *fields)
     return calls, 2 * queries * candidates * keypoints**2 * dimension / 1e12, "TFLOP"
 
 
-def _rows(features: Features, index: Any) -> Features:
-    return jax.tree.map(lambda field: field[index], features)
-
-
 CASES = [
-    Case("rates", "product {0} x {0}", product_rate, (8192,), (256,)),
+    Case("rates", "product {0} x {0}", product_rate, (8192,), (256,), True),
     Case("rates", "copy, {} GB", memory_rate, (4.0,), (0.01,)),
-    Case("rates", "copy, {} GB: a call without work", memory_rate, (1e-6,), (1e-6,)),
-    Case("matching", "{} x {} x {}", matching, (50, 700, 512), (3, 64, 32)),
+    Case("rates", "call without work", memory_rate, (1e-6,), (1e-6,)),
+    Case("matching", "{} x {} x {}", matching, (50, 700, 512), (3, 64, 32), True),
     Case("matching", "{} x {} x {}", matching, (1000, 1000, 128), (8, 64, 16)),
-    Case("matching", "{} x {} x {}, ratio", partial(matching, with_ratio=True), (50, 700, 512), (3, 64, 32), False),
-    Case("matching", "{} x {} x {}, bfloat16", partial(matching, product="bfloat16", chunk_size=1), (50, 700, 512),
-         (3, 64, 32), False),
-    *(Case("scores", f"{name}, {{:,}} pairs", partial(scoring, name=name), (pairs,), (4,), pairs != 1000)
+    Case("matching", "{} x {} x {}, ratio", partial(matching, with_ratio=True), (50, 700, 512), (3, 64, 32)),
+    *(Case("scores", f"{name}, {{:,}} pairs", partial(scoring, name=name), (pairs,), (4,), (name, pairs) == ("sum", 50))
       for pairs in (50, 1000, 10_000) for name in ("histogram", "anchor", "sum")),
-    Case("grids", "1,000 settings, {} queries x {}", partial(grid, at_once=False), (100, 50), (1, 2)),
-    Case("grids", "1,000 settings, {} queries x {}, one call", partial(grid, at_once=True), (100, 50), (1, 2), False),
-    *(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (3, 2000, 16), queries != 100)
+    Case("grids", "1,000 settings, {} queries x {}", grid, (100, 50), (1, 2), True),
+    Case("grids", "1,000 settings, {} queries x {}, one call", partial(grid, at_once=True), (100, 50), (1, 2)),
+    *(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (3, 2000, 16), queries == 1)
       for queries in (1, 100, 1000)),
-    *(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,), batch != 8)
-      for batch in (1, 32, 8)
-      for step in (networks.MAP, networks.FEATURES, f"{networks.ALIKED[0]} features", "MixVPR descriptor")),
-    Case("queries", "{} query, {} images, {} candidates x {} x {}", ranking, (1, 50, 50, 700, 512), (1, 4, 3, 64, 32)),
-    Case("queries", "{} queries, {} images, {} candidates x {} x {}", ranking, (1000, 1000, 50, 700, 512),
-         (3, 4, 3, 64, 32)),
+    *(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,), (step, batch) == (aliked, 8))
+      for batch in (1, 8, 32) for aliked in [f"{networks.ALIKED[0]} features"]
+      for step in (networks.MAP, networks.FEATURES, aliked, "MixVPR descriptor")
+      if (step, batch) != (networks.FEATURES, 32)),
+    Case("queries", "{} query x {} x {} x {}", ranking, (1, 50, 700, 512), (1, 3, 64, 32), True),
+    Case("queries", "{} queries x {} x {} x {}", ranking, (1000, 50, 700, 512), (3, 3, 64, 32)),
 ]  # fmt: skip
-# Group -> seconds that it may take on an accelerator, with compilation; with --quick a fifth. Unused time goes on.
-SECONDS = {"correct": 60, "rates": 10, "matching": 35, "scores": 45, "grids": 25, "search": 25, "networks": 70,
-           "queries": 25}  # fmt: skip
+# Group -> seconds that it needs on an accelerator, mostly to compile; time that is left goes to the groups after it.
+SECONDS = {"rates": 20, "correct": 50, "matching": 45, "scores": 35, "grids": 35, "search": 25, "networks": 65,
+           "queries": 20}  # fmt: skip
+QUICK_SECONDS = 12
 TIMED = ("case", "who", "ms", "25 %", "75 %", "calls", "/ first", "rate", "per s", "first call, s", "note")
 CHECKED = ("what", "reference", "deviation", "allowed", "differ", "entries", "exact")
 
@@ -292,23 +255,22 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
     """Run groups, by default all; print a table after each group, and write all tables so far as JSON to `out`."""
     if unknown := {*groups} - {*SECONDS}:
         raise InputError(f"groups: expected some of {', '.join(SECONDS)}, got {', '.join(sorted(unknown))}")
-    device, on_cpu = jax.devices()[0], jax.default_backend() == "cpu"
-    report: dict[str, Any] = {
-        "matmul_precision": jax.config.values["jax_default_matmul_precision"],
-        "torch": version("torch") if find_spec("torch") else None, "is_quick": is_quick, "groups": {},
-    }  # fmt: skip
-    end = time.monotonic()
+    on_cpu, end, group_reports = jax.default_backend() == "cpu", time.monotonic(), {}
+    report = {"torch": version("torch") if find_spec("torch") else None, "is_quick": is_quick, "groups": group_reports,
+              "matmul_precision": jax.config.values["jax_default_matmul_precision"]}  # fmt: skip
     for group in groups or SECONDS:
-        start, end = time.monotonic(), end + SECONDS[group] / (5 if is_quick else 1)
+        start, end = time.monotonic(), end + (QUICK_SECONDS if is_quick else SECONDS[group])
         if group == "correct":
             rows, names = list(checks(is_small=on_cpu or is_quick, end=end)), CHECKED
         else:
             cases = [case for case in CASES if case.group == group and (case.is_quick or not is_quick)]
             rows, names = list(time_cases(cases, rounds or ROUNDS, on_cpu=on_cpu, end=end)), TIMED
-        peak, seconds = (device.memory_stats() or {}).get("peak_bytes_in_use"), time.monotonic() - start
-        report["groups"][group] = {"seconds": seconds, "peak_bytes": peak, "rows": rows}
+        seconds, first_calls = time.monotonic() - start, sum(row.get("first call, s", 0) for row in rows)
+        peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+        group_reports[group] = {"seconds": seconds, "first_calls_s": first_calls, "peak_bytes": peak, "rows": rows}
         table = Table(names, [[_cell(row.get(name, "")) for name in names] for row in rows], text_columns=2)
-        write_report(out, f"{group}: {seconds:.1f} s, peak memory {peak} bytes", [table], report)
+        title = f"{group}: {seconds:.1f} s, of first calls {first_calls:.1f} s; peak memory so far {peak} bytes"
+        write_report(out, title, [table], report)
     return report
 
 
@@ -319,22 +281,22 @@ def time_cases(cases: Sequence[Case], rounds: int, *, on_cpu: bool, end: float) 
         if time.monotonic() > end:
             yield {"case": title, "note": "skipped: out of time"}
         else:
-            yield from time_calls(title, *case.make(*sizes), rounds, end)
+            yield from time_calls(title, *case.make(*sizes), rounds)
 
 
-def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int, end: float) -> Iterator[dict[str, Any]]:
+def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int) -> Iterator[dict[str, Any]]:
     """Time calls in turns, after a first call that compiles; a call that fails says so."""
     rows: dict[str, dict[str, Any]] = {who: {"case": title, "who": who} for who in calls}
     times: dict[str, list[float]] = {}
     for who, call in calls.items():
         try:
             rows[who]["first call, s"] = duration(call)
-            times[who] = [duration(call)]
+            times[who] = []
         except Exception as error:  # such as memory that does not suffice: the other calls go on
             rows[who]["note"] = " ".join(f"failed: {error!r}".split())[:80]
-    stop = min(time.monotonic() + CASE_SECONDS, end)
-    for _ in range(rounds - 1):
-        if time.monotonic() < stop:
+    stop = time.monotonic() + CASE_SECONDS
+    for number in range(rounds):
+        if number < LEAST_ROUNDS or time.monotonic() < stop:
             for who, seconds in times.items():
                 seconds.append(duration(calls[who]))
     medians = {who: float(np.median(seconds)) for who, seconds in times.items()}

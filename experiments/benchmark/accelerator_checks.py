@@ -1,9 +1,9 @@
-"""Results of a device beside float64: loops of the paper's equations, NumPy's products, or the same code on the CPU."""
+"""Results of a device beside float64: loops of the paper's equations, NumPy, or the same code on the CPU."""
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,31 +22,31 @@ from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.threads import ordered_map
 from tests import oracles
 
-SIZE = 336  # px
-TIE = 1e-6  # similarities that differ by less are equal in float32
+SIZE, CANDIDATES, DIMENSION = 336, 8, 128  # px
 SIDE = 12  # the keypoints of an image are SIDE^2, as cells of a grid
+TIE = 1e-6  # similarities that differ by less are equal in float32
 MATCHING: dict[str, dict[str, Any]] = {
-    "float32": {"product": "float32"}, "bfloat16": {"product": "bfloat16", "chunk_size": 1},
+    "bfloat16": {"product": "bfloat16", "chunk_size": 1}, "float32": {"product": "float32"},
     "one after the other": {"chunk_size": 1}, "without cross-check": {"cross_check": "none"},
 }  # fmt: skip
-GRIDS = (
-    (mfvpr.HistogramOfShifts(), {"sigma": [5.0, 22.5], "bin_size": [10.0, 15.0], "weight": ["fs", "dmf"],
-                                 "max_distance": [0.5, 1.2]}),
-    (mfvpr.AnchorPoints(), {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]}),
-)  # fmt: skip
-SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
-    "histogram": (mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48), 1e-4),
-    "anchor": (mfvpr.AnchorPoints(temperature=0.1), 5e-3),
-    "sum": (mfvpr.AggregatedScore(temperature=2.0), 1e-4),
+SCORES: dict[str, Callable[..., float]] = {  # of points0, points1, distances and summed scores of one pair
+    "histogram": lambda p0, p1, _, s: oracles.histogram_of_shifts(p1 - p0, s, (SIZE, SIZE), (SIZE, SIZE))[0].max(),
+    "anchor": lambda p0, p1, _, s: oracles.anchor_points(p0, p1, s, (SIZE, SIZE), (SIZE, SIZE)),
+    "sum": lambda p0, p1, d, _: oracles.aggregated_score(p1 - p0, 2 - d, (SIZE, SIZE)),
 }
+GRIDS = {
+    mfvpr.HistogramOfShifts(): {"sigma": [5.0, 22.5], "weight": ["fs", "dmf"], "max_distance": [0.5, 1.2]},
+    mfvpr.AnchorPoints(): {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]},
+}
+SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
+    mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4, mfvpr.AnchorPoints(temperature=0.1): 5e-3,
+    mfvpr.AggregatedScore(temperature=2.0): 1e-4,
+}  # fmt: skip
 NETWORKS = {  # checkpoint -> side of the images in px, result; weights are random unless they are installed
     networks.ALIKED[0]: (320, lambda model, images: model.levels(images / 255)[1]),
     networks.D2NET: (336, lambda model, images: model(preprocess(images, "caffe"))),
     networks.MIXVPR: (320, lambda model, images: model(model.preprocess(images))),
 }
-
-
-Images = tuple[Features, Features]  # a query `[N]`, and its candidates `[C, N]`
 
 
 class Task(NamedTuple):
@@ -68,6 +68,7 @@ def checks(*, is_small: bool, end: float) -> Iterator[dict[str, Any]]:
 
 
 def check(task: Task, end: float) -> dict[str, Any]:
+    """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
     row: dict[str, Any] = {"what": task.what, "reference": task.reference}
     if time.monotonic() > end:
         return row | {"exact": "skipped: out of time"}
@@ -75,19 +76,10 @@ def check(task: Task, end: float) -> dict[str, Any]:
         got, expected, differ, entries = (*task.compute(), 0, 0)[:4]
     except Exception as error:  # the other checks go on
         return row | {"exact": f"failed: {error!r}"[:80]}
-    deviation = relative_deviation(got, expected)
-    is_exact = deviation <= task.allowed and not differ
-    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
-                  "exact": "yes" if is_exact else "NO"}  # fmt: skip
-
-
-def relative_deviation(got: Any, expected: Any) -> float:
-    """Greatest deviation, relative to the largest entry; infinite if one has a NaN where the other has none."""
     got, expected = (np.asarray(values, np.float64) for values in (got, expected))
-    same = (got == expected) | (np.isnan(got) & np.isnan(expected))
-    difference = np.where(same, 0, np.nan_to_num(np.abs(got - expected), nan=np.inf))
-    scale = np.max(np.abs(expected), initial=0, where=np.isfinite(expected)) or 1.0
-    return float(np.max(difference, initial=0) / scale)
+    deviation = float(np.max(np.abs(got - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
+    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
+                  "exact": "yes" if deviation <= task.allowed and not differ else "NO"}  # fmt: skip
 
 
 def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:
@@ -97,60 +89,52 @@ def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any
         array = np.asarray(leaf)
         return array.astype(np.float64) if array.dtype == np.float32 else array
 
-    result = np.asarray(function(*jax.device_put(inputs)))
-    cpu = jax.devices("cpu")[0]
+    result, cpu = np.asarray(function(*jax.device_put(inputs))), jax.devices("cpu")[0]
     with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
         return result, np.asarray(function(*jax.tree.map(widen, inputs)))
 
 
-def features(count: int, dimension: int) -> Features:
-    """A query (row 0) and candidates `[count, N]`, NumPy; nearly equal descriptors need all digits of float32."""
-    rng, keypoints = np.random.default_rng(dimension), SIDE**2
-    query = np.abs(rng.normal(size=(keypoints, dimension)))
-    query /= np.linalg.norm(query, axis=1, keepdims=True)
-    images = [query]
-    for _ in range(count - 1):
-        image = query[rng.permutation(keypoints)] + rng.normal(size=query.shape) / dimension**0.5
-        image[keypoints // 2 :] = image[: keypoints // 2] + 5e-5 * rng.normal(size=(keypoints // 2, dimension))
-        images.append(image / np.linalg.norm(image, axis=1, keepdims=True))
-    points, scores = rng.uniform(0, SIZE, (count, keypoints, 2)), rng.uniform(100, 1000, (count, keypoints))
-    points, descriptors, scores = (array.astype(np.float32) for array in (points, np.stack(images), scores))
-    return Features(
-        points, descriptors, scores, np.ones((count, keypoints), bool), np.full((count, 2), SIZE, np.float32)
-    )
+@cache
+def images() -> tuple[Features, Features]:
+    """A query `[N]` and candidates `[C, N]`, NumPy; nearly equal descriptors need all digits of float32."""
+    rng, keypoints = np.random.default_rng(0), SIDE**2
+    descriptors = np.abs(rng.normal(size=(1 + CANDIDATES, keypoints, DIMENSION))) / DIMENSION**0.5
+    for image in descriptors[1:]:
+        image[:] = descriptors[0, rng.permutation(keypoints)] + rng.normal(size=image.shape) / DIMENSION**0.5
+        image[keypoints // 2 :] = image[: keypoints // 2] + 5e-5 * rng.normal(size=(keypoints // 2, DIMENSION))
+    descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
+    shape = descriptors.shape[:2]
+    arrays = rng.uniform(0, SIZE, (*shape, 2)), descriptors, rng.uniform(100, 1000, shape)
+    points, descriptors, scores = (array.astype(np.float32) for array in arrays)
+    both = Features(points, descriptors, scores, np.ones(shape, bool), np.full((shape[0], 2), SIZE, np.float32))
+    return jax.tree.map(lambda field: field[0], both), jax.tree.map(lambda field: field[1:], both)
 
 
-def sides(count: int, dimension: int) -> Images:
-    """A query `[N]` and its candidates `[count, N]`."""
-    images = features(count + 1, dimension)
-    return jax.tree.map(lambda field: field[0], images), jax.tree.map(lambda field: field[1:], images)
-
-
-def matches(count: int, **options: Any) -> Matches:
-    """Matches of a query with candidates, NumPy, computed on the CPU."""
+@cache
+def matches(**options: Any) -> Matches:
+    """Matches of the query with the candidates, NumPy, computed on the CPU."""
     with jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, mfvpr.match_candidates(*sides(count, 64), **options))
+        return jax.tree.map(np.asarray, mfvpr.match_candidates(*images(), **options))
 
 
-def product_tasks(_: bool) -> Iterator[Task]:
-    query, candidate = (side.descriptors for side in sides(1, 512))
-    expected = query.astype(np.float64) @ candidate[0].T.astype(np.float64)
-    for what, product, allowed in (("JAX's product, default precision", lambda left, right: left @ right.T, np.inf),
-                                   ("products of descriptors", products, 1e-6)):  # fmt: skip
-        compute = partial(lambda product: (jax.jit(product)(query, candidate[0]), expected), product)
-        yield Task(what, compute, allowed, "float64, NumPy")
+def matching_tasks(_: bool) -> Iterator[Task]:
+    """Products and matches."""
+    for name, options in MATCHING.items():
+        yield Task(f"matches, {name}", partial(match, images(), options), reference="float64, NumPy")
+    query, candidate = images()[0].descriptors, images()[1].descriptors[0]
+    expected = query.astype(np.float64) @ candidate.astype(np.float64).T
+    yield Task(
+        "products of descriptors", lambda: (jax.jit(products)(query, candidate), expected), 1e-6, "float64, NumPy"
+    )
+    default = jax.jit(lambda left, right: left @ right.T)
+    yield Task("JAX's default product", lambda: (default(query, candidate), expected), np.inf, "float64, NumPy")
 
 
-def matching_tasks(is_small: bool) -> Iterator[Task]:
-    for dimension in (128,) if is_small else (128, 512):
-        for title, options in MATCHING.items():
-            compute = partial(match, sides(3 if is_small else 8, dimension), options)
-            yield Task(f"matches of {dimension} dimensions, {title}", compute, 1e-5, "float64, NumPy")
-
-
-def match(images: Images, options: dict[str, Any], matched: Images | None = None) -> tuple[Any, ...]:
+def match(
+    images: tuple[Features, Features], options: dict[str, Any], rounded: tuple[Features, Features] | None = None
+) -> tuple[Any, ...]:
     """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
-    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*(matched or images), with_ratio=True, **options))
+    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*(rounded or images), with_ratio=True, **options))
     found, references = np.where(matches.mask, matches.index1, -1), []
     query, rows = images[0].descriptors.astype(np.float64), np.arange(found.shape[1])
     for candidate in images[1].descriptors.astype(np.float64):
@@ -169,84 +153,68 @@ def match(images: Images, options: dict[str, Any], matched: Images | None = None
     return np.where(compared, [matches.distance, matches.ratio], 0), np.where(compared, numbers, 0), differ, found.size
 
 
-def score_tasks(is_small: bool) -> Iterator[Task]:
-    pairs, cells = matches(4 if is_small else 20, with_ratio=True), matches(4, cross_check="candidate")
+def scoring_tasks(_: bool) -> Iterator[Task]:
+    """Scores, grids and gradients."""
+    pairs, cells = matches(with_ratio=True), matches(cross_check="candidate")
     for name, scorer in SCORERS.items():
-        if hasattr(scorer, "score_pairs"):  # on the host
-            continue
-        scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
-        yield Task(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
-        if name in ("histogram", "anchor", "sum"):
-            compute = partial(_beside_loops, name, scorer, pairs)
-            yield Task(f"score {name}", compute, reference="the paper's equation, loops")
-
-
-def _beside_loops(name: str, scorer: Any, pairs: Matches) -> tuple[Any, Any]:
-    pairs = jax.tree.map(lambda field: field[:3], pairs)
-    expected, size = [], (SIZE, SIZE)
-    for row, real in enumerate(pairs.mask):
-        points0, points1, distance, *scores = (
-            values[row][real] for values in (pairs.points0, pairs.points1, pairs.distance, pairs.scores0, pairs.scores1)
-        )
-        weights, shifts = np.sum(scores, axis=0, dtype=np.float64), points1.astype(np.float64) - points0
-        expected.append({
-            "histogram": lambda: oracles.histogram_of_shifts(shifts, weights, size, size)[0].max(),  # noqa: B023
-            "anchor": lambda: oracles.anchor_points(points0, points1, weights, size, size),  # noqa: B023
-            "sum": lambda: oracles.aggregated_score(shifts, 2 - distance.astype(np.float64), size),  # noqa: B023
-        }[name]())  # fmt: skip
-    return mfvpr.score_candidates(scorer, jax.device_put(pairs)), expected
-
-
-def grid_tasks(is_small: bool) -> Iterator[Task]:
-    pairs = matches(4 if is_small else 20, with_ratio=True)
-    for scorer, axes in GRIDS:
+        if name in SCORES:
+            compute, reference = partial(_beside_loops, SCORES[name], scorer(), pairs), "the paper's equation, loops"
+            yield Task(f"score {name}", compute, reference=reference)
+        elif not hasattr(scorer, "score_pairs"):  # those are on the host
+            scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
+            yield Task(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
+    for scorer, axes in GRIDS.items():
         compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
         yield Task(f"grid of {type(scorer).__name__}", compute)
+    for scorer, allowed in SMOOTH.items():
+        compute = partial(beside_float64, jax.jit(partial(_gradient, scorer)), *images())
+        yield Task(f"gradient of {type(scorer).__name__}", compute, allowed)
 
 
-def gradient_tasks(_: bool) -> Iterator[Task]:
-    pairs, (query, candidates) = matches(4), sides(1, 128)
+def _beside_loops(score: Callable[..., float], scorer: Any, pairs: Matches) -> tuple[Any, Any]:
+    expected = []
+    for pair, real in enumerate(pairs.mask[:3]):
+        fields = pairs.points0, pairs.points1, pairs.distance, pairs.scores0, pairs.scores1
+        points0, points1, distance, *scores = (field[pair, real].astype(np.float64) for field in fields)
+        expected.append(score(points0, points1, distance, sum(scores)))
+    return mfvpr.score_candidates(scorer, jax.device_put(pairs))[:3], expected
+
+
+def _gradient(scorer: Any, query: Features, candidates: Features) -> jax.Array:
+    """Gradient of a score for the descriptors and points of a candidate, side by side."""
     candidate = jax.tree.map(lambda field: field[0], candidates)
 
-    def by_points(scorer: Any, pairs: Matches) -> Any:
-        return jax.grad(lambda points: jnp.sum(jax.vmap(scorer)(replace(pairs, points1=points))))(pairs.points1)
+    def score(descriptors: jax.Array, points: jax.Array) -> jax.Array:
+        features = replace(candidate, descriptors=descriptors, keypoints=points)
+        return scorer(mfvpr.soft_match(query, features, temperature=0.02))
 
-    def by_descriptors(scorer: Any, query: Features, candidate: Features) -> Any:
-        def score(descriptors: Any) -> Any:
-            return scorer(mfvpr.soft_match(query, replace(candidate, descriptors=descriptors), temperature=0.02))
-
-        return jax.grad(score)(candidate.descriptors)
-
-    for name, (scorer, allowed) in SMOOTH.items():
-        for entries, function, inputs in (("points", by_points, (pairs,)),
-                                          ("descriptors", by_descriptors, (query, candidate))):  # fmt: skip
-            compute = partial(beside_float64, jax.jit(partial(function, scorer)), *inputs)
-            yield Task(f"gradient of {name}, {entries}", compute, allowed)
+    gradients = jax.grad(score, argnums=(0, 1))(candidate.descriptors, candidate.keypoints)
+    return jnp.concatenate([gradient / jnp.max(jnp.abs(gradient)) for gradient in gradients], axis=1)
 
 
-def search_tasks(is_small: bool) -> Iterator[Task]:
-    rng, count = np.random.default_rng(0), 500 if is_small else 100_000
-    rows = rng.normal(size=(count, 512))
-    rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, 512))  # nearly equal in pairs
+def search_tasks(_: bool) -> Iterator[Task]:
+    """Exact search."""
+    rng, count = np.random.default_rng(0), 20_000
+    rows = rng.normal(size=(count, DIMENSION))
+    rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, DIMENSION))  # equal but for digits
     database = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     queries = database[:: count // 20]
     similarity = queries.astype(np.float64) @ database.T.astype(np.float64)
     expected = -np.sort(-similarity, axis=1)[:, :50]
 
-    def search(shortlist: Callable[..., Any], **options: Any) -> tuple[Any, ...]:
+    def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
         candidates = shortlist(queries, database, num_candidates=50)
         found = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
         return candidates.scores, expected, int(np.sum(np.abs(found - expected) > TIE)), found.size
 
-    for function in (mfvpr.retrieve, ExactSearch().shortlist):
-        yield Task(f"search, {function.__name__}", partial(search, function), 2e-6, "float64, NumPy")
+    for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
+        yield Task(f"search, {name}", partial(search, function), 2e-6, "float64, NumPy")
 
 
 def network_tasks(is_small: bool) -> Iterator[Task]:
-    for checkpoint, (side, function) in NETWORKS.items():
-        if not is_small or checkpoint == networks.ALIKED[0]:
-            compute = partial(_network, checkpoint, 64 if is_small else side, function)
-            yield Task(f"{checkpoint}, random weights", compute)
+    """Networks on one image; the small check is of ALIKED alone."""
+    for checkpoint, (side, function) in [*NETWORKS.items()][: 1 if is_small else None]:
+        yield Task(f"{checkpoint}, random weights", partial(_network, checkpoint, 64 if is_small else side, function))
 
 
 def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[Any, Any]:
@@ -256,4 +224,4 @@ def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[
     return beside_float64(run, state, images.astype(np.float32))
 
 
-PARTS = (product_tasks, matching_tasks, network_tasks, score_tasks, grid_tasks, gradient_tasks, search_tasks)
+PARTS = (matching_tasks, network_tasks, scoring_tasks, search_tasks)
