@@ -1,28 +1,37 @@
 # `make demo` runs the main job on the embedded data set. Tests: `make test-fast` while editing, `make test` before a
-# commit, `make test-all` before a release.
+# commit, `make test-all` before a release, `make test-wheel` for what is installed.
 PYTHON ?= python3
+CONSTRAINTS ?= /dev/null
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS)
 
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --timeout 300
 # Half the compilation, for tests of logic. Tests of bits and of parity with other code are marked `optimized`.
-QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 \
-  XLA_FLAGS='--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1'
+FLAGS := --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1
+QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="`cat .venv/.flags`"
 
-.PHONY: demo test test-fast test-all setup check conf benchmark clean
+.PHONY: demo test test-fast test-all test-wheel setup check conf benchmark clean
 
 demo: setup
 	$(BIN)/mfvpr evaluate scorer=demo
 
-test-fast: .venv/.test
+test-fast: .venv/.test .venv/.flags
 	$(QUICK) $(PYTEST) -m 'not (slow or thorough or optimized)'
 
-test: .venv/.test
-	$(QUICK) $(PYTEST) -m 'not (slow or optimized)'
-	$(PYTEST) -m 'optimized and not slow'
+test: .venv/.test .venv/.flags
+	$(QUICK) $(PYTEST) -m 'not (slow or optimized)'; quick=$$?; \
+	$(PYTEST) -m 'optimized and not slow' && exit $$quick
 
 test-all: .venv/.test
 	$(PYTEST)
+
+# The quick tests on the installed wheel, outside of this folder, without any optional dependency.
+test-wheel: .venv/.test
+	@folder=`mktemp -d`; trap "rm -rf $$folder" EXIT; \
+	$(BIN)/python -m hatchling build -t wheel -d $$folder && $(PYTHON) -m venv $$folder/env && \
+	$$folder/env/bin/python -m pip install --quiet --disable-pip-version-check $$folder/*.whl pytest && \
+	cp -r tests pyproject.toml $$folder && cd $$folder && \
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 env/bin/python -m pytest -m 'not (slow or thorough or optimized)'
 
 setup: .venv/.setup
 
@@ -49,3 +58,7 @@ clean:
 .venv/.test .venv/.check .venv/.benchmark: .venv/.%: .venv/.setup
 	@$(PIP) --editable '.[$*]'
 	@touch $@
+
+# XLA ends a process at a flag that it does not know.
+.venv/.flags: .venv/.setup
+	@XLA_FLAGS='$(FLAGS)' $(BIN)/python -c 'import jax; jax.devices()' > $@ 2>&1 && echo '$(FLAGS)' > $@ || : > $@

@@ -4,16 +4,17 @@ import gc
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import settings
 
 from mfvpr import datasets
 from mfvpr.checkpoints import entry_of
+from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
 from mfvpr.checkpoints.networks import NETWORKS, blueprint
@@ -21,7 +22,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
 from tests.builders import read_golden
-from tests.io.match_files import write_tool_files
+from tests.needs import ALIKED, EXTRAS, LIGHTGLUE, OF_A_CLONE, is_at_hand, reason, skip_without
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects, and the usual thresholds collect too often
 # A shell ignores Ctrl-C for what it runs in the background; the tests of Ctrl-C need it there too.
@@ -48,8 +49,11 @@ def count_memory_maps() -> int:
 configure_jax("jax_compilation_cache_dir", str(COMPILED))
 configure_jax("jax_persistent_cache_min_compile_time_secs", 0.0)
 configure_jax("jax_persistent_cache_min_entry_size_bytes", -1)
-settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=40)
-settings.load_profile("mfvpr")
+if is_at_hand("hypothesis"):
+    from hypothesis import settings
+
+    settings.register_profile("mfvpr", deadline=None, derandomize=True, max_examples=40)
+    settings.load_profile("mfvpr")
 
 
 class Compilations:
@@ -75,6 +79,30 @@ def compilations() -> Compilations:
     jax.clear_caches()
     _compilations.reset()
     return _compilations
+
+
+class Module(pytest.Module):
+    """Skips as a whole where it imports a package that is not at hand."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        try:
+            return super().collect()
+        except self.CollectError as error:
+            missing = isinstance(error.__cause__, ModuleNotFoundError) and str(error.__cause__.name).split(".")[0]
+            if missing not in {*EXTRAS, *OF_A_CLONE}:
+                raise
+            pytest.skip(reason(missing), allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    return Module.from_parent(parent, path=module_path)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Count the skipped tests by reason."""
+    reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in terminalreporter.stats.get("skipped", []))
+    for words, count in reasons.most_common():
+        terminalreporter.write_line(f"{count:4} {words}")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -103,18 +131,30 @@ def cache(tmp_path_factory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def weights(tmp_path_factory) -> Path:
-    """A folder of installed weights: random ones, but ALIKED's real ones where they are at hand."""
-    root = tmp_path_factory.mktemp("weights")
+def install_weights(root: Path, checkpoints: Iterable[tuple[str, dict[str, np.ndarray]]]) -> Path:
+    """A folder of installed weights."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_WEIGHTS", str(root))
-        for name, tensors in random_checkpoints.at_hand():
+        for name, tensors in checkpoints:
             entry, source = entry_of(name), root / f"{name}.source"
             source.write_text("not published")
             plan = blueprint(entry)
             save(entry, convert(tensors, NETWORKS[name].table, plan.shapes), source, parameters=plan.parameters)
     return root
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory) -> Path:
+    """Installed weights of every network but DINOv2 and its relatives, all random."""
+    return install_weights(tmp_path_factory.mktemp("weights"), random_checkpoints.for_networks())
+
+
+@pytest.fixture(scope="session")
+def real_weights(tmp_path_factory) -> Path:
+    """The same, but with the real weights of ALIKED and LightGlue."""
+    skip_without(ALIKED, LIGHTGLUE)
+    real = {path.stem: read_checkpoint(path) for path in (ALIKED / "aliked-n16.pth", LIGHTGLUE)}
+    return install_weights(tmp_path_factory.mktemp("real"), (dict(random_checkpoints.for_networks()) | real).items())
 
 
 @pytest.fixture(scope="session")
@@ -126,6 +166,8 @@ def small_street(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tools(tmp_path_factory) -> Path:
     """Files of matches by hloc, kapture, COLMAP and vismatch."""
+    from tests.io.match_files import write_tool_files
+
     return write_tool_files(tmp_path_factory.mktemp("tools"))
 
 

@@ -14,10 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.io import savemat
 
-from mfvpr.checkpoints.checkpoint import read_checkpoint
-
-SHARED = Path(__file__).parent.parent.parent / "shared" / "weights"
-ALIKED, LIGHTGLUE = SHARED / "aliked", SHARED / "lightglue" / "aliked_lightglue.pth"
 KINDS = {
     "f4": "FloatStorage", "f8": "DoubleStorage", "f2": "HalfStorage", "i8": "LongStorage", "i4": "IntStorage",
     "i2": "ShortStorage", "i1": "CharStorage", "u1": "ByteStorage", "b1": "BoolStorage", "c8": "ComplexFloatStorage",
@@ -177,15 +173,15 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def at_hand() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """(name, tensors): random ones, and the real ones of ALIKED and LightGlue."""
+def for_networks() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """(name of published weights, random tensors)."""
     yield "d2_tf", random_checkpoint(d2net_shapes())
     yield "mixvpr_4096", random_checkpoint(mixvpr_shapes())
     yield "vgg16_places365", random_checkpoint(places365_shapes(full=False))
     yield "patchnetvlad_mapillary_128", random_checkpoint(netvlad_shapes(16, 128))
     yield "cosplace_vgg16_512", random_checkpoint(gem_shapes("vgg16", 512))
-    for path in sorted([*ALIKED.glob("*.pth"), *LIGHTGLUE.parent.glob(LIGHTGLUE.name)]):
-        yield path.stem, read_checkpoint(path)
+    yield "aliked-n16", random_checkpoint(aliked_shapes((16, 32, 64, 128), 128))
+    yield "aliked_lightglue", random_checkpoint(lightglue_shapes())
 
 
 def with_biases(weights: Shapes) -> Shapes:

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
-from beartype import beartype
 from jaxtyping import config, install_import_hook
 
 
 def check_shapes(function: Callable[..., Any]) -> Callable[..., Any]:
     """Check annotations of arrays at every call, and leave other types to pyright."""
+    from beartype import beartype
+
     function.__annotations__ = {name: hint for name, hint in function.__annotations__.items() if _is_array(hint)}
     return beartype(function)
 
@@ -28,4 +30,5 @@ def unchecked_shapes() -> Iterator[None]:
         config.update("jaxtyping_disable", False)
 
 
-install_import_hook("mfvpr", f"{__name__}.{check_shapes.__name__}")
+if find_spec("beartype"):
+    install_import_hook("mfvpr", f"{__name__}.{check_shapes.__name__}")

@@ -1,9 +1,10 @@
 """Disks of a few megabytes, for tests of what happens when they are full."""
 
-import shutil
 import subprocess
 
 import pytest
+
+from tests.needs import skip_without
 
 UNSHARE = ("unshare", "--map-root-user", "--mount")
 
@@ -16,5 +17,6 @@ def mount(folder, *options):
 def need_small_disks(folder):
     """Skip where the kernel does not let this user mount any."""
     command = [*UNSHARE, "mount", "-t", "tmpfs", "none", str(folder)]
-    if not shutil.which("unshare") or subprocess.run(command, capture_output=True).returncode:
-        pytest.skip("the kernel does not let this user mount a small disk")
+    skip_without("unshare")
+    if subprocess.run(command, capture_output=True).returncode:
+        pytest.skip("needs a user who may mount a small disk")

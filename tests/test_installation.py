@@ -12,6 +12,7 @@ import zipfile
 
 import pytest
 
+from tests.needs import skip_without
 from tests.programs import QUICK, ROOT, folder
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -32,7 +33,7 @@ print(mfvpr.__file__, repr(result), mfvpr.HistogramOfShifts(weight=mfvpr.UnitWei
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    pytest.importorskip("hatchling", reason="hatchling, of the extra `test`, is not installed")
+    skip_without("hatchling", "experiments")
     root = tmp_path_factory.mktemp("distributions")
 
     def build(target, source):

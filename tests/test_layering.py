@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -72,11 +73,12 @@ def imported_modules(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module == "mfvpr":
-            yield from (f"mfvpr.{alias.name}" for alias in node.names)
+            yield from (f"mfvpr.{alias.name}" for alias in node.names if alias.name != "__version__")
         elif isinstance(node, ast.ImportFrom):
             yield node.module
 
 
+@cache
 def imports_of(package):
     """All modules that a package, or a module at the root, imports from elsewhere."""
     paths = (ROOT / package).rglob("*.py") if (ROOT / package).is_dir() else [ROOT / f"{package}.py"]

@@ -4,19 +4,16 @@ import json
 
 import pytest
 
-from tests.programs import ROOT, typed
+from tests.needs import PHOTOGRAPHS, needs
+from tests.programs import typed
 
-DATA = ROOT.parent / "shared" / "data"
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared/data: the images have no license to ship with"),
-]
+pytestmark = [pytest.mark.slow, needs(PHOTOGRAPHS)]
 
 
 @pytest.mark.parametrize(("name", "histogram_at_2"), [("grief_season", 0.50), ("corridor", 0.70)])
 def test_histogram_recognizes_real_places(name, histogram_at_2, tmp_path, monkeypatch, capsys):
-    arguments = (f"dataset={name}", f"dataset.root={DATA / name}", "candidates=50", "figures=0", f"out={tmp_path}/out")
+    root = PHOTOGRAPHS / name
+    arguments = (f"dataset={name}", f"dataset.root={root}", "candidates=50", "figures=0", f"out={tmp_path}/out")
     code, _, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
     assert code == 0, stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())

@@ -19,6 +19,7 @@ from mfvpr.tuning.sweeps.rankings import group_program
 from mfvpr.tuning.sweeps.settings import group_by_program
 from mfvpr.types import per_match, per_pair
 from tests.builders import make_features, of_query, random_matches
+from tests.needs import skip_without
 from tests.programs import ROOT
 from tests.shapes import unchecked_shapes
 
@@ -205,7 +206,9 @@ def test_arrays_of_other_libraries_give_the_same_numbers(kind):
     """Also those that require a gradient, are not contiguous, or whose masks are integers."""
     convert = KINDS.get(kind)
     if convert is None:
-        torch = pytest.importorskip("torch", reason="torch, of the extra `benchmark`, is not installed")
+        skip_without("torch")
+        import torch
+
         convert = lambda values: torch.tensor(values, requires_grad=values.dtype.kind == "f")  # noqa: E731
     features = make_features(np.random.default_rng(0), 12, capacity=16)
     candidates = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), features)

@@ -76,7 +76,8 @@ def path_inside(root: Path, name: str) -> Path:
     """The path of a name from elsewhere below a folder; an InputError if the name leads out, also by a link."""
     try:
         path = (root / name).resolve()
-        if ".." not in Path(name).parts and path.is_relative_to(root.resolve()):
+        is_circle = path.is_symlink()  # Python 3.13 returns it, earlier versions raise
+        if ".." not in Path(name).parts and path.is_relative_to(root.resolve()) and not is_circle:
             return path
     except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
         pass

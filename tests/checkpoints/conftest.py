@@ -6,6 +6,7 @@ from flax import nnx
 
 from mfvpr.checkpoints import networks, registry
 from mfvpr.checkpoints.conversion import Layout, Rule, Table
+from tests.needs import skip_without
 
 
 class Tiny(nnx.Module):
@@ -64,4 +65,7 @@ def arrays():
 
 @pytest.fixture
 def torch():
-    return pytest.importorskip("torch", reason="torch, of the extra `benchmark`, is not installed")
+    skip_without("torch")
+    import torch
+
+    return torch

@@ -15,10 +15,11 @@ from mfvpr.io.formats import pickles
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import SOURCE_SHAPES
 from tests.io.checks import memory_below
-from tests.random_checkpoints import ALIKED, Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
+from tests.needs import ALIKED, LIGHTGLUE, needs
+from tests.random_checkpoints import Call, Global, View, Writer, random_checkpoint, write_legacy, write_zip
 
 WRITERS = pytest.mark.parametrize("write", [write_zip, write_legacy])
-REAL = (*ALIKED.glob("*.pth"), *(ALIKED.parent / "lightglue").glob("*.pth"))
+REAL = (*(ALIKED / f"aliked-{name}.pth" for name in ("n16", "n16rot", "n32", "t16")), LIGHTGLUE)
 
 
 class Runs:
@@ -121,7 +122,7 @@ def test_files_of_torch_are_read_as_torch_reads_them(torch, path, zipped):
         assert_same(read_checkpoint(path), {key: tensor.detach().numpy() for key, tensor in theirs.items()})
 
 
-@pytest.mark.skipif(not REAL, reason="no ../shared/weights: weights do not ship with the project")
+@needs(ALIKED, LIGHTGLUE)
 @pytest.mark.parametrize("path", REAL, ids=lambda path: path.stem)
 def test_real_files_are_read_as_torch_reads_them(torch, path):
     theirs = torch.load(path, map_location="cpu", weights_only=True)

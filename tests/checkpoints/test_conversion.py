@@ -12,7 +12,8 @@ from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
 from mfvpr.utils import InputError
 from tests import random_checkpoints as checkpoints
 from tests.checkpoints.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
-from tests.random_checkpoints import ALIKED, LIGHTGLUE, d2net_shapes, mixvpr_shapes, places365_shapes, random_checkpoint
+from tests.needs import ALIKED, LIGHTGLUE, needs
+from tests.random_checkpoints import d2net_shapes, mixvpr_shapes, places365_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
 
@@ -189,7 +190,7 @@ def test_unknown_layers_of_places365_are_refused():
         places365(both)
 
 
-@pytest.mark.skipif(not ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project")
+@needs(ALIKED, LIGHTGLUE)
 @pytest.mark.parametrize("name", [name for name in REGISTRY if name.startswith("aliked")])
 def test_real_weights_are_the_registrys_and_convert(name):
     entry = entry_of(name)

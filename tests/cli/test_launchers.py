@@ -7,6 +7,7 @@ from hydra.core.plugins import Plugins
 
 from mfvpr.cli.groups import choices
 from mfvpr.systems.settings import CONF
+from tests.needs import reason
 from tests.programs import composed
 
 PLUGINS = {"joblib": "joblib", "submitit_local": "submitit_local", "slurm": "submitit_slurm"}  # their launchers
@@ -23,7 +24,7 @@ def installed():
 def test_a_launcher_composes_and_adds_no_setting(launcher):
     """Check a structured configuration, which refuses what the plugin does not know."""
     if f"{PLUGINS[launcher]}.yaml" not in installed():
-        pytest.skip(f"pip install 'mfvpr[{EXTRAS[launcher]}]'")
+        pytest.skip(reason("hydra_{}_launcher".format(PLUGINS[launcher].split("_")[0])))
     for config in ("config", "sweep", "learn"):
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             hydra_settings = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra

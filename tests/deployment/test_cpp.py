@@ -11,6 +11,7 @@ import pytest
 
 from mfvpr.deployment.check_arrays import largest_difference
 from tests.golden.make_exported import export_scorer
+from tests.needs import skip_without
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.thorough
@@ -31,15 +32,13 @@ def exported(tmp_path_factory):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     """The folder of the examples whose runtime is installed."""
-    for tool in ("cmake", "c++"):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is not installed")
+    skip_without("cmake", "c++", "experiments")
     build, openvino = tmp_path_factory.mktemp("build"), find_spec("openvino")
     options = []
     if openvino is not None and openvino.origin is not None:
         options = [f"-DOpenVINO_DIR={Path(openvino.origin).parent / 'cmake'}"]
     if not options and "ONNXRUNTIME_ROOT" not in os.environ:
-        pytest.skip("neither openvino is installed nor ONNXRUNTIME_ROOT set")
+        skip_without("openvino")
     for command in (["-S", ROOT / "experiments" / "cpp", "-B", build, *options], ["--build", build]):
         done = subprocess.run(["cmake", *map(str, command)], capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
@@ -64,7 +63,7 @@ def test_the_outputs_in_the_folder_are_those_of_this_library(exported, tmp_path)
 def test_cpp_gives_the_outputs_in_the_folder(built, exported, tmp_path, example):
     program = built / example
     if not program.exists():
-        pytest.skip(f"the runtime of {example} is not installed")
+        pytest.skip(f"needs the runtime of {example}")
     code, stdout, stderr = run_example(program, exported)
     assert (code, stderr) == (0, "")
     scores = stdout.splitlines()[0].removeprefix("scores: ").split()

@@ -10,9 +10,9 @@ import mfvpr
 from mfvpr import ExportShapes, InputError
 from mfvpr.deployment import onnx_models
 from tests.deployment.test_programs import HISTOGRAM, make_system
+from tests.needs import needs
 
-pytest.importorskip("jax2onnx", reason="jax2onnx, of the extra `export`, is not installed")
-pytestmark = pytest.mark.thorough
+pytestmark = [pytest.mark.thorough, needs("jax2onnx")]
 
 SHAPES = ExportShapes(candidates=3, keypoints=30, image_size=(320, 240))
 

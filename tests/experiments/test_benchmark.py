@@ -12,6 +12,7 @@ from experiments.benchmark.__main__ import BENCHMARKS
 from mfvpr.checkpoints.networks import NETWORKS, Network
 from mfvpr.checkpoints.tables import SELAVPR
 from mfvpr.networks import SelaVpr
+from tests.needs import skip_without
 from tests.programs import run
 
 pytestmark = pytest.mark.slow
@@ -20,7 +21,9 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def contest(tmp_path_factory):
     """Results of all networks after one round on small images with random weights, and the report."""
-    torch = pytest.importorskip("torch", reason="torch is what the networks are compared with")
+    skip_without("torch")
+    import torch
+
     from experiments.benchmark import networks
 
     threads = torch.get_num_threads()

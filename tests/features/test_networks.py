@@ -6,15 +6,11 @@ import pytest
 from mfvpr.checkpoints import load_model
 from mfvpr.datasets import image_folder, resize
 from mfvpr.features import GlobalDescriptor
-from tests import random_checkpoints
 from tests.features.conftest import read_rows
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.slow
 
-needs_lightglue = pytest.mark.skipif(
-    not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's do not ship"
-)
 SMALL = "candidates=10", "features.image_size=[160,160]", "figures=2"
 
 
@@ -70,9 +66,9 @@ def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, tmp_path):
     assert rows[-1]["scorer"] == "grid"
 
 
-@pytest.mark.skipif(not random_checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: ALIKED's are not shipped")
 @pytest.mark.parametrize("name", ["mix_hist_aliked_50", "mfvpr"])
-def test_aliked_recognizes_the_street(evaluate, tmp_path, name):
+def test_aliked_recognizes_the_street(evaluate, real_weights, tmp_path, monkeypatch, name):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(real_weights))
     evaluate(f"system={name}", *SMALL, "features.image_size=[320,320]")
     out = tmp_path / "out"
     rows = read_rows(out)
@@ -81,8 +77,8 @@ def test_aliked_recognizes_the_street(evaluate, tmp_path, name):
     assert (out / "predictions.csv").read_bytes() == (out / "predictions/histogram.csv").read_bytes()
 
 
-@needs_lightglue
-def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, tmp_path):
+def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_weights, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(real_weights))
     features = ("features=aliked", "features.image_size=[160,160]", "retrieval.num_words=8")
     messages, rows = [], {}
     for name in ("neighbors", "lightglue", "lightglue"):
@@ -124,7 +120,7 @@ def test_mistakes_are_one_line(evaluate, arguments, words, tmp_path, monkeypatch
 
 @pytest.mark.parametrize(("options", "words"), [
     (("candidates=10", f"cache={ROOT}/README.md"), "README.md"),
-    pytest.param(("candidates=10", "matching=lightglue"), "got Sift of 128; ", marks=needs_lightglue),
+    (("candidates=10", "matching=lightglue"), "got Sift of 128; "),
     (("features=d2net", "features.multiscale=true", "features.image_size=[16,100]"), "got 16 x 100"),
     (("retrieval=netvlad", "retrieval.weights=mixvpr_512"), "=mixvpr_512: expected weights of netvlad: one of"),
     (("retrieval=gem", "retrieval.weights=cosplace_vgg16_512", "retrieval.components=5"), "retrieval.components"),

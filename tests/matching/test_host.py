@@ -1,7 +1,5 @@
 """Matchers that run on the host: programs of users, and files of other programs."""
 
-import importlib.util
-
 import h5py
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +14,7 @@ from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
 from mfvpr.utils.runtime import Runtime
 from tests.io.checks import one_line_error
+from tests.needs import needs
 
 SIFT = Sift(image_size=(160, 120))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
@@ -252,7 +251,7 @@ def test_the_documented_adapter_of_vismatch(dataset):
     assert (result.matches[0].matches[0].confidence == 1).all()
 
 
-@pytest.mark.skipif(importlib.util.find_spec("vismatch") is None, reason="vismatch is not installed")
+@needs("vismatch")
 def test_the_documented_adapter_with_vismatch_itself(dataset):
     from vismatch import get_matcher  # pyright: ignore
 

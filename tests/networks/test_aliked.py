@@ -15,20 +15,20 @@ from mfvpr.networks.aliked import DeformableConv
 from mfvpr.networks.aliked_description import DescriptorHead, field
 from mfvpr.networks.aliked_detection import detect
 from mfvpr.networks.sampling import sample, upsample
-from tests import random_checkpoints
 from tests.builders import local
 from tests.golden.make_aliked import DRAWN, REAL, checkpoint, picture, projections, samples, texture
+from tests.needs import ALIKED, PHOTOGRAPHS, needs
 from tests.networks import aliked_oracle as oracle
 from tests.networks.checkpoints import fill_published
 
 pytestmark = pytest.mark.thorough
 
 SLOTS = 1500
-IMAGES = random_checkpoints.ALIKED.parent.parent / "data" / "grief_season"
+IMAGES = PHOTOGRAPHS / "grief_season"
 
 
 def network(case) -> Aliked:
-    return fill_published(case.variant, checkpoint(case, random_checkpoints.ALIKED))
+    return fill_published(case.variant, checkpoint(case, ALIKED))
 
 
 @partial(jax.jit, static_argnums=(0, 4))
@@ -71,10 +71,7 @@ def assert_golden(golden, case, features, scores, detections, descriptors):
 
 @pytest.mark.optimized
 @pytest.mark.first_case
-@pytest.mark.skipif(
-    not random_checkpoints.ALIKED.is_dir(), reason="no ../shared/weights: weights do not ship with the project"
-)
-@pytest.mark.skipif(not IMAGES.is_dir(), reason="no ../shared/data: the images have no license to ship with")
+@needs(ALIKED, PHOTOGRAPHS)
 @pytest.mark.parametrize("case", REAL, ids=str)
 def test_with_real_weights_everything_is_as_in_the_public_code(golden, case):
     images = np.stack([picture(case, IMAGES), texture(case.width, case.height)])

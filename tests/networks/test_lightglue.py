@@ -17,10 +17,11 @@ from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.types import per_keypoint
 from mfvpr.utils import InputError
-from tests import random_checkpoints
 from tests.builders import double, read_golden, stack
 from tests.golden import make_lightglue_real
 from tests.golden.make_lightglue import DEPTH, REAL, SEEDS, SIZES, SMALL, SURE, checkpoint, pair
+from tests.needs import LIGHTGLUE as FILE
+from tests.needs import needs
 from tests.networks.checkpoints import fill, fill_published
 
 pytestmark = pytest.mark.thorough
@@ -51,7 +52,7 @@ def real_golden():
 @pytest.fixture(scope="module")
 def matcher():
     """With the published weights."""
-    return LightGlueMatcher.of(fill_published("aliked_lightglue", read_checkpoint(random_checkpoints.LIGHTGLUE)))
+    return LightGlueMatcher.of(fill_published("aliked_lightglue", read_checkpoint(FILE)))
 
 
 match_one = jax.jit(lambda matcher, features0, features1: matcher(features0, features1))
@@ -142,7 +143,7 @@ def test_what_is_not_finite_is_no_keypoint_and_of_none_nothing_is_said():
 
 
 @pytest.mark.optimized
-@pytest.mark.skipif(not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: weights do not ship")
+@needs(FILE)
 def test_published_weights_assign_as_the_public_code(golden, matcher):
     for counts in REAL:
         assignments = assigned(matcher.weights, *(padded(image, 72) for image in pair(counts, 128, 0)))
@@ -165,7 +166,7 @@ def test_older_names_of_the_published_tensors_are_known():
 
 
 @pytest.mark.optimized
-@pytest.mark.skipif(not random_checkpoints.LIGHTGLUE.is_file(), reason="no ../shared/weights: LightGlue's do not ship")
+@needs(FILE)
 @pytest.mark.parametrize("name", make_lightglue_real.PAIRS)
 def test_photographs_are_matched_as_by_the_public_code(real_golden, matcher, name):
     """The same pairs of keypoints with the same scores, whatever the padding."""

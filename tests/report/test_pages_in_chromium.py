@@ -1,7 +1,6 @@
 """Pages in a headless Chromium, on a wide screen and on a phone: charts, sorting, filters, keyboard, scripts."""
 
 import shutil
-from importlib.util import find_spec
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,13 +9,10 @@ from PIL import Image
 
 from mfvpr.report.pages.one_run import write_report
 from mfvpr.report.pages.several_runs import write_comparison
+from tests.needs import needs
 from tests.run_folders import HEADLINE, RANKS, SYSTEMS, write_run
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-WHY_NOT = "" if CHROMIUM else "no chromium, chromium-browser or google-chrome on the PATH"
-WHY_NOT = WHY_NOT or ("" if find_spec("playwright") else "playwright is not installed: pip install 'mfvpr[test]'")
-
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)]
+pytestmark = [pytest.mark.slow, needs("chromium", "playwright")]
 SEQUENCES = ("day", "night " * 12)
 
 
@@ -25,7 +21,7 @@ def browser():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         yield browser
         browser.close()
 

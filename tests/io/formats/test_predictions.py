@@ -9,6 +9,7 @@ import pytest
 
 from mfvpr.io import Images, open_matches, read_shortlist
 from tests.io.checks import one_line_error
+from tests.needs import needs
 
 QUERIES = ["q/1.jpg", "q/2.jpg"]
 DATABASE = [f"d/{row}.jpg" for row in range(4)]
@@ -49,8 +50,10 @@ def test_candidates_are_in_the_order_of_their_inliers(folder):
     assert shortlist.scores.tolist() == [[7, 7, 0], [90, 2, 0]]
 
 
+@needs("torch")
 def test_torch_writes_the_same(folder):
-    torch = pytest.importorskip("torch")
+    import torch
+
     torch.save([result(count) for count in (0, 7, 7)], folder / "000.torch")
     torch.save([result(2), result(90)], folder / "001.torch")
     assert read_shortlist(folder, QUERIES, DATABASE).indices.tolist() == [[2, 1, 3], [1, 0, -1]]

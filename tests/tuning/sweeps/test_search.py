@@ -14,6 +14,7 @@ from mfvpr.report import sweeps
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, search
+from tests.needs import needs
 from tests.scorers import Wrapped
 from tests.tuning.learning.paths import QUERIES, TOLERANCES, split
 from tests.tuning.sweeps.test_sweep import rank
@@ -118,8 +119,10 @@ def test_each_half_is_reported_by_what_was_chosen_on_the_other(outcome):
     assert verdict.sign_flips == statistics.block_sign_flips(first, of_scorer)
 
 
+@needs("optuna")
 def test_optuna_draws_within_the_axes():
-    optuna = pytest.importorskip("optuna")
+    import optuna
+
     values = {"num_bins": [4, 9], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
     drawn = [search.suggest_setting(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
@@ -132,8 +135,10 @@ def test_optuna_draws_within_the_axes():
     assert len({setting["tolerance"] for setting in drawn}) == 20
 
 
+@needs("optuna")
 def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_choose(data, monkeypatch, tmp_path):
-    optuna = pytest.importorskip("optuna")
+    import optuna
+
     values, tell = [], optuna.Study.tell
     monkeypatch.setattr(optuna.Study, "tell", lambda *arguments: values.append(arguments[-1]) or tell(*arguments))
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
