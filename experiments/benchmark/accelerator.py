@@ -84,7 +84,7 @@ def scene(images: int, keypoints: int, dimension: int) -> tuple[Features, Featur
     keys = jax.random.split(jax.random.key(0, impl="rbg"), 6)
     shape, is_common = (images, keypoints), (np.arange(keypoints) < SHARE * keypoints)[None, :, None]
     points, elsewhere = (jax.random.uniform(key, (*shape, 2), maxval=SIZE) for key in keys[:2])
-    rows, others = (jax.random.normal(key, (*shape, dimension)) for key in keys[2:4])
+    rows, new_rows = (jax.random.normal(key, (*shape, dimension)) for key in keys[2:4])
     moved = jnp.clip(points + 20 + 4 * jax.random.normal(keys[4], points.shape), 0, SIZE - 1)
     scores, size = jax.random.uniform(keys[5], shape, minval=100, maxval=1000), jnp.full((images, 2), float(SIZE))
 
@@ -94,7 +94,7 @@ def scene(images: int, keypoints: int, dimension: int) -> tuple[Features, Featur
         return Features(points, rows, scores, jnp.ones(shape, bool), size)
 
     order = np.random.default_rng(0).permutation(keypoints)
-    view = jnp.where(is_common, moved, elsewhere), jnp.where(is_common, rows + 0.5 * others, others)
+    view = jnp.where(is_common, moved, elsewhere), jnp.where(is_common, rows + 0.5 * new_rows, new_rows)
     return features(points, rows), features(*(values[:, order] for values in view))
 
 
@@ -286,25 +286,25 @@ def time_cases(cases: Sequence[Case], rounds: int, *, on_cpu: bool, end: float) 
 
 def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int) -> Iterator[dict[str, Any]]:
     """Time calls in turns, after a first call that compiles; a call that fails says so."""
-    rows: dict[str, dict[str, Any]] = {who: {"case": title, "who": who} for who in calls}
+    rows: dict[str, dict[str, Any]] = {name: {"case": title, "who": name} for name in calls}
     times: dict[str, list[float]] = {}
-    for who, call in calls.items():
+    for name, call in calls.items():
         try:
-            rows[who]["first call, s"] = duration(call)
-            times[who] = []
+            rows[name]["first call, s"] = duration(call)
+            times[name] = []
         except Exception as error:  # such as memory that does not suffice: the other calls go on
-            rows[who]["note"] = " ".join(f"failed: {error!r}".split())[:80]
+            rows[name]["note"] = " ".join(f"failed: {error!r}".split())[:80]
     stop = time.monotonic() + CASE_SECONDS
     for number in range(rounds):
         if number < LEAST_ROUNDS or time.monotonic() < stop:
-            for who, seconds in times.items():
-                seconds.append(duration(calls[who]))
-    medians = {who: float(np.median(seconds)) for who, seconds in times.items()}
-    for who, seconds in times.items():
+            for name, seconds in times.items():
+                seconds.append(duration(calls[name]))
+    medians = {name: float(np.median(seconds)) for name, seconds in times.items()}
+    for name, seconds in times.items():
         low, high = (1e3 * float(np.quantile(seconds, share)) for share in (0.25, 0.75))
-        rows[who] |= {"ms": 1e3 * medians[who], "25 %": low, "75 %": high, "calls": len(seconds),
-                      "/ first": medians[who] / next(iter(medians.values())),
-                      "rate": float(work / medians[who]), "per s": unit}  # fmt: skip
+        rows[name] |= {"ms": 1e3 * medians[name], "25 %": low, "75 %": high, "calls": len(seconds),
+                      "/ first": medians[name] / next(iter(medians.values())),
+                      "rate": float(work / medians[name]), "per s": unit}  # fmt: skip
     yield from rows.values()
 
 

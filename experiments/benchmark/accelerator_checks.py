@@ -135,8 +135,8 @@ def match(
 ) -> tuple[Any, ...]:
     """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
     matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*(rounded or images), with_ratio=True, **options))
-    found, references = np.where(matches.mask, matches.index1, -1), []
-    query, rows = images[0].descriptors.astype(np.float64), np.arange(found.shape[1])
+    neighbors, references = np.where(matches.mask, matches.index1, -1), []
+    query, rows = images[0].descriptors.astype(np.float64), np.arange(neighbors.shape[1])
     for candidate in images[1].descriptors.astype(np.float64):
         similarity = query @ candidate.T
         *_, second, expected = np.argsort(similarity, axis=1).T
@@ -148,9 +148,14 @@ def match(
             expected = np.where(similarity.argmax(0)[expected] == rows, expected, -1)
         references.append((expected, is_tie, distance, distance / to_second))
     expected, is_tie, *numbers = (np.stack(values) for values in zip(*references, strict=True))
-    compared = (found == expected) & (found >= 0) & ~is_tie
-    differ = int(np.sum((found != expected) & ~is_tie))
-    return np.where(compared, [matches.distance, matches.ratio], 0), np.where(compared, numbers, 0), differ, found.size
+    compared = (neighbors == expected) & (neighbors >= 0) & ~is_tie
+    differ = int(np.sum((neighbors != expected) & ~is_tie))
+    return (
+        np.where(compared, [matches.distance, matches.ratio], 0),
+        np.where(compared, numbers, 0),
+        differ,
+        neighbors.size,
+    )
 
 
 def scoring_tasks(_: bool) -> Iterator[Task]:
@@ -204,8 +209,8 @@ def search_tasks(_: bool) -> Iterator[Task]:
 
     def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
         candidates = shortlist(queries, database, num_candidates=50)
-        found = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
-        return candidates.scores, expected, int(np.sum(np.abs(found - expected) > TIE)), found.size
+        similarities = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
+        return candidates.scores, expected, int(np.sum(np.abs(similarities - expected) > TIE)), similarities.size
 
     for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
         yield Task(f"search, {name}", partial(search, function), 2e-6, "float64, NumPy")

@@ -30,8 +30,8 @@ def test_results_are_exact_and_times_are_reported(parts, monkeypatch, tmp_path, 
 
 def test_matches_by_products_of_few_digits_differ():
     images = accelerator_checks.images()
-    kept = np.uint32(0xFFFFE000)  # bits of TF32
-    rounded = tuple(replace(image, descriptors=(image.descriptors.view(np.uint32) & kept).view(np.float32))
+    high_bits = np.uint32(0xFFFFE000)  # bits of TF32
+    rounded = tuple(replace(image, descriptors=(image.descriptors.view(np.uint32) & high_bits).view(np.float32))
                     for image in images)  # fmt: skip
     assert accelerator_checks.match(images, {})[2] == 0
     assert accelerator_checks.match(images, {}, rounded)[2] > 10
