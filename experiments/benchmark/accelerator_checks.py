@@ -1,10 +1,10 @@
-"""Results of a device beside float64: loops of the paper's equations, NumPy's products, or the same code on the CPU."""
+"""Results of a device beside float64: loops of the paper's equations, NumPy, or the same code on the CPU."""
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,30 @@ from mfvpr.networks.imagenet import preprocess
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.scoring.registry import SCORERS
 from mfvpr.types import Features, Matches
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.threads import ordered_map
 from tests import oracles
 
-SIZE = 336  # px
-TIE = 1e-6  # similarities that differ by less are equal in float32
+SIZE, CANDIDATES, DIMENSION = 336, 8, 128  # px
 SIDE = 12  # the keypoints of an image are SIDE^2, as cells of a grid
-SMOOTH = {"histogram": mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48),
-          "anchor": mfvpr.AnchorPoints(temperature=0.1), "sum": mfvpr.AggregatedScore(temperature=2.0)}  # fmt: skip
+TIE = 1e-6  # similarities that differ by less are equal in float32
+MATCHING: dict[str, dict[str, Any]] = {
+    "bfloat16": {"product": "bfloat16", "chunk_size": 1}, "float32": {"product": "float32"},
+    "one after the other": {"chunk_size": 1}, "without cross-check": {"cross_check": "none"},
+}  # fmt: skip
+SCORES: dict[str, Callable[..., float]] = {  # of points0, points1, distances and summed scores of one pair
+    "histogram": lambda p0, p1, _, s: oracles.histogram_of_shifts(p1 - p0, s, (SIZE, SIZE), (SIZE, SIZE))[0].max(),
+    "anchor": lambda p0, p1, _, s: oracles.anchor_points(p0, p1, s, (SIZE, SIZE), (SIZE, SIZE)),
+    "sum": lambda p0, p1, d, _: oracles.aggregated_score(p1 - p0, 2 - d, (SIZE, SIZE)),
+}
+GRIDS = {
+    mfvpr.HistogramOfShifts(): {"sigma": [5.0, 22.5], "weight": ["fs", "dmf"], "max_distance": [0.5, 1.2]},
+    mfvpr.AnchorPoints(): {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]},
+}
+SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
+    mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4, mfvpr.AnchorPoints(temperature=0.1): 5e-3,
+    mfvpr.AggregatedScore(temperature=2.0): 1e-4,
+}  # fmt: skip
 NETWORKS = {  # checkpoint -> side of the images in px, result; weights are random unless they are installed
     networks.ALIKED[0]: (320, lambda model, images: model.levels(images / 255)[1]),
     networks.D2NET: (336, lambda model, images: model(preprocess(images, "caffe"))),
@@ -32,211 +49,184 @@ NETWORKS = {  # checkpoint -> side of the images in px, result; weights are rand
 }
 
 
-@dataclass(frozen=True)
-class Check:
-    """A result of the device, beside a reference."""
+class Task(NamedTuple):
+    """A check: `compute` returns the device's result and its reference, which deviate by a share `allowed` at most.
+
+    It may return how many entries differ, and of how many, without ties of float32.
+    """
 
     what: str
-    reference: str
-    deviation: float  # greatest, relative to the largest entry of the reference
-    allowed: float
-    differ: int = 0  # entries that differ, without ties of float32
-    entries: int = 0
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the result is as exact as float32 allows."""
-        return self.deviation <= self.allowed and not self.differ
+    compute: Callable[[], tuple[Any, ...]]
+    allowed: float = 1e-5
+    reference: str = "float64, CPU"
 
 
-def checks(*, is_small: bool, end: float) -> Iterator[Check]:
-    """All checks that begin before the time `end`."""
-    for check in (_products, _matching, _scores, _grids, _gradients, _search, _networks):
-        if time.monotonic() < end:
-            yield from check(is_small)
+def checks(*, is_small: bool, end: float) -> Iterator[dict[str, Any]]:
+    """Rows of all checks that begin before the time `end`; several at the same time, since most of it is compiling."""
+    tasks = [task for part in PARTS for task in part(is_small)]
+    return ordered_map(partial(check, end=end), tasks, workers=available_cpus())
 
 
-def in_float64(function: Callable[..., Any], *inputs: Any) -> Any:
-    """Result of a function with all numbers in float64 on the CPU, NumPy."""
+def check(task: Task, end: float) -> dict[str, Any]:
+    """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
+    row: dict[str, Any] = {"what": task.what, "reference": task.reference}
+    if time.monotonic() > end:
+        return row | {"exact": "skipped: out of time"}
+    try:
+        got, expected, differ, entries = (*task.compute(), 0, 0)[:4]
+    except Exception as error:  # the other checks go on
+        return row | {"exact": f"failed: {error!r}"[:80]}
+    got, expected = (np.asarray(values, np.float64) for values in (got, expected))
+    deviation = float(np.max(np.abs(got - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
+    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
+                  "exact": "yes" if deviation <= task.allowed and not differ else "NO"}  # fmt: skip
+
+
+def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:
+    """Results of a function on the device, and on the CPU with all numbers in float64."""
 
     def widen(leaf: Any) -> Any:
         array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else leaf if np.isscalar(leaf) else array
+        return array.astype(np.float64) if array.dtype == np.float32 else array
 
-    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, function(*jax.tree.map(widen, inputs)))
-
-
-def compare(what: str, got: Any, expected: Any, allowed: float = 1e-5, reference: str = "float64, CPU") -> Check:
-    """Greatest deviation of an array; infinite if one has a NaN where the other has none."""
-    got, expected = (np.asarray(values, np.float64) for values in (got, expected))
-    same = (got == expected) | (np.isnan(got) & np.isnan(expected))
-    difference = np.where(same, 0, np.nan_to_num(np.abs(got - expected), nan=np.inf))
-    scale = np.max(np.abs(expected), initial=0, where=np.isfinite(expected)) or 1.0
-    return Check(what, reference, float(np.max(difference, initial=0) / scale), allowed)
+    result, cpu = np.asarray(function(*jax.device_put(inputs))), jax.devices("cpu")[0]
+    with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
+        return result, np.asarray(function(*jax.tree.map(widen, inputs)))
 
 
-def features(count: int, dimension: int) -> Features:
-    """A query (row 0) and candidates `[count, N]`, NumPy; nearly equal descriptors need all digits of float32."""
-    rng, keypoints = np.random.default_rng(dimension), SIDE**2
-    query = np.abs(rng.normal(size=(keypoints, dimension)))
-    query /= np.linalg.norm(query, axis=1, keepdims=True)
-    images = [query]
-    for _ in range(count - 1):
-        image = query[rng.permutation(keypoints)] + rng.normal(size=query.shape) / dimension**0.5
-        image[keypoints // 2 :] = image[: keypoints // 2] + 5e-5 * rng.normal(size=(keypoints // 2, dimension))
-        images.append(image / np.linalg.norm(image, axis=1, keepdims=True))
-    points, scores = rng.uniform(0, SIZE, (count, keypoints, 2)), rng.uniform(100, 1000, (count, keypoints))
-    arrays = (array.astype(np.float32) for array in (points, np.stack(images), scores))
-    return Features(*arrays, np.ones((count, keypoints), bool), np.full((count, 2), SIZE, np.float32))
+@cache
+def images() -> tuple[Features, Features]:
+    """A query `[N]` and candidates `[C, N]`, NumPy; nearly equal descriptors need all digits of float32."""
+    rng, keypoints = np.random.default_rng(0), SIDE**2
+    descriptors = np.abs(rng.normal(size=(1 + CANDIDATES, keypoints, DIMENSION))) / DIMENSION**0.5
+    for image in descriptors[1:]:
+        image[:] = descriptors[0, rng.permutation(keypoints)] + rng.normal(size=image.shape) / DIMENSION**0.5
+        image[keypoints // 2 :] = image[: keypoints // 2] + 5e-5 * rng.normal(size=(keypoints // 2, DIMENSION))
+    descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
+    shape = descriptors.shape[:2]
+    arrays = rng.uniform(0, SIZE, (*shape, 2)), descriptors, rng.uniform(100, 1000, shape)
+    points, descriptors, scores = (array.astype(np.float32) for array in arrays)
+    both = Features(points, descriptors, scores, np.ones(shape, bool), np.full((shape[0], 2), SIZE, np.float32))
+    return jax.tree.map(lambda field: field[0], both), jax.tree.map(lambda field: field[1:], both)
 
 
-def sides(count: int, dimension: int) -> tuple[Features, Features]:
-    """A query `[N]` and its candidates `[count, N]`."""
-    images = features(count + 1, dimension)
-    return jax.tree.map(lambda field: field[0], images), jax.tree.map(lambda field: field[1:], images)
-
-
-def matches(count: int, **options: Any) -> Matches:
-    """Matches of a query with candidates, NumPy, computed on the CPU."""
+@cache
+def matches(**options: Any) -> Matches:
+    """Matches of the query with the candidates, NumPy, computed on the CPU."""
     with jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, mfvpr.match_candidates(*sides(count, 64), **options))
+        return jax.tree.map(np.asarray, mfvpr.match_candidates(*images(), **options))
 
 
-def _products(_: bool) -> Iterator[Check]:
-    query, candidates = (side.descriptors for side in sides(1, 512))
-    expected = query.astype(np.float64) @ candidates[0].T.astype(np.float64)
-    default = jax.jit(lambda left, right: left @ right.T)(query, candidates[0])
-    yield compare("JAX's product, default precision", default, expected, 1.0, "float64, NumPy")
-    yield compare("products of descriptors", products(jnp.asarray(query), jnp.asarray(candidates[0])), expected, 1e-6,
-                  "float64, NumPy")  # fmt: skip
+def matching_tasks(_: bool) -> Iterator[Task]:
+    """Products and matches."""
+    for name, options in MATCHING.items():
+        yield Task(f"matches, {name}", partial(match, images(), options), reference="float64, NumPy")
+    query, candidate = images()[0].descriptors, images()[1].descriptors[0]
+    expected = query.astype(np.float64) @ candidate.astype(np.float64).T
+    yield Task(
+        "products of descriptors", lambda: (jax.jit(products)(query, candidate), expected), 1e-6, "float64, NumPy"
+    )
+    default = jax.jit(lambda left, right: left @ right.T)
+    yield Task("JAX's default product", lambda: (default(query, candidate), expected), np.inf, "float64, NumPy")
 
 
-def _matching(is_small: bool) -> Iterator[Check]:
-    settings: list[dict[str, Any]] = [{"product": "float32"}, {"product": "bfloat16", "chunk_size": 1},
-                {"with_ratio": True}, {"cross_check": "none"}, {"cross_check": "candidate"},
-                {"cross_check": "opencv_legacy"}]  # fmt: skip
-    for dimension in (128, 512):
-        query, candidates = sides(3 if is_small else 8, dimension)
-        for options in settings:
-            matches = jax.tree.map(np.asarray, mfvpr.match_candidates(query, candidates, **options))
-            is_candidate = options.get("cross_check") == "candidate"
-            found = np.where(matches.mask, matches.index0 if is_candidate else matches.index1, -1)
-            expected, is_tie, distance = zip(
-                *(_nearest(query.descriptors, rows, options.get("cross_check", "mutual"))
-                  for rows in candidates.descriptors), strict=True)  # fmt: skip
-            same = (found == np.stack(expected)) & matches.mask
-            differ = int(np.sum((found != np.stack(expected)) & ~np.stack(is_tie)))
-            deviation = np.max(np.abs(matches.distance - np.stack(distance)), initial=0, where=same)
-            label = ", ".join(str(value) for name, value in options.items() if name != "chunk_size")
-            label = label.replace("True", "with ratio")
-            yield Check(f"matches of {dimension} dimensions, {label}", "float64, NumPy", float(deviation), 1e-5, differ,
-                        found.size)  # fmt: skip
+def match(
+    images: tuple[Features, Features], options: dict[str, Any], rounded: tuple[Features, Features] | None = None
+) -> tuple[Any, ...]:
+    """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
+    matches = jax.tree.map(np.asarray, mfvpr.match_candidates(*(rounded or images), with_ratio=True, **options))
+    neighbors, references = np.where(matches.mask, matches.index1, -1), []
+    query, rows = images[0].descriptors.astype(np.float64), np.arange(neighbors.shape[1])
+    for candidate in images[1].descriptors.astype(np.float64):
+        similarity = query @ candidate.T
+        *_, second, expected = np.argsort(similarity, axis=1).T
+        distance, to_second = (np.linalg.norm(query - candidate[index], axis=1) for index in (expected, second))
+        is_tie = similarity[rows, expected] - similarity[rows, second] < TIE
+        if "cross_check" not in options:
+            *_, second0, largest0 = np.sort(similarity, axis=0)
+            is_tie |= (largest0 - second0 < TIE)[expected]
+            expected = np.where(similarity.argmax(0)[expected] == rows, expected, -1)
+        references.append((expected, is_tie, distance, distance / to_second))
+    expected, is_tie, *numbers = (np.stack(values) for values in zip(*references, strict=True))
+    compared = (neighbors == expected) & (neighbors >= 0) & ~is_tie
+    differ = int(np.sum((neighbors != expected) & ~is_tie))
+    return (
+        np.where(compared, [matches.distance, matches.ratio], 0),
+        np.where(compared, numbers, 0),
+        differ,
+        neighbors.size,
+    )
 
 
-def _nearest(query: np.ndarray, candidate: np.ndarray, cross_check: str) -> tuple[np.ndarray, ...]:
-    """Neighbor of every keypoint (-1 = none), whether float32 may decide otherwise, and the distance."""
-    query, candidate = query.astype(np.float64), candidate.astype(np.float64)
-    if cross_check == "candidate":
-        query, candidate, cross_check = candidate, query, "none"
-    similarity, rows = query @ candidate.T, np.arange(len(query))
-    forward, backward = similarity.argmax(1), similarity.argmax(0)
-    ordered0, ordered1 = np.sort(similarity, axis=1), np.sort(similarity, axis=0)
-    is_tie = ordered0[:, -1] - ordered0[:, -2] < TIE
-    if cross_check != "none":
-        close = (ordered1[-1] - ordered1[-2] < TIE) & (similarity >= ordered1[-2])  # keypoints that share a column
-        is_tie |= close.any(1) | close[:, forward].any(0)
-    found = forward
-    if cross_check == "mutual":
-        found = np.where(backward[forward] == rows, forward, -1)
-    if cross_check == "opencv_legacy":
-        picked = np.where(backward == rows[:, None], similarity, -np.inf)
-        found = np.where(np.isfinite(picked.max(1)), picked.argmax(1), -1)
-    return found, is_tie, np.linalg.norm(query - candidate[found], axis=1)
-
-
-def _scores(is_small: bool) -> Iterator[Check]:
-    pairs, cells = matches(4 if is_small else 20, with_ratio=True), matches(4, cross_check="candidate")
-    scores = {}
+def scoring_tasks(_: bool) -> Iterator[Task]:
+    """Scores, grids and gradients."""
+    pairs, cells = matches(with_ratio=True), matches(cross_check="candidate")
     for name, scorer in SCORERS.items():
-        if hasattr(scorer, "score_pairs"):  # on the host
-            continue
-        made, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
-        scores[name] = mfvpr.score_candidates(made, jax.device_put(of))
-        yield compare(f"score {name}", scores[name], in_float64(mfvpr.score_candidates, made, of))
-    for name, expected in zip(("histogram", "anchor", "sum"), zip(*(_by_loops(pairs, row) for row in range(3)), strict=True),
-                              strict=True):  # fmt: skip
-        yield compare(f"score {name}", scores[name][:3], expected, 1e-5, "the paper's equations, loops")
+        if name in SCORES:
+            compute, reference = partial(_beside_loops, SCORES[name], scorer(), pairs), "the paper's equation, loops"
+            yield Task(f"score {name}", compute, reference=reference)
+        elif not hasattr(scorer, "score_pairs"):  # those are on the host
+            scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
+            yield Task(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
+    for scorer, axes in GRIDS.items():
+        compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
+        yield Task(f"grid of {type(scorer).__name__}", compute)
+    for scorer, allowed in SMOOTH.items():
+        compute = partial(beside_float64, jax.jit(partial(_gradient, scorer)), *images())
+        yield Task(f"gradient of {type(scorer).__name__}", compute, allowed)
 
 
-def _by_loops(pairs: Matches, row: int) -> tuple[float, ...]:
-    """Scores of a pair by the histogram, anchor points and the sum."""
-    pair = jax.tree.map(lambda field: field[row], pairs)
-    real = pair.mask
-    points0, points1, distance = pair.points0[real], pair.points1[real], pair.distance[real]
-    weights, size = (pair.scores0 + pair.scores1)[real], (SIZE, SIZE)
-    histogram, *_ = oracles.histogram_of_shifts(points1 - points0, weights, size, size)
-    anchor = oracles.anchor_points(points0, points1, weights, size, size)
-    return histogram.max(), anchor, oracles.aggregated_score(points1 - points0, 2 - distance, size)
+def _beside_loops(score: Callable[..., float], scorer: Any, pairs: Matches) -> tuple[Any, Any]:
+    expected = []
+    for pair, real in enumerate(pairs.mask[:3]):
+        fields = pairs.points0, pairs.points1, pairs.distance, pairs.scores0, pairs.scores1
+        points0, points1, distance, *scores = (field[pair, real].astype(np.float64) for field in fields)
+        expected.append(score(points0, points1, distance, sum(scores)))
+    return mfvpr.score_candidates(scorer, jax.device_put(pairs))[:3], expected
 
 
-def _grids(is_small: bool) -> Iterator[Check]:
-    pairs = matches(4 if is_small else 20, with_ratio=True)
-    for name, scorer, axes in (
-        ("histogram", mfvpr.HistogramOfShifts(), {"sigma": [5.0, 22.5], "bin_size": [10.0, 15.0], "weight": ["fs", "dmf"],
-                                                  "max_distance": [0.5, 1.2]}),
-        ("anchor", mfvpr.AnchorPoints(), {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]}),
-    ):  # fmt: skip
-        score = partial(mfvpr.score_grid, scorer, **axes)
-        yield compare(f"grid of {name}", score(jax.device_put(pairs)), in_float64(score, pairs))
-
-
-def _gradients(_: bool) -> Iterator[Check]:
-    pairs, (query, candidates) = matches(4), sides(1, 128)
+def _gradient(scorer: Any, query: Features, candidates: Features) -> jax.Array:
+    """Gradient of a score for the descriptors and points of a candidate, side by side."""
     candidate = jax.tree.map(lambda field: field[0], candidates)
-    for name, scorer in SMOOTH.items():
 
-        @jax.jit
-        def by_points(pairs: Matches, scorer: Any = scorer) -> Any:
-            return jax.grad(lambda points: jnp.sum(jax.vmap(scorer)(replace(pairs, points1=points))))(pairs.points1)
+    def score(descriptors: jax.Array, points: jax.Array) -> jax.Array:
+        features = replace(candidate, descriptors=descriptors, keypoints=points)
+        return scorer(mfvpr.soft_match(query, features, temperature=0.02))
 
-        @jax.jit
-        def by_descriptors(query: Features, candidate: Features, scorer: Any = scorer) -> Any:
-            def score(descriptors: Any) -> Any:
-                return scorer(mfvpr.soft_match(query, replace(candidate, descriptors=descriptors), temperature=0.02))
-
-            return jax.grad(score)(candidate.descriptors)
-
-        yield compare(
-            f"gradient of {name}, points",
-            by_points(pairs),
-            in_float64(by_points, pairs),
-            5e-3 if name == "anchor" else 1e-4,
-        )
-        yield compare(f"gradient of {name}, descriptors", by_descriptors(query, candidate),
-                      in_float64(by_descriptors, query, candidate), 5e-3 if name == "anchor" else 1e-4)  # fmt: skip
+    gradients = jax.grad(score, argnums=(0, 1))(candidate.descriptors, candidate.keypoints)
+    return jnp.concatenate([gradient / jnp.max(jnp.abs(gradient)) for gradient in gradients], axis=1)
 
 
-def _search(is_small: bool) -> Iterator[Check]:
-    rng, count = np.random.default_rng(0), 500 if is_small else 100_000
-    rows = rng.normal(size=(count, 512))
-    rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, 512))  # nearly equal in pairs
+def search_tasks(_: bool) -> Iterator[Task]:
+    """Exact search."""
+    rng, count = np.random.default_rng(0), 20_000
+    rows = rng.normal(size=(count, DIMENSION))
+    rows[count // 2 :] = rows[: count // 2] + 1e-3 * rng.normal(size=(count // 2, DIMENSION))  # equal but for digits
     database = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     queries = database[:: count // 20]
     similarity = queries.astype(np.float64) @ database.T.astype(np.float64)
     expected = -np.sort(-similarity, axis=1)[:, :50]
-    for name, shortlist in (("retrieve", mfvpr.retrieve(queries, database, num_candidates=50)),
-                            ("ExactSearch", ExactSearch().shortlist(queries, database, 50))):  # fmt: skip
-        found = np.take_along_axis(similarity, np.asarray(shortlist.indices), axis=1)
-        check = compare(f"search, {name}", shortlist.scores, expected, 1e-6, "float64, NumPy")
-        yield replace(check, differ=int(np.sum(np.abs(found - expected) > TIE)), entries=found.size)
+
+    def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
+        candidates = shortlist(queries, database, num_candidates=50)
+        similarities = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
+        return candidates.scores, expected, int(np.sum(np.abs(similarities - expected) > TIE)), similarities.size
+
+    for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
+        yield Task(f"search, {name}", partial(search, function), 2e-6, "float64, NumPy")
 
 
-def _networks(is_small: bool) -> Iterator[Check]:
-    for checkpoint, (side, function) in NETWORKS.items():
-        if is_small and checkpoint != networks.ALIKED[0]:
-            continue
-        images = networks.make_images(64 if is_small else side)[:1].astype(np.float32)
-        graph, state = nnx.split(networks.make_network(checkpoint)[0])
-        run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))  # noqa: B023
-        yield compare(f"{checkpoint}, {images.shape[2]} px", run(state, images), in_float64(run, state, images), 1e-4)
+def network_tasks(is_small: bool) -> Iterator[Task]:
+    """Networks on one image; the small check is of ALIKED alone."""
+    for checkpoint, (side, function) in [*NETWORKS.items()][: 1 if is_small else None]:
+        yield Task(f"{checkpoint}, random weights", partial(_network, checkpoint, 64 if is_small else side, function))
+
+
+def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[Any, Any]:
+    images = np.random.default_rng(0).uniform(0, 255, (1, side // 8, side // 8, 3)).repeat(8, axis=1).repeat(8, axis=2)
+    graph, state = nnx.split(networks.make_network(checkpoint)[0])
+    run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))
+    return beside_float64(run, state, images.astype(np.float32))
+
+
+PARTS = (matching_tasks, network_tasks, scoring_tasks, search_tasks)

@@ -78,4 +78,4 @@ def write_report(out: Path, title: str, parts: Iterable[Table | str], content: M
     common = {"machine": machine, "versions": versions(), "remarks": remarks}
     write_text(out, json.dumps(common | dict(content), indent=1) + "\n")
     texts = (part if isinstance(part, str) else part.text() for part in parts)
-    print(f"\n{title}; {machine}\n", *texts, f"results: {out}", sep="\n")
+    print(f"\n{title}; {machine}\n", *texts, f"results: {out}", sep="\n", flush=True)
