@@ -11,6 +11,7 @@ from typing import Any
 
 from PIL import Image
 
+from mfvpr.datasets.images import open_image
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.pages.charts import Chart
 from mfvpr.report.pages.files import Prediction
@@ -118,7 +119,7 @@ def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
     paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
     for path in paths[:: max(1, -(-len(paths) // most))]:
         try:
-            with Image.open(path) as image:
+            with open_image(path) as image:
                 image.load()
                 small = image.convert("RGB")
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
