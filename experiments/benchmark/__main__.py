@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from mfvpr.cli.launch import Parser, run_command
+from mfvpr.utils.files import require_replaceable
 
 PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
@@ -39,8 +40,9 @@ def add_arguments(parser: Parser) -> None:
 def run(benchmark: str, rounds: int | None, out: Path | None) -> None:
     """Run a benchmark."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-    module = import_module(f"experiments.benchmark.{benchmark}")
-    module.run(rounds, out or Path(f"runs/benchmark_{benchmark}.json"))
+    module, out = import_module(f"experiments.benchmark.{benchmark}"), out or Path(f"runs/benchmark_{benchmark}.json")
+    require_replaceable(out, b'{\n "machine": {')
+    module.run(rounds, out)
 
 
 def positive_int(text: str) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mfvpr.io.containers import Container, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable, replacing, require_replaceable
 
 
 class H5File(Container):
@@ -64,8 +64,9 @@ class H5Pairs(H5File):
 
 
 def write_h5(path: Path, groups: Iterable[tuple[str, Mapping[str, np.ndarray]]]) -> None:
-    """Write a group for each image, one after the other, atomically; `libver` as in hloc."""
+    """Write a new file with a group for each image, one after the other, atomically; `libver` as in hloc."""
     h5py = _h5py(path)
+    require_replaceable(path)
     with replacing(path) as temporary, h5py.File(temporary, "w", libver="latest") as file:
         for image, parts in groups:
             group = file.create_group(printable(image))

@@ -15,7 +15,7 @@ from jaxtyping import Shaped
 
 from mfvpr.io.containers import Container, FileEntry, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable, replacing, require_replaceable
 
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
@@ -89,7 +89,8 @@ def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write named arrays, one after the other, atomically."""
+    """Write a new file of named arrays, one after the other, atomically."""
+    require_replaceable(path)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays:
             with archive.open(f"{printable(name)}.npy", "w", force_zip64=True) as member:

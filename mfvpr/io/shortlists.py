@@ -19,7 +19,7 @@ from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import printable, require_file, write_text
+from mfvpr.utils.files import printable, require_file, require_replaceable, write_text
 
 PairLayout = Literal["hloc", "kapture", "preds"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
@@ -114,7 +114,8 @@ def write_shortlist(
         positives: `[Q]` database rows of the correct images of each query, for `preds`; None = not listed.
 
     Raises:
-        InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
+        InputError: the file exists; names are missing or do not fit a line; or written scores are not finite, or
+            ascending.
     """
     path = Path(path)
     require_word("layout", layout, PairLayout)
@@ -148,6 +149,7 @@ def write_shortlist(
         names = (query_names[query], database_names[int(indices[query, position])])
         score = np.float32(scores[query, position])
         lines.append(" ".join(names) if layout == "hloc" else ", ".join((*names, str(score))))
+    require_replaceable(path)
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -235,8 +237,8 @@ def _write_predictions(folder: Path, query_names: Sequence[str], lists: Sequence
 
     `lists` are the names of the predictions of each query, and those of its positives if they are known.
     """
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     folder.mkdir(parents=True, exist_ok=True)
     for row, (query, *names) in enumerate(zip(query_names, *lists, strict=True)):
         if names[0]:
