@@ -25,7 +25,7 @@ PairLayout = Literal["hloc", "kapture", "preds"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
-_SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
+_MOST_CHARACTERS, _MOST_WORDS = 10_000, 200  # of a line, since every split of it is tried
 _HEADINGS = PREDICTIONS, POSITIVES
 
 
@@ -189,7 +189,8 @@ def _read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence
     space.) Lines that begin with # and hold no known pair are comments.
 
     Raises:
-        InputError: a line has no split with known names, or several.
+        InputError: a line has no split with known names, or several, or it has more than 10,000 characters or 200
+            words.
     """
     with reading(path, mend="expected a text file of image pairs"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
@@ -257,6 +258,10 @@ def _pair(where: str, line: str, sides: Sequence[Set[str]], ends: Sequence[Set[s
     words = line.split()
     if len(words) == 2 and words[0] in sides[0] and words[1] in sides[1]:
         return Pair(words[0], words[1])  # nearly every line of hloc
+    if len(line) > _MOST_CHARACTERS or line.count(",") + len(words) > _MOST_WORDS:
+        if line.startswith("#"):
+            return None
+        raise InputError(f"{where}: expected the names of a query and a database image, got {len(line)} characters")
     splits = list(_splits(line))
     pairs = [pair for pair in splits if pair.query in sides[0] and pair.database in sides[1]]
     pairs = pairs or [pair for pair in splits if _ends(pair.query)[0] in ends[0] and _ends(pair.database)[0] in ends[1]]
@@ -273,9 +278,10 @@ def _splits(line: str) -> Iterator[Pair]:
     for separator in _SEPARATOR.finditer(line):
         query, database = line[: separator.start()], line[separator.end() :]
         yield Pair(query, database)
-        if scored := _SCORED.fullmatch(database):
-            with suppress(ValueError):  # the last word is no number
-                yield Pair(query, scored[1], parse_number(scored[2]))
+        name, comma, number = database.rpartition(",")
+        if comma:
+            with suppress(ValueError):  # no number
+                yield Pair(query, name.rstrip(), parse_number(number.strip()))
 
 
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
