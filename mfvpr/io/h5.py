@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.io.containers import Container, Shapes, reading, require_plain, shorten
+from mfvpr.io.containers import MAX_INFLATED, Container, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -125,7 +125,9 @@ def _read(path: Path, image: str, group: Any, part: str) -> np.ndarray:
         raise InputError(f"{where}: expected data in this file, got storage in others, which is not read; copy it")
     if dataset.size and not _has_all_values(dataset):
         raise InputError(f"{where}: expected data, got a dataset that was not written; extract this image again")
-    return dataset[()]
+    if dataset.nbytes > max(MAX_INFLATED, dataset.id.get_storage_size()):
+        raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset, got more; write it uncompressed")
+    return np.asarray(dataset[()])
 
 
 def _has_all_values(dataset: Any) -> bool:

@@ -13,7 +13,7 @@ from typing import IO
 import numpy as np
 from jaxtyping import Shaped
 
-from mfvpr.io.containers import Container, FileEntry, Shapes, reading, require_plain, shorten
+from mfvpr.io.containers import MAX_INFLATED, Container, FileEntry, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -126,8 +126,10 @@ def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype
 
 
 def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
-    content = archive.read(member)  # completely, which verifies the checksum
-    return parse_npy(f"{archive.filename}: {shorten(member)}", content)
+    where, entry = f"{archive.filename}: {shorten(member)}", archive.getinfo(member)
+    if entry.file_size > max(MAX_INFLATED, entry.compress_size):
+        raise InputError(f"{where}: expected at most 1 GiB in a compressed array, got more; write it uncompressed")
+    return parse_npy(where, archive.read(member))  # completely, which verifies the checksum
 
 
 def parse_npy(where: str, content: bytes) -> Shaped[np.ndarray, "..."]:
