@@ -129,8 +129,8 @@ def result_matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
         raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")
     shapes = [values.shape for values in (keypoints0, keypoints1, numbers, confidence) if values is not None]
     if [*map(len, shapes)] != [2, 2, 1, 1][: len(shapes)] or len({shape[0] for shape in (shapes[0], *shapes[2:])}) > 1:
-        raise InputError(f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N], match_confidence [N], got "
-                         f"{', '.join(map(str, shapes))}")  # fmt: skip
+        raise InputError(f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N], match_confidence [N], "
+                         f"got {', '.join(map(str, shapes))}")  # fmt: skip
     if numbers.dtype.kind not in "iu":
         raise InputError(f"{file}: expected matches of integers, got {numbers.dtype}")
     real = numbers >= 0
