@@ -160,7 +160,7 @@ class _LocalizationFigures:
 
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)
-        except Exception as error:
+        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
             self._failed += 1
             tell(f"warning: {path}: not drawn ({error})")
             return {"figure": None}
