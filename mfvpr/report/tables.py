@@ -87,7 +87,7 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | 
 
 def _write_rows(file: TextIO, rows: Iterable[Sequence[str | int]]) -> None:
     """Write CSV with \\n at the end of lines; Python quotes \\r only if it is in `lineterminator` (before 3.13)."""
-    lines = SimpleNamespace(write=lambda line: file.write(line.removesuffix("\r\n") + "\n"))
+    lines: Any = SimpleNamespace(write=lambda line: file.write(line.removesuffix("\r\n") + "\n"))
     csv.writer(lines, lineterminator="\r\n").writerows(rows)
 
 
