@@ -23,6 +23,8 @@ import numpy as np
 from nbclient import NotebookClient
 from PIL import Image
 
+from mfvpr.datasets.images import open_image
+
 FOLDER = Path(__file__).parent
 PICTURES = FOLDER / "pictures"
 RUN_OF = "code_sha256"  # the notebook's metadata
@@ -39,7 +41,7 @@ def run_notebook(path: Path) -> None:
         for output in cell.get("outputs", ()):
             if "image/png" in output.get("data", {}):
                 output.metadata = {}
-                image = Image.open(io.BytesIO(base64.b64decode(output.data["image/png"])))
+                image = open_image(io.BytesIO(base64.b64decode(output.data["image/png"])))
                 output.data["image/png"] = base64.b64encode(small(image)).decode()
                 output.data["text/plain"] = "<Figure>"
     notebook.metadata = {"kernelspec": notebook.metadata.kernelspec, RUN_OF: code_hash(notebook)}
@@ -105,12 +107,12 @@ def draw_run() -> None:
             [sys.executable, "-c", "from mfvpr.cli.programs import main; main()", "evaluate", *settings], check=True
         )
         [figure] = Path(folder, "run", "figures").glob("*correct*.png")
-        (PICTURES / "run.png").write_bytes(small(Image.open(figure)))
+        (PICTURES / "run.png").write_bytes(small(open_image(figure)))
         if browser := shutil.which("chromium"):
             page, shot = f"file://{folder}/run/report.html", f"{folder}/page.png"
             options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1200,1120"]
             subprocess.run([browser, *options, f"--screenshot={shot}", page], check=True, capture_output=True)
-            (PICTURES / "report.png").write_bytes(small(Image.open(shot)))
+            (PICTURES / "report.png").write_bytes(small(open_image(shot)))
 
 
 if __name__ == "__main__":

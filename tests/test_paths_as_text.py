@@ -4,6 +4,7 @@ import inspect
 import os
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,9 +16,12 @@ from mfvpr.evaluation import Confidence, calibration, read_confidences, write_co
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.scoring import weight_registry
-from mfvpr.scoring.weight_registry import read_weight
-from tests.builders import fill
+from mfvpr.scoring.learned_weight import LearnedWeight
+from mfvpr.scoring.weight_registry import read_weight, write_weight
+from tests.builders import fill, random_matches
 from tests.io.other_programs import feature
+
+WEIGHT = LearnedWeight.create(jax.random.key(1), random_matches(np.random.default_rng(0), 30), 3)
 
 
 def public_functions():
@@ -30,7 +34,8 @@ def public_functions():
 def test_signatures_say_so():
     checked = {function.__name__ for function in public_functions()}
     assert {"open_features", "image_folder", "read_frames", "read_confidences", "truth_from_file"} <= checked
-    internal = {"choose_reader", "read_npz", "reading", "replacing", "require_all", "require_file", "write_text"}
+    internal = {"choose_reader", "read_npz", "reading", "replacing", "require_all", "require_file"}
+    internal |= {"require_replaceable", "write_text"}
     for function in public_functions():
         if function.__name__ not in internal:
             for parameter in inspect.signature(function).parameters.values():
@@ -53,6 +58,40 @@ def test_files_of_other_programs(tmp_path):
     path = str(tmp_path / "pairs.txt")
     io.write_shortlist(path, Shortlist(np.zeros((2, 1), int), np.ones((2, 1)), np.ones((2, 1), bool)), names, names)
     assert io.read_shortlist(path, names, names).indices.tolist() == [[0], [0]]
+
+
+def test_files_that_exist_stay(tmp_path):
+    """Only files of weights and of confidences are replaced, by their like."""
+    names, one = ["1.jpg"], np.ones((1, 1))
+    model = Confidence(("margin",), 5, (0.0,), (1.0,), (1.0,), 0.0)
+    writers = {
+        "a.h5": lambda path: io.write_features(path, names, [(0, feature(0))]),
+        "a.npz": lambda path: io.write_features(path, names, [(0, feature(0))]),
+        "a": lambda path: io.write_features(path, names, [(0, feature(0))]),
+        "g.npy": lambda path: io.write_global_descriptors(path, names, one),
+        "g.npz": lambda path: io.write_global_descriptors(path, names, one),
+        "g.h5": lambda path: io.write_global_descriptors(path, names, one),
+        "s.npz": lambda path: io.write_shortlist(path, Shortlist(0 * one.astype(int), one, one > 0), names, names),
+        "s.txt": lambda path: io.write_shortlist(path, Shortlist(0 * one.astype(int), one, one > 0), names, names),
+        "t.txt": lambda path: io.write_trajectory(path, ["0 0 0 0 0 0 1"], [0]),
+        "c.json": lambda path: write_confidences(path, {"histogram": model}, {}),
+        "w.json": lambda path: write_weight(path, WEIGHT, {}),
+    }
+    for name, write in writers.items():
+        path = tmp_path / name
+        file = path / "1.jpg.npz" if name == "a" else path
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"precious")
+        with pytest.raises(InputError, match="expected a new file, got one that exists"):
+            write(path)
+        assert file.read_bytes() == b"precious"
+        file.unlink()
+        write(path)
+        if name.endswith(".json"):
+            write(path)
+        else:
+            with pytest.raises(InputError, match="expected a new file"):
+                write(path)
 
 
 def test_data_sets(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mfvpr.cli.launch import Parser, run_command
 from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.files import require_replaceable
 
 PROGRAM = "python -m experiments.benchmark"
 # Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
@@ -45,6 +46,7 @@ def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None,
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module = import_module(f"experiments.benchmark.{benchmark}")
     out = out or Path(f"runs/benchmark_{benchmark}.json")
+    require_replaceable(out, b'{\n "machine": {')
     if benchmark == "accelerator":
         module.run(rounds, out, groups, is_quick=is_quick)
     elif groups or is_quick:

@@ -23,6 +23,7 @@ from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
 from mfvpr.localization.vectors import Vectors
+from mfvpr.report.pages.rendering import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database
@@ -45,12 +46,17 @@ STEPS = ("retrieval", "features", "matching", "scores")
 _MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
 _DATABASES = (100, 1000, 10_000, 100_000)  # images
 _ROUNDS = 5
+_OUTPUTS = {"runs", "tables", "figures", "comparisons", "seconds", PAGE}
 _FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change no number
 
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations, and remove temporary files of a killed process; SettingsError if it is in use."""
+    """Lock a folder for evaluations, and remove temporary files of a killed process.
+
+    Raises:
+        SettingsError: another process uses the folder, or it has files of others.
+    """
     in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
         try:
@@ -58,6 +64,9 @@ def lock_output(out: Path) -> Iterator[None]:
             stack.enter_context(lock_folder(out, in_use))
         except OSError as error:
             raise SettingsError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
+        names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
+        if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
+            raise SettingsError(f"out={out}: expected a new or empty folder, or one of this program; name another")
         remove_leftovers(out)
         yield
 

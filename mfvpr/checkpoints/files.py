@@ -17,7 +17,7 @@ from mfvpr.checkpoints.conversion import convert, is_ignored
 from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint, resemblance
 from mfvpr.checkpoints.registry import OWN, REGISTRY, Entry, entry_of, how_to_install, own_entry
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import replacing, write_text
+from mfvpr.utils.files import replacing, require_file, write_text
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -72,6 +72,7 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
         raise InputError(f"{entry.name}: expected a name that is free, got one of installed weights; choose another")
     network, is_runtime_file = NETWORKS[name], own is not None and checkpoint.suffix == ".safetensors"
     if is_runtime_file:
+        require_file(checkpoint, "a safetensors file")
         network, tensors = network._replace(table=RUNTIME), _parse(checkpoint.read_bytes(), f"{checkpoint}: ")
     else:
         require_checkpoint(checkpoint)  # first, since "a web page" helps more than another hash
@@ -220,7 +221,8 @@ def is_installed(entry: Entry) -> bool:
 
 
 def file_sha256(path: Path) -> str:
-    """The sha256 of a file of any size."""
+    """The sha256 of a file of any size; an InputError if it is none, such as a pipe."""
+    require_file(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

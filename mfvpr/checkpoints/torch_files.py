@@ -134,7 +134,12 @@ def read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
 
 def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes]) -> dict[str, np.ndarray]:
     """Arrays of the tensors in a pickle's content; `order` is the byte order of their values."""
-    read_values = cache(read_values)
+
+    @cache
+    def values_of(storage: Storage) -> np.ndarray:  # in native byte order, for all tensors that share it
+        dtype = _dtype(storage)
+        return np.frombuffer(read_values(storage), dtype.newbyteorder(order)).astype(dtype, copy=False)
+
     if isinstance(content, dict):
         content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), dict)), content)
     if not isinstance(content, dict) or not content:
@@ -148,15 +153,13 @@ def _arrays(content: Any, order: Order, read_values: Callable[[Storage], bytes])
         where = f" at {shorten(key)}"
         if not isinstance(tensor, Tensor):
             raise InputError(f"expected tensors only, got {type(tensor).__name__}{where}")
-        dtype = _dtype(tensor.storage, where).newbyteorder(order)
-        raw = read_values(tensor.storage)
-        if len(raw) != tensor.storage.count * dtype.itemsize:
+        dtype, values = _dtype(tensor.storage, where), values_of(tensor.storage)
+        if len(values) != tensor.storage.count:
             raise ValueError("a storage of another size")
         if math.prod(tensor.shape) > tensor.storage.count:
             raise InputError(f"expected no more values than the file stores{where}; use the official file")
         strides = [step * dtype.itemsize for step in tensor.strides]
-        view = np.ndarray(tensor.shape, dtype, raw, tensor.offset * dtype.itemsize, strides)  # checks its bounds
-        arrays[key] = view.astype(dtype.newbyteorder("="), copy=False)
+        arrays[key] = np.ndarray(tensor.shape, dtype, values, tensor.offset * dtype.itemsize, strides)  # checks bounds
     return arrays
 
 

@@ -78,10 +78,12 @@ def localize(settings: dict[str, Any]) -> None:
             if not len(robot_map):
                 raise
             failed += 1
-            line = {"error": str(error)} | drive.entry_without_image()
-        else:
-            line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
-        print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
+            localized, line = None, {"error": str(error)} | drive.entry_without_image()
+        try:
+            if localized is not None:
+                line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
+        finally:  # the prediction must not be lost if its image cannot be added
+            print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
         raise SettingsError(f"{failed} of the images could not be localized; their lines say why")
     figures.finish()
@@ -158,7 +160,7 @@ class _LocalizationFigures:
 
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)
-        except Exception as error:
+        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
             self._failed += 1
             tell(f"warning: {path}: not drawn ({error})")
             return {"figure": None}

@@ -28,9 +28,6 @@ def convert(
     _check(source, layout, poses, times, database)
     if (prefixes := (query_prefix, database_prefix)) != ("", "") and layout not in ("hloc", "kapture"):
         raise SettingsError(f"--query-prefix, --database-prefix: expected none for --layout {layout}; remove them")
-    for path in filter(None, (source, poses, times, database)):
-        if out.exists() and path.exists() and out.samefile(path):
-            raise SettingsError(f"{out}: expected another path than those that are read, got {path}")
     if source.is_dir():
         dataset, thresholds = _dataset_of_run(source)
         if times and len(dataset.sequences) > 1:

@@ -68,7 +68,7 @@ def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
     for name, draw_figure in console.track("figures")(figures, len(figures)):
         try:
             draw_figure(folder / "figures" / name)
-        except Exception as error:
+        except Exception as error:  # of any kind from Matplotlib; the results are already written
             console.tell(f"warning: {folder}/figures/{name}: not drawn ({error})")
 
 
@@ -76,6 +76,6 @@ def report_page(folder: Path) -> Path | None:
     """Write the page of an evaluation and return its path; warn and return None if that fails."""
     try:
         return one_run.write_report(folder)
-    except Exception as error:
+    except (ImportError, InputError, OSError) as error:
         console.tell(f"warning: {folder}: no page was made of it ({error})")
         return None

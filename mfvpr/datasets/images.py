@@ -5,11 +5,12 @@ their EXIF orientation, and 16 bits a channel are reduced to the upper 8.
 """
 
 import math
+import struct
 import warnings
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import require_file
 
 MAX_PIXELS = 64_000_000
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "PPM", "BMP")  # Pillow's names; it runs Ghostscript for others
 VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 
 Interpolation = Literal[
@@ -57,8 +59,10 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             Pillow's conversion: gray is cut off at 255, of color the upper 8 of 16 bits are kept.
 
     Raises:
-        InputError: not a regular file, empty, not an image, truncated, over 64 megapixels (checked before decoding),
-            or of 32 bits a channel, whose range is unknown (unless `bits` is None).
+        InputError: not a regular file, empty, not an image of a format in `FORMATS`, truncated, over 64 megapixels
+            (checked before decoding), or of 32 bits a channel, whose range is unknown (unless `bits` is None).
+            Every damage to a PNG file is noticed by its checksums; other formats have none, so that a flipped bit may
+            change pixels.
     """
     path = Path(path)
     with reading(path, "an image file", "replace or remove it"):
@@ -66,7 +70,7 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             raise InputError("expected an image file, got 0 bytes; replace or remove it")
         limit = f"expected at most {MAX_PIXELS // 10**6} megapixels"
         try:
-            image = Image.open(path)
+            image = open_image(path)
         except Image.DecompressionBombError:
             raise InputError(f"{limit}, got several times as many; shrink the image") from None
         with image:
@@ -86,10 +90,18 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
 
 def read_size(path: Path | str, *, orient: bool = True) -> tuple[int, int]:
     """(width, height) px of the image that `read_image` reads, from the header of the file; errors as there."""
-    with reading(Path(path), "an image file", "replace or remove it"), Image.open(path) as image:
+    with reading(Path(path), "an image file", "replace or remove it"), open_image(path) as image:
         width, height = image.size
         is_stored = image.format != "TIFF"  # already turned by Pillow
         return (height, width) if orient is is_stored and _orientation(image) >= 5 else (width, height)
+
+
+def open_image(file: Path | str | BinaryIO) -> ImageFile.ImageFile:
+    """Open an image file of a format in `FORMATS` with Pillow, whose errors have no common class."""
+    with Image.open(file, formats=FORMATS) as image:
+        if image.format == "PNG":  # decoding alone misses damage that leaves enough pixels
+            image.verify()
+    return Image.open(file, formats=FORMATS)
 
 
 def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tuple[int, int]:
@@ -124,7 +136,7 @@ def read_header(content: bytes) -> tuple[int, int | None]:
             has 32 bits; None = an image of 8 bits, or a file that cannot be read.
     """
     try:
-        with Image.open(BytesIO(content)) as image:
+        with open_image(BytesIO(content)) as image:
             used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
             may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
             orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, `_orientation` decodes all
@@ -132,7 +144,7 @@ def read_header(content: bytes) -> tuple[int, int | None]:
                 return orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None
             has_range = used != 16 or image.format == "PPM"
             return orientation, 0 if has_range else _largest(image, content)
-    except Exception:  # reading the image raises
+    except Exception:  # decoders share no class of errors, and reading the image raises an InputError
         return 1, None
 
 
@@ -184,9 +196,11 @@ def read_frames(path: Path | str, *, every: int = 1) -> Iterator[tuple[int, np.n
 
 
 def _orientation(image: Image.Image) -> int:
+    if image.format == "PNG":
+        image.load()  # tags may follow the pixels
     try:
         value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # an image with damaged tags is readable
+    except (SyntaxError, ValueError, LookupError, TypeError, struct.error):  # an image with damaged tags is readable
         return 1
     return value if value in _TURN else 1
 
@@ -220,7 +234,7 @@ def _largest(image: Image.Image, content: bytes) -> int:
     try:
         is_gray = image.mode in _GRAY
         return int((np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))).max())
-    except Exception:  # reading the image raises
+    except Exception:  # as in `read_header`
         return 0
 
 

@@ -14,7 +14,7 @@ from mfvpr.datasets.truth import Truth
 from mfvpr.reranking.confidence import APART, INPUTS, Confidence, Input, confidence_inputs
 from mfvpr.reranking.results import Ranked
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file, write_text
+from mfvpr.utils.files import require_file, require_replaceable, write_text
 
 __all__ = [
     "CalibrationData", "Confidence", "absent_rankings", "calibration_data", "confidence_inputs", "fit_confidence",
@@ -131,8 +131,12 @@ def _leave_out(ranked: Ranked, place: Positives) -> Ranked:
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
-    """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values)."""
+    """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values).
+
+    An earlier file of confidences is replaced; an InputError for other files.
+    """
     values = {name: vars(confidence) for name, confidence in systems.items()}
+    require_replaceable(Path(path), _FORMAT.encode())
     content = {"format": _FORMAT, "made": recipe, "systems": values}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 

@@ -10,6 +10,7 @@ import numpy as np
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file
 
+MAX_INFLATED = 1 << 30  # bytes of an array that a file stores compressed
 Shapes = Mapping[str, tuple[int, ...]]  # by the name of the array
 
 

@@ -13,7 +13,7 @@ from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
 from mfvpr.types import Array
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable, replacing, require_replaceable
 
 PART = "global_descriptor"  # hloc's name
 
@@ -60,7 +60,7 @@ def write_global_descriptors(
     """Write global descriptors `[M, D]` as `read_global_descriptors` reads them, atomically.
 
     Args:
-        path: `.npy`, `.npz`, `.h5` or `.hdf5`.
+        path: new file, `.npy`, `.npz`, `.h5` or `.hdf5`.
         names: `[M]`.
         descriptors: `[M, D]` in the order of `names`.
         half: float16 instead of float32, as hloc by default.
@@ -71,6 +71,7 @@ def write_global_descriptors(
     _require_rows(path, values, names)
     suffix = path.suffix.lower()
     if suffix == ".npy":
+        require_replaceable(path)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.lib.format.write_array(file, values[_sorted_rows(names)], allow_pickle=False)
     elif suffix == ".npz":

@@ -180,7 +180,8 @@ def write_features(
         half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
 
     Raises:
-        InputError: a value is too large for float16, a name is no path below a folder, or two images share a name.
+        InputError: a file exists, a value is too large for float16, a name is no path below a folder, or two images
+            share a name.
     """
     path = Path(path)
     require_different(path, names)

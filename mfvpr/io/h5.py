@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.io.containers import Container, Shapes, reading, require_plain, shorten
+from mfvpr.io.containers import MAX_INFLATED, Container, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable, replacing, require_replaceable
 
 
 class H5File(Container):
@@ -64,8 +64,9 @@ class H5Pairs(H5File):
 
 
 def write_h5(path: Path, groups: Iterable[tuple[str, Mapping[str, np.ndarray]]]) -> None:
-    """Write a group for each image, one after the other, atomically; `libver` as in hloc."""
+    """Write a new file with a group for each image, one after the other, atomically; `libver` as in hloc."""
     h5py = _h5py(path)
+    require_replaceable(path)
     with replacing(path) as temporary, h5py.File(temporary, "w", libver="latest") as file:
         for image, parts in groups:
             group = file.create_group(printable(image))
@@ -124,7 +125,9 @@ def _read(path: Path, image: str, group: Any, part: str) -> np.ndarray:
         raise InputError(f"{where}: expected data in this file, got storage in others, which is not read; copy it")
     if dataset.size and not _has_all_values(dataset):
         raise InputError(f"{where}: expected data, got a dataset that was not written; extract this image again")
-    return dataset[()]
+    if dataset.nbytes > max(MAX_INFLATED, dataset.id.get_storage_size()):
+        raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset, got more; write it uncompressed")
+    return np.asarray(dataset[()])
 
 
 def _has_all_values(dataset: Any) -> bool:

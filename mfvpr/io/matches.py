@@ -139,9 +139,9 @@ class ImportedMatches:
             features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
         return features
 
-    def _confidence(self, where: str, raw: FileMatches) -> Num[np.ndarray, " matches"] | None:
+    def _confidence(self, where: str, raw: FileMatches) -> Num[np.ndarray, "..."] | None:
         """Confidences of the file; all pairs or none must have them."""
-        if not self._use_confidences or not len(raw.first):
+        if not self._use_confidences or not raw.first.size:
             return None
         if (raw.confidence is not None) != self._reader.has_confidences:
             raise InputError(f"{where}: expected confidences of all pairs or of none, unlike the first pair; ignore "

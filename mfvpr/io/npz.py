@@ -13,9 +13,9 @@ from typing import IO
 import numpy as np
 from jaxtyping import Shaped
 
-from mfvpr.io.containers import Container, FileEntry, Shapes, reading, require_plain, shorten
+from mfvpr.io.containers import MAX_INFLATED, Container, FileEntry, Shapes, reading, require_plain, shorten
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable, replacing, require_replaceable
 
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
 
@@ -89,7 +89,8 @@ def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write named arrays, one after the other, atomically."""
+    """Write a new file of named arrays, one after the other, atomically."""
+    require_replaceable(path)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays:
             with archive.open(f"{printable(name)}.npy", "w", force_zip64=True) as member:
@@ -125,8 +126,10 @@ def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype
 
 
 def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
-    content = archive.read(member)  # completely, which verifies the checksum
-    return parse_npy(f"{archive.filename}: {shorten(member)}", content)
+    where, entry = f"{archive.filename}: {shorten(member)}", archive.getinfo(member)
+    if entry.file_size > max(MAX_INFLATED, entry.compress_size):
+        raise InputError(f"{where}: expected at most 1 GiB in a compressed array, got more; write it uncompressed")
+    return parse_npy(where, archive.read(member))  # completely, which verifies the checksum
 
 
 def parse_npy(where: str, content: bytes) -> Shaped[np.ndarray, "..."]:

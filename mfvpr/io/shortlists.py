@@ -19,13 +19,13 @@ from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import printable, require_file, write_text
+from mfvpr.utils.files import printable, require_file, require_replaceable, write_text
 
 PairLayout = Literal["hloc", "kapture", "preds"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
-_SCORED = re.compile(r"(.*?)\s*,\s*([-+.\w]+)")
+_MOST_CHARACTERS, _MOST_WORDS = 10_000, 200  # of a line, since every split of it is tried
 _HEADINGS = PREDICTIONS, POSITIVES
 
 
@@ -114,7 +114,8 @@ def write_shortlist(
         positives: `[Q]` database rows of the correct images of each query, for `preds`; None = not listed.
 
     Raises:
-        InputError: names are missing or do not fit a line; written scores are not finite, or ascending.
+        InputError: the file exists; names are missing or do not fit a line; or written scores are not finite, or
+            ascending.
     """
     path = Path(path)
     require_word("layout", layout, PairLayout)
@@ -148,6 +149,7 @@ def write_shortlist(
         names = (query_names[query], database_names[int(indices[query, position])])
         score = np.float32(scores[query, position])
         lines.append(" ".join(names) if layout == "hloc" else ", ".join((*names, str(score))))
+    require_replaceable(path)
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -187,7 +189,8 @@ def _read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence
     space.) Lines that begin with # and hold no known pair are comments.
 
     Raises:
-        InputError: a line has no split with known names, or several.
+        InputError: a line has no split with known names, or several, or it has more than 10,000 characters or 200
+            words.
     """
     with reading(path, mend="expected a text file of image pairs"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
@@ -235,8 +238,8 @@ def _write_predictions(folder: Path, query_names: Sequence[str], lists: Sequence
 
     `lists` are the names of the predictions of each query, and those of its positives if they are known.
     """
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose another")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     folder.mkdir(parents=True, exist_ok=True)
     for row, (query, *names) in enumerate(zip(query_names, *lists, strict=True)):
         if names[0]:
@@ -255,6 +258,10 @@ def _pair(where: str, line: str, sides: Sequence[Set[str]], ends: Sequence[Set[s
     words = line.split()
     if len(words) == 2 and words[0] in sides[0] and words[1] in sides[1]:
         return Pair(words[0], words[1])  # nearly every line of hloc
+    if len(line) > _MOST_CHARACTERS or line.count(",") + len(words) > _MOST_WORDS:
+        if line.startswith("#"):
+            return None
+        raise InputError(f"{where}: expected the names of a query and a database image, got {len(line)} characters")
     splits = list(_splits(line))
     pairs = [pair for pair in splits if pair.query in sides[0] and pair.database in sides[1]]
     pairs = pairs or [pair for pair in splits if _ends(pair.query)[0] in ends[0] and _ends(pair.database)[0] in ends[1]]
@@ -271,9 +278,10 @@ def _splits(line: str) -> Iterator[Pair]:
     for separator in _SEPARATOR.finditer(line):
         query, database = line[: separator.start()], line[separator.end() :]
         yield Pair(query, database)
-        if scored := _SCORED.fullmatch(database):
-            with suppress(ValueError):  # the last word is no number
-                yield Pair(query, scored[1], parse_number(scored[2]))
+        name, comma, number = database.rpartition(",")
+        if comma:
+            with suppress(ValueError):  # no number
+                yield Pair(query, name.rstrip(), parse_number(number.strip()))
 
 
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:

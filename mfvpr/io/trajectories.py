@@ -8,7 +8,7 @@ from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import shorten
 from mfvpr.io.stamps import SECOND, parse_stamp, read_content_lines, stamps_in_names
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import require_replaceable, write_text
 
 _TUM, _KITTI = 7, 12  # numbers of a pose
 _WORDS = {_TUM + 1: "tum", _KITTI: "kitti"}  # of a line
@@ -55,7 +55,7 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
         write_trajectory("queries.tum", [poses[row] for row in rows], stamps)  # database rows of the predictions
 
     Args:
-        path: text file.
+        path: new text file.
         poses: `[Q]` texts of 7 numbers (TUM) or 12 numbers (KITTI), as `read_poses` returns them; None = no place.
         stamps: `[Q]` times in ns, for TUM; None for KITTI.
 
@@ -63,8 +63,8 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
     need a place.
 
     Raises:
-        InputError: there is no pose at all, or none of a KITTI frame; a pose has other numbers; or two images have the
-            same time.
+        InputError: the file exists; there is no pose at all, or none of a KITTI frame; a pose has other numbers; or
+            two images have the same time.
     """
     path = Path(path)
     num_numbers = _KITTI if stamps is None else _TUM
@@ -89,6 +89,7 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
             lines[stamps[row]] = _pose(f"{path}: row {row}", words)
     if not lines:
         raise InputError(f"{path}: expected at least one image with a place, got none")
+    require_replaceable(path)
     starts = [f"{_seconds(stamp)} " if num_numbers == _TUM else "" for stamp in lines]
     write_text(path, "".join(f"{start}{pose}\n" for start, pose in zip(starts, lines.values(), strict=True)))
 

@@ -11,6 +11,7 @@ from jaxtyping import Int, UInt8
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
+from mfvpr.io.containers import shorten
 from mfvpr.io.plain_matches import numbered_matches, point_matches
 from mfvpr.matching.batched import Pair, join_candidates
 from mfvpr.matching.match_set import QueryMatches
@@ -169,8 +170,9 @@ class _CalledPairs:
                              f"matched_kpts1, got {type(result).__name__}")  # fmt: skip
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
-        except ValueError as error:
-            raise InputError(f"{where}: expected arrays, got lists of different lengths") from error
+        except Exception as error:  # of NumPy for ragged lists, of any library for tensors that are not dense
+            reason = shorten(" ".join(str(error).split()), 160)
+            raise InputError(f"{where}: expected dense arrays, got others ({reason})") from error
         confidence = values[2] if len(values) == 3 else None
         if self.numbered:
             return numbered_matches(where, values[0], values[1], confidence, first, second)

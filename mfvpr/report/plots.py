@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mfvpr.evaluation.metrics import PrecisionRecall, Reliability
-from mfvpr.utils.files import clip_middle, printable, replacing
+from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
 
 BINS = 12  # of the matches, by the value of an input
 COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
@@ -22,6 +22,7 @@ _DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
 _LINE_STYLES = {"solid": "solid", "dash": "dashed", "dot": "dotted", "dashdot": "dashdot"}  # by plotly's words
 _TITLE_LENGTH = 34  # characters that fit above a panel
 _LOSS, _MARK, _SHARE = "#2fa8ff", "#e8482c", "#888888"
+_SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 _FLAT_LENGTH = 9  # letters of a column's value that fit beside the next one's
 
 
@@ -41,7 +42,11 @@ def panels(number: int, width: float, height: float, columns: int = 4, **options
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -> None:
-    """Write an image file; `options` go to `Figure.savefig`."""
+    """Write an image file; `options` go to `Figure.savefig`. Of existing files, only a PNG from here is replaced."""
+    is_png = path.suffix == ".png"
+    require_replaceable(path, _SOFTWARE if is_png else None)
+    if is_png:
+        options["metadata"] = {"Software": _SOFTWARE.decode(), **options.get("metadata", {})}
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(temporary, dpi=dpi, **options)

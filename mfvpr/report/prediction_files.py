@@ -20,6 +20,7 @@ from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.tables import read_csv, write_csv
 from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_replaceable
 
 CandidateLayout = Literal["preds", "hloc", "kapture"]
 _NUMBERS = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "scale", "image_width")
@@ -86,8 +87,9 @@ def write_poses(
 def write_shift_table(path: Path, images: Sequence[LocalizedImage], stamps: Sequence[int]) -> None:
     """Write a CSV line per image with `SHIFT_COLUMNS`, in the order of the times `stamps` (ns), as ROS names them.
 
-    Unknown numbers, and the place of an image without one, are empty cells.
+    The file must be new. Unknown numbers, and the place of an image without one, are empty cells.
     """
+    require_replaceable(path)
     write_csv(path, SHIFT_COLUMNS, (
         [stamps[row] // SECOND, stamps[row] % SECOND, _FRAME, _place_text(images[row].place),
          *(images[row].cells.get(name, "") for name in _CELLS), images[row].name]

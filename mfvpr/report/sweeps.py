@@ -95,8 +95,15 @@ class Sweep:
         return _heat_map(self.outcome, *("", *names)[-2:])
 
     def save(self, folder: Path | str) -> None:
-        """Write table, summary, figures and results.json, each file whole; earlier ones are replaced."""
+        """Write table, summary, figures and results.json, each file whole; those of an earlier sweep are replaced.
+
+        Raises:
+            InputError: the folder is neither new nor empty, nor one of a sweep.
+        """
         folder = Path(folder)
+        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
+        if names and "blocks" not in names and not {runs.LAST, "summary.txt", "table.csv"} <= names:
+            raise InputError(f"{folder}: expected a new or empty folder, or one of a sweep; name another")
         shutil.rmtree(folder / "figures", ignore_errors=True)
         for name, draw in sweep_figures(self.outcome):
             draw(folder / "figures" / name)

@@ -5,7 +5,8 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
@@ -14,6 +15,11 @@ from mfvpr.utils.files import replacing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+_LATEX = str.maketrans(
+    {character: rf"\{character}" for character in "&%_#${}"}
+    | {"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "±": r"$\pm$"}
+)
 
 
 @dataclass(frozen=True)
@@ -44,12 +50,12 @@ class Table:
     def csv(self) -> str:
         """Comma-separated, quoted where needed."""
         out = io.StringIO()
-        csv.writer(out, lineterminator="\n").writerows([self.header, *self.rows])
+        _write_rows(out, [self.header, *self.rows])
         return out.getvalue()
 
     def latex(self) -> str:
         """A `tabular` for the booktabs package."""
-        lines = [" & ".join(map(_escape_latex, row)) + r" \\" for row in (self.header, *self.rows)]
+        lines = [" & ".join(cell.translate(_LATEX) for cell in row) + r" \\" for row in (self.header, *self.rows)]
         columns = "l" * self.text_columns + "r" * (len(self.header) - self.text_columns)
         body = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
         return "\n".join([*body, r"\end{tabular}", ""])
@@ -76,7 +82,13 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | 
     A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
     """
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
-        csv.writer(file, lineterminator="\n").writerows([header, *lines])
+        _write_rows(file, [header, *lines])
+
+
+def _write_rows(file: TextIO, rows: Iterable[Sequence[str | int]]) -> None:
+    """Write CSV with \\n at the end of lines; Python quotes \\r only if it is in `lineterminator` (before 3.13)."""
+    lines: Any = SimpleNamespace(write=lambda line: file.write(line.removesuffix("\r\n") + "\n"))
+    csv.writer(lines, lineterminator="\r\n").writerows(rows)
 
 
 def format_number(value: Any) -> str:
@@ -89,9 +101,3 @@ def format_value(value: Any) -> str:
     if value is None:
         return "none"
     return f"{value:g}" if isinstance(value, float | np.floating) else str(value)
-
-
-def _escape_latex(cell: str) -> str:
-    for plain, escaped in (("\\", r"\textbackslash "), ("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$")):
-        cell = cell.replace(plain, escaped)
-    return cell

@@ -17,7 +17,7 @@ import numpy as np
 from mfvpr.scoring.learned_weight import INPUTS, LearnedWeight
 from mfvpr.scoring.weights import WEIGHTS, Weight
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file, write_text
+from mfvpr.utils.files import require_file, require_replaceable, write_text
 
 SUFFIX = ".json"
 _FORMAT = "mfvpr match weight 1"
@@ -25,7 +25,11 @@ _LEARNED = Path(__file__).parent / "learned"
 
 
 def write_weight(path: Path | str, weight: LearnedWeight, provenance: Mapping[str, Any]) -> None:
-    """Write a weight of finite numbers as JSON, exact to the last bit, with its provenance (JSON values)."""
+    """Write a weight of finite numbers as JSON, exact to the last bit, with its provenance (JSON values).
+
+    An earlier file of a weight is replaced; an InputError for other files.
+    """
+    require_replaceable(Path(path), _FORMAT.encode())
     arrays = {f.name: np.asarray(getattr(weight, f.name)).tolist() for f in fields(weight) if f.name != "names"}
     content = {"format": _FORMAT, "made": provenance, "inputs": list(weight.names), **arrays}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

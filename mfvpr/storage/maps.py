@@ -145,7 +145,7 @@ class _Segment:
                 file.write(new.astype(_TOKEN).tobytes())
                 file.flush()
                 os.fsync(file.fileno())
-        except BaseException:
+        except BaseException:  # also Ctrl-C: the rows are not there
             self.tokens[first : rows.stop] = 0
             raise
         self.stamp = file_stamp(self.folder / _TOKENS)

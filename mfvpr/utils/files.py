@@ -42,6 +42,16 @@ def require_file(path: Path, expected: str = "a file") -> None:
         raise InputError(f"{path}: expected {expected}, got {got}; check the path")
 
 
+def require_replaceable(path: Path, mark: bytes | None = None) -> None:
+    """Raise `InputError` if a file exists, unless its first 4 KiB contain `mark`, as all earlier outputs do."""
+    if os.path.lexists(path):
+        if mark is not None and path.is_file():
+            with path.open("rb") as file:
+                if mark in file.read(4096):
+                    return
+        raise InputError(f"{path}: expected a new file, got one that exists; remove it, or name another")
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files of killed processes below a folder; no process may be writing there."""
     for path in folder.rglob(".*"):

@@ -223,6 +223,15 @@ def test_instructions_out_of_place_are_refused(path, instructions):
     assert "damaged" in message or "nothing was executed" in message
 
 
+def test_tensors_that_share_a_storage_share_its_memory(path):
+    """Also if the bytes of their numbers must be swapped."""
+    array = np.arange(1 << 18, dtype=np.float32)
+    write_zip(path, {str(number): View(array, key="0") for number in range(100)}, order="big")
+    with memory_below(20e6):
+        tensors = read_checkpoint(path)
+    np.testing.assert_array_equal(tensors["99"], array)
+
+
 def test_nothing_grows_beyond_the_file(path, monkeypatch):
     array = np.ones(3, np.float32)
     put = b"]r\xff\xff\xff\x7f0"  # memo 2,147,483,647 of a list that is dropped

@@ -3,6 +3,7 @@
 import gc
 import hashlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -85,6 +86,17 @@ except SystemExit:
 def test_mistakes_are_one_line_and_exit_code_2(refused, folder, arguments, words):
     refused(words, *arguments)
     assert not folder.exists()
+
+
+def test_a_pipe_is_not_waited_for(program, refused, folder, tmp_path):
+    for name, options in (("d2_tf.pth", []), ("mine.safetensors", ["--as", "d2_tf", "--own", "mine"])):
+        os.mkfifo(tmp_path / name)
+        refused(f"{name}: expected a", "add", tmp_path / name, *options)
+    folder.mkdir()
+    os.mkfifo(folder / REGISTRY["aliked-n16"].file)
+    code, stdout, _ = program("verify")
+    assert code == 2
+    assert "got a pipe or device" in stdout
 
 
 def test_list(program, folder):

@@ -95,10 +95,10 @@ def test_trajectories_and_shifts_of_a_run(convert, settings, tmp_path):
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     (tmp_path / "times.txt").write_text("".join(f"{row}.000000001\n" for row in range(len(expected))))
     times = ("--times", tmp_path / "times.txt")
-    path, *_ = convert(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times)
+    path, *_ = convert(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times, out="tum")
     expected = [f"{row}.000000001 {poses[first[query]]}" for row, query in enumerate(dataset.queries.names)]
     assert path.read_text().splitlines() == expected
-    path, *_ = convert(settings["out"], "shifts", *times)
+    path, *_ = convert(settings["out"], "shifts", *times, out="shifts")
     rows = {row["image"]: row for row in csv_rows(path)}
     assert {name: row["place"] for name, row in rows.items()} == first
     for row in csv_rows(Path(settings["out"]) / "shifts.csv"):
@@ -117,7 +117,7 @@ def test_lines_of_localize(convert, tmp_path, settings):
     path, stdout, _ = convert(tmp_path / "lines", "tum", *files)
     assert path.read_text() == f"1403636579.763555584 {poses[dataset.database.names[3]]}\n"
     assert stdout == f"{path}: 1 images with a place, 1 without\n"
-    path, *_ = convert(tmp_path / "lines", "shifts")
+    path, *_ = convert(tmp_path / "lines", "shifts", out="shifts")
     assert [row["header.stamp.nanosec"] for row in csv_rows(path)] == ["500000000", "763555584"]
 
 
@@ -139,12 +139,17 @@ def test_wrong_arguments_are_one_line(convert, settings, tmp_path, layout, more,
     assert not path.exists()
 
 
-def test_files_that_are_read_are_not_overwritten(convert, settings, tmp_path):
+@pytest.mark.parametrize("layout", ["preds", "hloc", "kapture", "kitti", "shifts"])
+def test_files_that_exist_are_not_overwritten(convert, settings, tmp_path, layout):
+    """Also those that are read."""
     dataset = dataset_of(settings["dataset"])
-    poses_of(dataset, tmp_path / "out", 7)
+    poses_of(dataset, tmp_path / "out", 12)
+    (tmp_path / "times").write_text("".join(f"{row}.5\n" for row in range(len(dataset.queries))))
     before = (tmp_path / "out").read_text()
-    _, _, stderr = convert(settings["out"], "tum", "--poses", tmp_path / "out", code=2)
-    assert "expected another path than those that are read" in stderr
+    more = {"kitti": ["--poses", tmp_path / "out"], "shifts": ["--times", tmp_path / "times"]}.get(layout, [])
+    _, _, stderr = convert(settings["out"], layout, *more, code=2)
+    assert stderr.startswith(f"error: {tmp_path}/out: expected a new")
+    assert stderr.count("\n") == 1
     assert (tmp_path / "out").read_text() == before
 
 

@@ -106,6 +106,12 @@ def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, 
     assert str(sweep(MyScorer(), **AXES, split="both", out=out).table()) == str(result.table())
     with pytest.raises(mfvpr.InputError, match="has the result of a sweep of other axes"):
         sweep(MyScorer(), sigma=[5], out=out)
+    for _ in range(2):
+        result.save(tmp_path / "saved")
+    (tmp_path / "thesis" / "figures").mkdir(parents=True)
+    with pytest.raises(mfvpr.InputError, match="thesis: expected a new or empty folder"):
+        result.save(tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "figures").is_dir()
     figure = result.plot("weight", "sigma")
     assert [figure.axes[0].get_ylabel(), figure.axes[0].get_xlabel()] == ["weight", "sigma"]
     assert result.plot("sigma").axes[0].get_xlabel() == "sigma"

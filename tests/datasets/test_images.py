@@ -1,5 +1,6 @@
 """Decoding and resampling as in Pillow, and errors of broken files."""
 
+import io
 import os
 import struct
 import threading
@@ -69,6 +70,8 @@ BROKEN = {
     "dangling link": (lambda p, photo: p.symlink_to("nowhere"), "got nothing"),
     "truncated": (lambda p, photo: p.write_bytes(png(photo)[:-400]), "cannot be read"),
     "other bytes": (lambda p, photo: p.write_bytes(png(photo)[:60] + os.urandom(99)), "cannot be read"),
+    "PostScript": (lambda p, photo: p.write_text("%!PS-Adobe-3.0\n%%BoundingBox: 0 0 9 9\n"), "cannot identify"),
+    "GIF": (lambda p, photo: Image.fromarray(photo).save(p, format="GIF"), "cannot identify"),
     "too large": (lambda p, photo: write_bomb(p), "at most 64 megapixels"),
 }
 
@@ -83,6 +86,42 @@ def test_broken_files_are_errors_of_one_line(tmp_path, photo, kind, suffix):
     with one_line_error(words, str(path)):
         read_image(path)
     assert time.perf_counter() - start < 2.0  # nothing is decoded, and no pipe is waited for
+
+
+@pytest.mark.parametrize("read", [lambda path: read_image(path, bits=None), read_size])
+@pytest.mark.parametrize("kind", ["PostScript", "GIF"])
+def test_other_formats_start_no_other_program(tmp_path, photo, kind, read):
+    BROKEN[kind][0](tmp_path / "a.png", photo)
+    with one_line_error("cannot identify"):
+        read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_damaged_png_is_an_error_or_has_the_same_pixels(tmp_path, photo, smooth):
+    """Also in its tags behind the pixels, and where a decoder has enough pixels before it sees the damage."""
+    path, photo = tmp_path / "a.png", np.zeros((30, 40, 3), np.uint8) + 90 if smooth else photo
+    Image.fromarray(photo).save(path)
+    write_orientation(path, 1, behind_pixels=True)
+    content, errors = path.read_bytes(), []
+    for place in range(0, len(content), 1 + len(content) // 100):
+        for bits in (0xFF, 1):
+            path.write_bytes(content[:place] + bytes([content[place] ^ bits]) + content[place + 1 :])
+            try:
+                pixels = read_image(path)
+            except InputError as error:
+                errors.append(str(error))
+            else:
+                np.testing.assert_array_equal(pixels, photo)
+    assert len(errors) > 100
+    assert all(error.startswith(f"{path}: ") for error in errors)
+
+
+def test_a_truncated_jpeg_is_an_error(tmp_path, photo):
+    content = io.BytesIO()
+    Image.fromarray(photo).save(content, "JPEG")
+    (tmp_path / "a.jpg").write_bytes(content.getvalue()[:-100])
+    with one_line_error("truncated", "a.jpg"):
+        read_image(tmp_path / "a.jpg")
 
 
 def test_a_name_that_no_file_has_is_one_line():
@@ -180,13 +219,14 @@ def test_orientation_of_16_bit_color(tmp_path, photo, name):
     np.testing.assert_array_equal(read_image(path, bits=12, orient=False), STORED[6](photo))
 
 
-def write_orientation(path, orientation):
+def write_orientation(path, orientation, *, behind_pixels=False):
     """Put the tag into a file of 16-bit color, which Pillow cannot write."""
     content = path.read_bytes()
     if path.suffix == ".png":
         body = b"eXIf" + tag(orientation).tobytes().removeprefix(b"Exif\0\0")
         chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-        path.write_bytes(content[:33] + chunk + content[33:])  # behind the header's
+        place = len(content) - 12 if behind_pixels else 33  # before the last chunk, or behind the header's
+        path.write_bytes(content[:place] + chunk + content[place:])
     else:
         (start,) = struct.unpack("<I", content[4:8])
         (count,) = struct.unpack("<H", content[start : start + 2])

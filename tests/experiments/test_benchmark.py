@@ -9,6 +9,8 @@ import pytest
 
 from experiments.benchmark import search
 from experiments.benchmark.__main__ import BENCHMARKS
+from experiments.benchmark.__main__ import run as run_benchmark
+from mfvpr import InputError
 from mfvpr.checkpoints.networks import NETWORKS, Network
 from mfvpr.checkpoints.tables import SELAVPR
 from mfvpr.networks import SelaVpr
@@ -114,6 +116,13 @@ def test_all_searches_give_the_same_rows(monkeypatch):
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_every_benchmark_is_a_module(name):
     assert callable(import_module(f"experiments.benchmark.{name}").run)
+
+
+def test_the_file_of_others_stays(tmp_path):
+    """It is refused before the work."""
+    (tmp_path / "precious.json").write_text("{}")
+    with pytest.raises(InputError, match="expected a new file"):
+        run_benchmark("scores", 1, tmp_path / "precious.json")
 
 
 def test_help_needs_no_jax():

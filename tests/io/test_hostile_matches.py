@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.io import Images, open_features, open_matches
-from tests.io.checks import one_line_error
+from mfvpr.io import Images, h5, npz, open_features, open_matches
+from tests.io.checks import memory_below, one_line_error
 from tests.io.match_files import DATABASE, POINTS, QUERIES, SIZE, npz_folder, pair_of, side, write_hloc
+
+SUPERGLUE = {"keypoints0": POINTS, "keypoints1": POINTS, "matches": [0, -1, 2]}
 
 
 @pytest.mark.parametrize(
@@ -32,6 +34,14 @@ from tests.io.match_files import DATABASE, POINTS, QUERIES, SIZE, npz_folder, pa
         ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
         ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "was given"),
         ({"points0": POINTS, "points1": POINTS, "im_size": np.nan}, "was given"),
+        ({"points0": "text", "points1": "text"}, "expected numbers"),
+        ({"points0": 3.0, "points1": 3.0, "confidence": 1.0}, r"points \(x, y\)"),
+        (SUPERGLUE | {"match_confidence": [0.5, 0.5]}, r"match_confidence \[N\]"),
+        (SUPERGLUE | {"matches": 0}, r"matches \[N\]"),
+        (SUPERGLUE | {"matches": [0, 1]}, r"matches \[N\]"),
+        (SUPERGLUE | {"matches": [0.0, 1, 2]}, "matches of integers"),
+        (SUPERGLUE | {"keypoints0": [0, 1, 2]}, r"keypoints0 \[N, 2\]"),
+        (SUPERGLUE | {"keypoints1": 1}, r"keypoints1 \[M, 2\]"),
     ],
 )
 def test_hostile_npz(tmp_path, arrays, message):
@@ -65,6 +75,8 @@ def test_hostile_results_of_vismatch(tmp_path, monkeypatch):
         ("matched_kpts1", [1, 2], "points"),
         ("matched_kpts1", None, "expected points0"),
         ("im_size", [64, 64, 64], "im_size"),
+        ("im_size", 10**400, "im_size"),
+        ("matched_kpts0", "text", "expected numbers"),
     ]:
         torch_file(folder / "output_0_result.torch", {**result, key: value})
         with one_line_error(message):
@@ -146,12 +158,33 @@ def changed_database(tools, tmp_path, *statements):
         ("UPDATE cameras SET width = 3", "image of 3"),
         ("UPDATE cameras SET width = 'wide'", "size of an image"),
         ("UPDATE keypoints SET data = zeroblob(length(data) - 8), rows = 1", "bytes"),
+        ("ALTER TABLE matches ADD COLUMN more BLOB AS (zeroblob(1000000000))", "generated"),
     ],
 )
 def test_hostile_colmap(tools, tmp_path, statement, message):
     path = changed_database(tools, tmp_path, "PRAGMA foreign_keys = OFF", statement)
     with one_line_error(message):
         open_matches(path, side("queries/", QUERIES), side("database/", DATABASE)).read(0, [0, 1])
+
+
+@pytest.mark.parametrize("file", ["pairs/q1_d1.npz", "m.h5"])
+def test_an_array_that_grows_without_limit_is_not_read(tmp_path, monkeypatch, file):
+    monkeypatch.setattr(npz if file.endswith("npz") else h5, "MAX_INFLATED", 1 << 20)
+    (tmp_path / "pairs").mkdir()
+    for count, grows in ((100, False), (200_000, True)):
+        points = np.zeros((count, 2), np.float32)
+        if file == "m.h5":
+            with h5py.File(tmp_path / file, "w") as content:
+                for name in ("keypoints0", "keypoints1"):
+                    content.create_dataset(f"q1.jpg/d1.jpg/{name}", data=points, compression="gzip")
+        else:
+            np.savez_compressed(tmp_path / file, points0=points, points1=points)
+        path = tmp_path / file if file == "m.h5" else tmp_path / "pairs"
+        if not grows:
+            assert len(pair_of(path, image_size=SIZE).mask) == count
+            continue
+        with one_line_error("at most 1 GiB", file), memory_below(5 << 20):
+            pair_of(path, image_size=SIZE)
 
 
 def test_colmaps_database_is_not_touched(tools, tmp_path):

@@ -73,6 +73,15 @@ def test_missing_pairs_are_one_warning(tools, tool, missing):
         open_tool(tools, tool).warnings(Shortlist(indices, 0.0 * indices, indices >= 0))
 
 
+def test_of_both_orders_of_a_pair_that_of_query_and_database_counts(tmp_path):
+    for place, (first, second) in enumerate((("d1.jpg", "q1.jpg"), ("q1.jpg", "d1.jpg"))):
+        names = {"img0_path": first, "img1_path": second}
+        npz_folder(tmp_path, f"{place}.npz", points0=POINTS + place, points1=POINTS + 2, **names)
+    matches = pair_of(tmp_path / "pairs", image_size=SIZE)
+    np.testing.assert_array_equal(matches.points0, POINTS + 1)
+    np.testing.assert_array_equal(matches.points1, POINTS + 2)
+
+
 def test_names_without_prefixes_are_identified_by_the_folders_of_the_images(tools):
     """Queries and database images have the same names; their folders tell them apart."""
     sides = [Images(QUERIES, [f"/data/set/{folder}/{name}" for name in QUERIES], size=lambda row: SIZE)

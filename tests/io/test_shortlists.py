@@ -1,6 +1,7 @@
 """Shortlists: pairs of hloc and kapture, predictions in npz."""
 
 import os
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError, Ranking, Shortlist
 from mfvpr.io import read_shortlist, reranked_shortlist, write_shortlist
-from tests.io.checks import one_line_error
+from tests.io.checks import memory_below, one_line_error
 
 QUERIES = ["q/1.jpg", "q/2.jpg", "q/my query.jpg"]
 DATABASE = ["d/1.jpg", "d/2.jpg", "d/my place.jpg", "d/x, y.jpg"]
@@ -166,6 +167,19 @@ def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
     np.savez(tmp_path / "p.npz", **arrays)
     with one_line_error(message, "p.npz"):
         read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
+
+
+@pytest.mark.parametrize("line", ["a " * 20_000, "a," * 20_000, "q, " + "x " * 90 + " " * 9_000 + ",y z"])
+def test_a_long_line_takes_no_time(tmp_path, line):
+    """Every split of it is tried."""
+    (tmp_path / "p.txt").write_text(f"# {line}\n{line}\n")
+    start = time.perf_counter()
+    with (
+        one_line_error("line 2: expected the names of a query and a database image", "p.txt"),
+        memory_below(20_000_000),
+    ):
+        read_shortlist(tmp_path / "p.txt", QUERIES, DATABASE)
+    assert time.perf_counter() - start < 2
 
 
 def test_not_a_file(tmp_path):

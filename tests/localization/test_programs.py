@@ -314,6 +314,19 @@ def test_a_drive_finds_where_it_was_before(twice, small_street, tmp_path, build_
     assert len(Map.open(tmp_path / "map")) == 19
 
 
+def test_a_prediction_is_printed_even_if_the_image_cannot_be_added(folder, small_street, call_program, monkeypatch):
+    def fail(*_):
+        raise InputError("the disk is full")
+
+    monkeypatch.setattr(Map, "add_described", fail)
+    image = small_street / "queries" / "0003.png"
+    stdout, stderr = call_program("localize", f"map={folder}", f"images={image}", "add=true", code=2)
+    [line] = map(json.loads, stdout.splitlines())
+    assert line["place"] in NAMES
+    assert "added" not in line
+    assert stderr.splitlines()[-1] == "error: the disk is full"
+
+
 def test_a_drive_that_was_interrupted_goes_on(twice, folder, localize):
     other, settings = shutil.copytree(folder, folder.parent / "other"), ("add=true", "recent=2")
     uninterrupted, _ = localize(twice, *settings)
@@ -356,7 +369,7 @@ def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
     with lock_map(folder):
         lines, stderr = localize(twice, "add=true", code=2)
-    assert lines == []
+    assert [(line["image"], "added" in line) for line in lines] == [(f"{twice}/00.png", False)]
     assert "in use by process" in stderr
     assert stderr.count("\n") == 1
 

@@ -59,6 +59,16 @@ class Counting:
         return points, points + self.shift, np.array([0.5, 1, 1, 0.25])
 
 
+class Sparse:
+    """A tensor that a library does not export."""
+
+    def __dlpack_device__(self):
+        return 1, 0
+
+    def __dlpack__(self, **_):
+        raise BufferError("no layout but strided")
+
+
 def test_a_function_of_features_gives_the_matches_of_the_same_matcher_in_jax(dataset):
     data = few(dataset)
     ours, theirs = (
@@ -180,7 +190,8 @@ def test_pairs_without_matches_score_0(dataset):
         ((np.full((4, 2), np.nan), np.zeros((4, 2))), "finite"),
         ((np.zeros((4, 2)), np.zeros((4, 2)), np.full(4, 3.0)), "0 to 1"),
         ({"points": 3}, "matched_kpts0"),
-        (([[1.0], [2.0, 3.0]], np.zeros((2, 2))), "different lengths"),
+        (([[1.0], [2.0, 3.0]], np.zeros((2, 2))), "expected dense arrays"),
+        ((Sparse(), np.zeros((4, 2))), r"expected dense arrays, got others \(no layout"),
     ],
 )
 def test_wrong_results_of_a_function(dataset, result, message):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mfvpr import InputError
 from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import line_chart
@@ -27,6 +28,14 @@ def test_a_long_name_leaves_the_figure_as_large(tmp_path):
     short, long = (draw(tmp_path / f"{len(name)}.png", name) for name in ("x" * 30, "x" * 200))
     assert (short < 20).sum() == pytest.approx((long < 20).sum(), rel=0.1)  # of the images
     assert long.shape[1] == pytest.approx(short.shape[1], rel=0.1)
+
+
+def test_a_figure_replaces_only_a_figure(tmp_path):
+    assert draw(tmp_path / "a.png", "name").shape == draw(tmp_path / "a.png", "name").shape
+    Image.fromarray(QUERY).save(tmp_path / "query.png")
+    with pytest.raises(InputError, match=r"query\.png: expected a new file"):
+        draw(tmp_path / "query.png", "name")
+    np.testing.assert_array_equal(Image.open(tmp_path / "query.png"), QUERY)
 
 
 def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path):

@@ -119,6 +119,15 @@ def test_the_same_folder_is_the_same_page(run, tmp_path):
     assert write_report(write_run(tmp_path / "again"), tmp_path / "third.html").read_bytes() == first
 
 
+def test_a_page_replaces_only_a_page(run, tmp_path):
+    assert write_report(run, tmp_path / "page.html") == write_report(run, tmp_path / "page.html")
+    (tmp_path / "query.jpg").write_bytes(b"precious")
+    for write in (lambda path: write_report(run, path), lambda path: write_comparison([run], path)):
+        with pytest.raises(InputError, match=r"query\.jpg: expected a new file"):
+            write(tmp_path / "query.jpg")
+    assert (tmp_path / "query.jpg").read_bytes() == b"precious"
+
+
 def test_recall_and_its_intervals_are_those_of_the_files(page):
     table = page.rows[: len(SYSTEMS) + 1]
     assert table[0] == ["system", "R@1 ±2", "R@1 ±2, 95 %"]

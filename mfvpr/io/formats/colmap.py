@@ -82,8 +82,9 @@ class ColmapPairs(PairReader):
             database.execute("PRAGMA trusted_schema = OFF")
             kinds = dict(database.execute("SELECT name, type FROM sqlite_master"))
             for table in ("images", "cameras", "keypoints", self._table):
-                if kinds.get(table) != "table":
-                    raise InputError(f"expected COLMAP's table {table}, got none")
+                columns = database.execute(f"PRAGMA table_xinfo({table})").fetchall()
+                if kinds.get(table) != "table" or any(is_hidden for *_, is_hidden in columns):
+                    raise InputError(f"expected COLMAP's table {table}, without generated columns, got none")
             yield database
 
 

@@ -17,7 +17,8 @@ _NUMBERS = {"float32": "<f4", "float64": "<f8", "float": "<f8"}  # types of keyp
 class KapturePairs(PairReader):
     """Reader of `reconstruction/matches/TYPE` with `reconstruction/keypoints/TYPE`.
 
-    `path` is kapture's root, or a folder of matches if there are several types.
+    `path` is kapture's root, or a folder of matches if there are several types. Keypoints are taken as they are: their
+    pixel centers are at whole numbers from extractors such as R2D2, and at half pixels if kapture has them from COLMAP.
     """
 
     by_number, has_confidences = True, True

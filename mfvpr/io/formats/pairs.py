@@ -58,7 +58,7 @@ class PairReader:
         raise NotImplementedError
 
     def keypoints(self, image: str) -> Float[np.ndarray, "keypoints 2"] | None:
-        """Keypoints (x, y) of an image, px, pixel centers at whole numbers; None = the file has no keypoints."""
+        """Keypoints (x, y) of an image, px, pixel centers at whole numbers (but see kapture); None = no keypoints."""
         return None
 
     def image_size(self, image: str) -> Size | None:
@@ -71,5 +71,5 @@ class PairReader:
 
     def find_confidences(self, pairs: Sequence[Pair]) -> bool:
         """Whether the first of the pairs that has matches has confidences."""
-        real = (matches for matches in self.read(pairs) if len(matches.first))
+        real = (matches for matches in self.read(pairs) if matches.first.size)
         return next((matches.confidence is not None for matches in real), False)

@@ -63,7 +63,7 @@ class DataUnpickler(_Unpickler):
             return super().load()
         except (InputError, OSError):
             raise
-        except Exception as error:  # the unpickler raises what its lists, `struct` and codecs raise
+        except Exception as error:  # a damaged file makes the unpickler raise what lists, `struct` and codecs raise
             raise ValueError("damaged pickle") from error
 
     def find_class(self, module: str, name: str) -> Name:

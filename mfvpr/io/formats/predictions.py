@@ -38,13 +38,13 @@ def read_predictions(path: Path) -> tuple[str, list[str]]:
     return parts[QUERY][0], parts[PREDICTIONS]
 
 
-def read_num_inliers(path: Path) -> list[int]:
+def read_num_inliers(path: Path) -> list[float]:
     """Numbers of inliers of a query with its predictions, in their order; raises as `_read_results`."""
     results = _read_results(path)
     with reading(path, mend=_MEND):
         if not all(_INLIERS in result for result in results):
             raise InputError(f"expected {_INLIERS} of each prediction, got results without")
-        return [natural_number(result[_INLIERS]) for result in results]
+        return [float(natural_number(result[_INLIERS])) for result in results]
 
 
 class PredictionPairs(PairReader):

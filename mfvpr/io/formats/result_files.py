@@ -127,8 +127,12 @@ def result_matches(file: Path, parts: Parts, verified: bool) -> FileMatches:
     if verified or keypoints0 is None or keypoints1 is None or numbers is None:
         expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
         raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")
-    if numbers.shape != keypoints0.shape[:1] or numbers.dtype.kind not in "iu":
-        raise InputError(f"{file}: expected matches [{len(keypoints0)}] of integers, got {list(numbers.shape)}")
+    shapes = [values.shape for values in (keypoints0, keypoints1, numbers, confidence) if values is not None]
+    if [*map(len, shapes)] != [2, 2, 1, 1][: len(shapes)] or len({shape[0] for shape in (shapes[0], *shapes[2:])}) > 1:
+        raise InputError(f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N], match_confidence [N], "
+                         f"got {', '.join(map(str, shapes))}")  # fmt: skip
+    if numbers.dtype.kind not in "iu":
+        raise InputError(f"{file}: expected matches of integers, got {numbers.dtype}")
     real = numbers >= 0
     if (numbers < -1).any() or (numbers >= len(keypoints1)).any():
         raise InputError(f"{file}: expected matches from -1 to {len(keypoints1) - 1}, got others")
@@ -144,6 +148,6 @@ def _sizes(file: Path, parts: Parts) -> tuple[Size, Size] | None:
         return None
     try:
         (size0, size1) = (np.broadcast_to(np.asarray(size, np.float64), 2) for size in sizes)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(f"{file}: expected image_size0 and image_size1 (width, height), or im_size, px") from None
     return (float(size0[0]), float(size0[1])), (float(size1[0]), float(size1[1]))

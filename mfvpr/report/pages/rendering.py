@@ -11,17 +11,19 @@ from typing import Any
 
 from PIL import Image
 
+from mfvpr.datasets.images import open_image
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.pages.charts import Chart
 from mfvpr.report.pages.files import Prediction
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import require_replaceable, write_text
 
 # Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
 PAGE = "report.html"  # in a run folder
 MOST_PICTURES = 60
 _WIDTH, _QUALITY = 1000, 75  # px of a picture, of JPEG: some 60 kB each
+_POLICY = b"default-src 'none'; script-src "  # at the start of every page
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
@@ -77,8 +79,10 @@ class Section:
 def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
     """Write one HTML file that needs no other; the same bytes for the same values.
 
-    `words` stand below the title; `facts` are the most important values, by name.
+    `words` stand below the title; `facts` are the most important values, by name. An earlier page is replaced; an
+    InputError for other files.
     """
+    require_replaceable(path, _POLICY)
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
@@ -118,7 +122,7 @@ def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
     paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
     for path in paths[:: max(1, -(-len(paths) // most))]:
         try:
-            with Image.open(path) as image:
+            with open_image(path) as image:
                 image.load()
                 small = image.convert("RGB")
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:

@@ -97,6 +97,7 @@ class Malicious:
         ([result(1)] * 5, "expected results of at most 4 predictions, as in the text file, got 5"),
         ([result(1), {"H": None}], "expected num_inliers of each prediction"),
         ([result(1) | {"num_inliers": -1}], "expected at least 0, got -1"),
+        ([result(1) | {"num_inliers": 10**400}], "too large"),
         ([result(1) | {"num_inliers": 1.5}], "expected int, got float"),
         ({"num_inliers": 3}, "expected list, got dict"),
         ([3], "expected dict, got int"),

@@ -1,0 +1,26 @@
+"""The folder of the paper's evaluation: nothing of others is removed from it."""
+
+import pytest
+
+from experiments.paper.runs import lock_output
+from mfvpr.systems.settings import SettingsError
+
+
+@pytest.mark.parametrize("others", [["figures"], ["runs", "figures", "thesis.tex"]])
+def test_a_folder_with_files_of_others_is_refused(tmp_path, others):
+    for name in others:
+        (tmp_path / name).mkdir()
+    with (
+        pytest.raises(SettingsError, match="expected a new or empty folder, or one of this program"),
+        lock_output(tmp_path),
+    ):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {*others}
+
+
+@pytest.mark.parametrize("earlier", [[], ["runs"], ["runs", "tables", "figures", "report.html", ".DS_Store"]])
+def test_a_new_folder_and_an_earlier_output_are_not(tmp_path, earlier):
+    for name in earlier:
+        (tmp_path / name).mkdir()
+    with lock_output(tmp_path):
+        pass
