@@ -187,6 +187,9 @@ def searching(queries: int, images: int, dimension: int) -> Timed:
     return calls, 2 * queries * images * dimension / 1e12, "TFLOP"
 
 
+_network, _images = cache(networks.make_network), cache(networks.make_images)
+
+
 def network(batch: int, *, step: str) -> Timed:
     """A network, from images on the host to features on the host; a dense map stays on the device."""
     contest = next(contest for contest in networks.contests() if contest.step == step)
@@ -198,9 +201,6 @@ def network(batch: int, *, step: str) -> Timed:
         entries = networks.torch_entries(contest, arrays, images, (batch,))
         calls |= {name: call for _, name, call in entries if "channels last" not in name}
     return calls, batch * GIGAFLOPS[contest.checkpoint] / 1e3, "TFLOP"
-
-
-_network, _images = cache(networks.make_network), cache(networks.make_images)
 
 
 def ranking(queries: int, candidates: int, keypoints: int, dimension: int) -> Timed:
