@@ -299,7 +299,7 @@ def _extractor(system: System) -> Extractor:
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.cohort is not None or system.correlated or system.sequences:
         raise InputError("a map ranks single images: expected a system without cohort, frame correlation and "
-                         "sequences; mfvpr.localization.Route follows a drive")  # fmt: skip
+                         "sequences; mfvpr.Route follows a drive")  # fmt: skip
     return extractor
 
 
