@@ -28,7 +28,7 @@ from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_
 from mfvpr.localization.declaration import check_declaration, fit_to_map, read_system
 from mfvpr.localization.describing import Described, Image, is_file, load
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
-from mfvpr.localization.matching import match_and_score, shift_of
+from mfvpr.localization.matching import match_and_score, padded_size, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
 from mfvpr.matching.host import PairSource
@@ -95,6 +95,7 @@ class Map(MapImages):
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.threshold = threshold
         self._noise_scores: dict[int, float] = {}  # by the number of rows
+        self._typical = extractor.scales[0].typical_count
         keep_compiled_programs()
         super().__init__(folder, system, extractor, describer, memory=runtime.memory)
 
@@ -192,12 +193,20 @@ class Map(MapImages):
 
     @exclusive
     def warm_up(self) -> None:
-        """Compile what the first `localize` needs; the map stays as it is. An empty map raises an `InputError`."""
+        """Compile what `localize` needs for images with as many keypoints as those of the map, which stays as it is.
+
+        An empty map raises an `InputError`.
+        """
         described = self._refresh_images()
-        _, vector = described.describing.image(noise_image())
-        rows, _ = self._vectors.nearest(vector, 1)
-        for _, features in described.rows.features(rows.tolist()):  # its own best candidate: nothing is left out
-            self._localize(described, (features, vector), self._vectors.total, self.extractor.image_size, None)
+        described.describing.image(noise_image())
+        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        counts = enumerate(described.rows.counts(range(self._vectors.total)).tolist())
+        rows = {padded_size(count, self._typical): row for row, count in counts if count >= 0}  # one of each size
+        images = described.resident.read([*rows.values()])
+        for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
+            match_and_score(features, images, matcher, self.system.scorers, self._typical)
+            description = features, self._vectors[row]
+            self._localize(described, description, self._vectors.total, self.extractor.image_size, None)
 
     def _refresh_images(self) -> DescribedMap:
         self.refresh()
@@ -218,8 +227,7 @@ class Map(MapImages):
             return refusal("no candidates", description, size[0])
         rows, similarities, matches, scores = matched
         ranking, by_retrieval = self._rank(rows, similarities, scores)
-        [place] = np.flatnonzero(rows == ranking.rows[0, 0])
-        best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
+        best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
         [score], noise = evidence_scores(best), self._noise_score(described, end)
         if reason := reason_against(best.mask.sum(), score, noise):
             return refusal(reason, description, size[0])
@@ -241,15 +249,15 @@ class Map(MapImages):
 
     def _match(
         self, described: DescribedMap, description: Described, end: int, scorers: Mapping[str, Scorer]
-    ) -> tuple[np.ndarray, np.ndarray, Matches, dict[str, np.ndarray]] | None:
+    ) -> tuple[np.ndarray, np.ndarray, list[Matches], dict[str, np.ndarray]] | None:
         """Candidates before `end`, their similarities, matches and scores; None without candidates."""
         features, vector = description
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return None
-        arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
-        return rows, similarities, *match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
+        candidates = described.resident.read(rows.tolist())
+        return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
 
     def _noise_score(self, described: DescribedMap, end: int) -> float:
         """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
@@ -257,7 +265,7 @@ class Map(MapImages):
         if end not in self._noise_scores:
             descriptions = map(described.describing.image, noise_images(self.extractor.image_size))
             parts = [self._match(described, description, end, {}) for description in descriptions]
-            scores = [evidence_scores(matches)[: len(rows)] for rows, _, matches, _ in filter(None, parts)]
+            scores = [evidence_scores(pair)[0] for _, _, matches, _ in filter(None, parts) for pair in matches]
             self._noise_scores[end] = float(np.max(scores, initial=0))
         return self._noise_scores[end]
 
