@@ -186,7 +186,8 @@ def dominant_shifts(
     Returns:
         Refined dominant shifts (candidate minus query), their 95 % intervals (low, high), and the scales; NaN if no
         match votes. Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of
-        the resized query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they refer.
+        the resized query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to
+        whose px they refer.
     """
     fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)))]

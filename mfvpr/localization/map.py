@@ -32,7 +32,7 @@ from mfvpr.localization.matching import match_and_score, padded_size, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
 from mfvpr.matching.host import PairSource
-from mfvpr.reranking.confidence import Confidence
+from mfvpr.reranking.confidence import REFUSALS, Confidence
 from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
@@ -188,8 +188,12 @@ class Map(MapImages):
         localized = self._localize(described, description, end, pixels.shape[1::-1], reason)
         if route is None:
             return localized
-        located = route(localized.prediction, self.there[:end])
-        return localized._replace(prediction=replace(localized.prediction, located=located))
+        refusals = REFUSALS if self.confidence is None else self.confidence.refusals
+        located = route(localized.prediction, self.there[:end], refusals)
+        prediction = replace(localized.prediction, located=located)
+        if located is not None and located.row is None:
+            prediction = prediction.without_place("off the map")
+        return localized._replace(prediction=prediction)
 
     @exclusive
     def warm_up(self) -> None:
@@ -242,9 +246,7 @@ class Map(MapImages):
             alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
         )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
-            prediction = replace(
-                prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
-            )
+            prediction = prediction.without_place("low confidence")
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _match(
