@@ -50,7 +50,7 @@ def run(drives: list[str]) -> None:
     system, cache = load_system("mfvpr"), FeatureCache()
     folders = {name: paths.split(":") for name, _, paths in (drive.partition("=") for drive in drives)}
     datasets = {name: folder(*paths, ground_truth="order") for name, paths in folders.items()}
-    data = {name: data_of_drive(dataset, system, cache) for name, dataset in datasets.items()}
+    data = {name: data_of_drive(dataset, system, cache)[0] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = {}
     for place, other in itertools.permutations(folders, 2):

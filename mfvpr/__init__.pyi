@@ -53,6 +53,7 @@ from .utils.cluster import Cluster
 from .utils.runtime import Runtime
 from .report.results import Result, evaluate
 from .localization.map import Map
+from .localization.route import Drive, Route
 
 # programs without Python
 from .deployment.folders import export, load_exported
@@ -120,6 +121,8 @@ __all__ = [
     "Result",
     "evaluate",
     "Map",
+    "Drive",
+    "Route",
     "export",
     "load_exported",
     "ExportShapes",

@@ -131,7 +131,7 @@ class _Drive:
         if self._route is None or located is None:
             return {} if self._route is None else {"route": None}
         numbers = {"p": round(located.p, 4), "advance": round(located.advance, 2), "off": round(located.off, 4)}
-        return {"route": {"place": self._map.place(located.row)} | numbers}
+        return {"route": {"place": located.row if located.row is None else self._map.place(located.row)} | numbers}
 
 
 class _LocalizationFigures:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth
-from mfvpr.reranking.confidence import APART, INPUTS, Confidence, Input, confidence_inputs
+from mfvpr.reranking.confidence import APART, INPUTS, REFUSALS, Confidence, Input, confidence_inputs
 from mfvpr.reranking.results import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
@@ -157,7 +157,9 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
         raise InputError(f"{path}: expected {expected} ({reason}); {fix}") from error
 
 
-def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list[float]) -> Confidence:
+def _confidence(
+    *, inputs: list[Input], apart: int, bias: float, refusals: Sequence[float] = REFUSALS, **vectors: list[float]
+) -> Confidence:
     arrays = [np.array(vectors.pop(name)) for name in ("center", "scale", "weights")]
     if any(array.dtype.kind not in "fi" for array in arrays):
         raise ValueError("expected lists of numbers")
@@ -167,6 +169,7 @@ def _confidence(*, inputs: list[Input], apart: int, bias: float, **vectors: list
     known = set(inputs) <= {"margin", "height", "retrieval", "score"}
     once = len({*inputs}) == len(inputs) and type(apart) is int and apart >= 0
     fitted = np.isfinite(numbers).all() and min(scale, default=0) > 0 and min(weights) >= 0
-    if vectors or not (same and known and once and fitted):
+    on, off = refusals
+    if vectors or not (same and known and once and fitted and 0 < on <= 1 and 0 < off <= 1):
         raise ValueError("values that make no model")
-    return Confidence(tuple(inputs), apart, center, scale, weights, float(bias))
+    return Confidence(tuple(inputs), apart, center, scale, weights, float(bias), (float(on), float(off)))

@@ -37,7 +37,7 @@ from mfvpr.utils.runtime import Runtime
 KS = (1, 5, 10)  # depths of recall, by default
 Reason = Literal[  # why there is no place
     "no candidates", "overexposed", "blurred", "too few features", "too few matches", "no better than noise",
-    "low confidence",
+    "low confidence", "off the map",
 ]  # fmt: skip
 
 Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer

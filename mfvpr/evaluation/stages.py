@@ -34,8 +34,8 @@ __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match"
 
 SHIFTS_AT_ONCE = 64  # pairs
 STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's sides: near and far
-# things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
+# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's longer side: near and
+# far things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
 SHIFT_FLOOR = 0.03
 WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
 Limits = tuple[float | None, Sequence[Device] | None]  # of memory, GB, and devices
@@ -185,8 +185,9 @@ def dominant_shifts(
 
     Returns:
         Refined dominant shifts (candidate minus query), their 95 % intervals (low, high), and the scales; NaN if no
-        match votes. Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR`, in
-        quadrature. At last the sizes (width, height) of the resized queries, to whose px they refer.
+        match votes. Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of
+        the resized query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to
+        whose px they refer.
     """
     fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)))]
@@ -222,13 +223,13 @@ def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Ar
             shifts = -shifts[jnp.array([0, 2, 1])]
         offset = (at_least_single(pair.image_size1) - at_least_single(pair.image_size0))[None] / 2  # of the centers
         shifts = jnp.where(votes, offset + jnp.sqrt(scale) * (shifts - offset), 0.0)
-        interval = _widened(shifts[1:], SHIFT_FLOOR * at_least_single(pair.image_size0))
+        interval = _widened(shifts[1:], SHIFT_FLOOR * at_least_single(pair.image_size0).max())
         return votes, shifts[0], interval, jnp.where(votes, scale, 0.0)
 
     return jax.vmap(of_pair)(matches)
 
 
-def _widened(interval: Float[Array, "2 2"], floor: Float[Array, "2"]) -> Float[Array, "2 2"]:
+def _widened(interval: Float[Array, "2 2"], floor: Float[Array, ""]) -> Float[Array, "2 2"]:
     """An interval (low, high) whose half widths, (x, y), are added to `floor` in quadrature."""
     low, high = interval
     half = jnp.sqrt(((high - low) / 2) ** 2 + floor**2)

@@ -8,7 +8,7 @@
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
 Read first: map (localize one image), images (the images of a map, and how they are added), predictions. Then their
-parts: vocabulary, describing, vectors, matching, resident (features on the device), strength (of a map's images),
+parts: vocabulary, describing, vectors, matching, resident (features in memory), strength (of a map's images),
 declaration and calibration (what a map keeps in its folder), route (a drive through a map).
 """
 

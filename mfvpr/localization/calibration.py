@@ -1,33 +1,60 @@
 """The confidence of a map: fitted on a drive whose places are known, and kept in the folder of the map."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.truth import middle
-from mfvpr.evaluation.calibration import CalibrationData, calibration_data, read_confidences, write_confidences
+from mfvpr.evaluation.calibration import (
+    CalibrationData,
+    absent_rankings,
+    calibration_data,
+    read_confidences,
+    write_confidences,
+)
 from mfvpr.evaluation.evaluation import rank_dataset
+from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.evaluation.system import System
-from mfvpr.reranking.confidence import Confidence
-from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.reranking.confidence import REFUSALS, Confidence
+from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 _FILE = "confidence.json"
+_USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
 _LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
 
 
-def data_of_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> CalibrationData:
-    """Evaluate a system on a data set: what the confidence of the ranking that decides is fitted on."""
-    sequence = dataset.only
-    if sequence.truth is None:
+def data_of_drive(
+    dataset: Dataset, system: System, cache: FeatureCache | None
+) -> tuple[CalibrationData, tuple[float, float]]:
+    """Evaluate a system on a data set: what the confidence of the ranking that decides is fitted on.
+
+    Also the shares of images without enough evidence, see `Confidence.refusals`.
+    """
+    truth, cache = dataset.only.truth, cache or FeatureCache()
+    if truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
-    result = rank_dataset(dataset, system, cache=cache)
+    result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
     [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-    return calibration_data(ranked, by_retrieval, sequence.truth, middle(sequence.truth.thresholds()))
+    absent, _ = absent_rankings(ranked, by_retrieval, truth, threshold)
+
+    def refused(rankings: Ranked) -> Bool[np.ndarray, " queries"]:
+        [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
+        return np.array([reason is not None for reason in reasons])
+
+    shown, has_absent = truth.positives(threshold).counts > 0, absent.rows[:, 0] >= 0
+    of_queries = refused(ranked)
+    parts = of_queries[shown], np.concatenate([of_queries[~shown], refused(absent)[has_absent]])
+    shares = [
+        (np.sum(part) + _USUAL * usual) / (len(part) + _USUAL) for part, usual in zip(parts, REFUSALS, strict=True)
+    ]
+    return calibration_data(ranked, by_retrieval, truth, threshold), (float(shares[0]), float(shares[1]))
 
 
 def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
@@ -35,12 +62,12 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
 
     Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
     """
-    data, queries = data_of_drive(dataset, system, cache), dataset.queries
+    (data, refusals), queries = data_of_drive(dataset, system, cache), dataset.queries
     if not data.num_absent:
         warnings.warn(f"{queries.root}: without the images of a query's place there are no candidates, so that "
                       "places that the map does not show get too high a confidence; calibrate on a longer drive",
                       stacklevel=3)  # fmt: skip
-    confidence = data.fit()
+    confidence = replace(data.fit(), refusals=refusals)
     probabilities = confidence.probability(data.present)
     if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
         warnings.warn(f"{queries.root}: scores do not tell correct predictions ({data.correct.sum()} of "

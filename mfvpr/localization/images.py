@@ -46,7 +46,7 @@ def exclusive(method: Method) -> Method:
 
 
 class DescribedMap(NamedTuple):
-    """The parts of a map that depend on its describer: descriptions, rows on disk and on the device, mean strength."""
+    """The parts of a map that depend on its describer: descriptions, rows on disk and in memory, mean strength."""
 
     describing: Describing
     rows: MapRows
@@ -72,7 +72,7 @@ class MapImages:
         self._vectors = Vectors()
         self._entries: dict[int, Entry] = {}  # without vectors
         self._row_of_name: dict[str, int] = {}
-        self._resident_options = {"candidates": self.candidates, "memory": memory}
+        self._memory = memory
         self._settings = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
         self._has_settings = False  # whether these settings are known to be the folder's
         self._lock = threading.RLock()
@@ -256,9 +256,7 @@ class MapImages:
         """Open the rows, which are described by `describer`."""
         describing = Describing(self.extractor, describer)
         rows = MapRows(self.folder, describing.recipe)
-        typical = self.extractor.scales[0].typical_count
-        resident = Resident(rows, typical=typical, **self._resident_options)
-        self._described = DescribedMap(describing, rows, resident, MapStrength(rows))
+        self._described = DescribedMap(describing, rows, Resident(rows, self._memory), MapStrength(rows))
 
     def _open_parts(self) -> DescribedMap:
         if self._described is None:

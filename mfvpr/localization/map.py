@@ -28,11 +28,11 @@ from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_
 from mfvpr.localization.declaration import check_declaration, fit_to_map, read_system
 from mfvpr.localization.describing import Described, Image, is_file, load
 from mfvpr.localization.images import DescribedMap, MapImages, exclusive
-from mfvpr.localization.matching import match_and_score, shift_of
+from mfvpr.localization.matching import match_and_score, padded_size, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
 from mfvpr.matching.host import PairSource
-from mfvpr.reranking.confidence import Confidence
+from mfvpr.reranking.confidence import REFUSALS, Confidence
 from mfvpr.reranking.fusion import rank_by_scores
 from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.retrieval.retriever import Retrieval
@@ -95,6 +95,7 @@ class Map(MapImages):
             raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
         self.threshold = threshold
         self._noise_scores: dict[int, float] = {}  # by the number of rows
+        self._typical = extractor.scales[0].typical_count
         keep_compiled_programs()
         super().__init__(folder, system, extractor, describer, memory=runtime.memory)
 
@@ -187,17 +188,29 @@ class Map(MapImages):
         localized = self._localize(described, description, end, pixels.shape[1::-1], reason)
         if route is None:
             return localized
-        located = route(localized.prediction, self.there[:end])
-        return localized._replace(prediction=replace(localized.prediction, located=located))
+        refusals = REFUSALS if self.confidence is None else self.confidence.refusals
+        located = route(localized.prediction, self.there[:end], refusals)
+        prediction = replace(localized.prediction, located=located)
+        if located is not None and located.row is None:
+            prediction = prediction.without_place("off the map")
+        return localized._replace(prediction=prediction)
 
     @exclusive
     def warm_up(self) -> None:
-        """Compile what the first `localize` needs; the map stays as it is. An empty map raises an `InputError`."""
+        """Compile what `localize` needs for images with as many keypoints as those of the map, which stays as it is.
+
+        An empty map raises an `InputError`.
+        """
         described = self._refresh_images()
-        _, vector = described.describing.image(noise_image())
-        rows, _ = self._vectors.nearest(vector, 1)
-        for _, features in described.rows.features(rows.tolist()):  # its own best candidate: nothing is left out
-            self._localize(described, (features, vector), self._vectors.total, self.extractor.image_size, None)
+        described.describing.image(noise_image())
+        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        counts = enumerate(described.rows.counts(range(self._vectors.total)).tolist())
+        rows = {padded_size(count, self._typical): row for row, count in counts if count >= 0}  # one of each size
+        images = described.resident.read([*rows.values()])
+        for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
+            match_and_score(features, images, matcher, self.system.scorers, self._typical)
+            description = features, self._vectors[row]
+            self._localize(described, description, self._vectors.total, self.extractor.image_size, None)
 
     def _refresh_images(self) -> DescribedMap:
         self.refresh()
@@ -218,8 +231,7 @@ class Map(MapImages):
             return refusal("no candidates", description, size[0])
         rows, similarities, matches, scores = matched
         ranking, by_retrieval = self._rank(rows, similarities, scores)
-        [place] = np.flatnonzero(rows == ranking.rows[0, 0])
-        best = jax.tree.map(lambda leaf: leaf[place : place + 1], matches)
+        best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
         [score], noise = evidence_scores(best), self._noise_score(described, end)
         if reason := reason_against(best.mask.sum(), score, noise):
             return refusal(reason, description, size[0])
@@ -234,22 +246,20 @@ class Map(MapImages):
             alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
         )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
-            prediction = replace(
-                prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
-            )
+            prediction = prediction.without_place("low confidence")
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _match(
         self, described: DescribedMap, description: Described, end: int, scorers: Mapping[str, Scorer]
-    ) -> tuple[np.ndarray, np.ndarray, Matches, dict[str, np.ndarray]] | None:
+    ) -> tuple[np.ndarray, np.ndarray, list[Matches], dict[str, np.ndarray]] | None:
         """Candidates before `end`, their similarities, matches and scores; None without candidates."""
         features, vector = description
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return None
-        arrays, slots = described.resident.hold(rows.tolist(), features, self._vectors.total)
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
-        return rows, similarities, *match_and_score(features, arrays, slots, self.candidates, matcher, scorers)
+        candidates = described.resident.read(rows.tolist())
+        return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
 
     def _noise_score(self, described: DescribedMap, end: int) -> float:
         """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
@@ -257,7 +267,7 @@ class Map(MapImages):
         if end not in self._noise_scores:
             descriptions = map(described.describing.image, noise_images(self.extractor.image_size))
             parts = [self._match(described, description, end, {}) for description in descriptions]
-            scores = [evidence_scores(matches)[: len(rows)] for rows, _, matches, _ in filter(None, parts)]
+            scores = [evidence_scores(pair)[0] for _, _, matches, _ in filter(None, parts) for pair in matches]
             self._noise_scores[end] = float(np.max(scores, initial=0))
         return self._noise_scores[end]
 
@@ -299,7 +309,7 @@ def _extractor(system: System) -> Extractor:
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.cohort is not None or system.correlated or system.sequences:
         raise InputError("a map ranks single images: expected a system without cohort, frame correlation and "
-                         "sequences; mfvpr.localization.Route follows a drive")  # fmt: skip
+                         "sequences; mfvpr.Route follows a drive")  # fmt: skip
     return extractor
 
 

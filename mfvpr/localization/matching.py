@@ -1,62 +1,72 @@
 """Match a query with its candidates on the device, score the matches on all cores, and measure the shift of a pair."""
 
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.evaluation.stages import pair_shifts
 from mfvpr.evaluation.validation import require_finite
-from mfvpr.features.feature_set import stack_features
+from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.matching.matcher import Matcher, match_pairs
 from mfvpr.reranking.ranking import BIN_STEP, score_candidates
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import with_capacity
 from mfvpr.scoring.scorer import Scorer, require_scores
 from mfvpr.types import Features, Matches
-from mfvpr.utils.numerics import available_cpus, device_bytes, knows_own_context, round_up
+from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
 
 Point = tuple[float, float]
 
-_AT_ONCE = 25  # pairs; with ten a prediction takes 8 ms longer
+_AT_ONCE = 8  # pairs: a scorer takes the time of so many, also for a single image of a rare size
+_LEAST = 256  # slots of an image
 
 
 def match_and_score(
-    query: Features, database: Features, slots: Int[np.ndarray, " n"], number: int, matcher: Matcher,
-    scorers: Mapping[str, Scorer],
-) -> tuple[Matches, dict[str, Float[np.ndarray, " n"]]]:  # fmt: skip
-    """Matches `[C, K, ...]` of an unpadded query, and scores by name; no pair's result depends on the other pairs.
+    query: Features, candidates: Sequence[Features], matcher: Matcher, scorers: Mapping[str, Scorer], typical: int
+) -> tuple[list[Matches], dict[str, Float[np.ndarray, " candidates"]]]:
+    """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
 
-    A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes a few pairs at a
-    time. Their number is the same for any number of cores, since the last bits of scores depend on it. A device with
-    memory of its own takes all pairs at once.
-
-    Args:
-        database: `[S, N, ...]` on the device.
-        slots: of the candidates.
-        number: C; beyond n there are no matches. If no score is finite, an InputError is raised.
+    Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
+    on the other pairs. A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes
+    a few pairs at a time. `typical` is a usual number of keypoints, or the detector's limit. If no score is finite, an
+    InputError is raised.
     """
-    padded_query = stack_features([query], database.mask.shape[1], total=1)
-    size = min(number, _AT_ONCE) if device_bytes(database) is None else number
-    pairs = np.zeros((round_up(number, size), 2), np.int32)
-    pairs[: len(slots), 1] = slots
+    padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
+    by_size = defaultdict[int, list[int]](list)
+    for place, candidate in enumerate(candidates):
+        by_size[padded_size(len(candidate.mask), typical)].append(place)
+    parts = [(size, places[start : start + _AT_ONCE]) for size, places in sorted(by_size.items(), reverse=True)
+             for start in range(0, len(places), _AT_ONCE)]  # fmt: skip
 
-    def match_part(start: int) -> tuple[Matches, dict[str, np.ndarray]]:
-        real = np.int32(np.clip(len(slots) - start, 0, size))
-        matches = match_pairs(padded_query, database, pairs[start : start + size], real, matcher)
+    def match_part(part: tuple[int, list[int]]) -> tuple[Matches, dict[str, np.ndarray]]:
+        size, places = part
+        images = stack_features([candidates[place] for place in places], size, total=_AT_ONCE)
+        pairs = np.stack([np.zeros(_AT_ONCE, np.int32), np.arange(_AT_ONCE, dtype=np.int32)], axis=1)
+        matches = match_pairs(padded_query, images, pairs, np.int32(len(places)), matcher)
         return jax.device_get((matches, {name: _scores(scorer, matches) for name, scorer in scorers.items()}))
 
-    workers = min(available_cpus(), len(pairs) // size)
+    workers = min(available_cpus(), len(parts))
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
-    parts = list(map_parts(match_part, range(0, len(pairs), size)))
-    matches, scores = jax.tree.map(lambda *fields: np.concatenate(fields)[:number], *parts)
-    scores = {name: values[: len(slots)] for name, values in scores.items()}
+    matches, scores = {}, {name: np.zeros(len(candidates), np.float32) for name in scorers}
+    for (_, places), (of_part, scores_of_part) in zip(parts, map_parts(match_part, parts), strict=True):
+        for number, place in enumerate(places):
+            matches[place] = jax.tree.map(lambda leaf: leaf[number : number + 1], of_part)  # noqa: B023
+        for name, values in scores_of_part.items():
+            scores[name][places] = values[: len(places)]
     for name, values in scores.items():
         require_finite(name, values)
-    return matches, scores
+    return [matches[place] for place in range(len(candidates))], scores
+
+
+def padded_size(count: int, typical: int) -> int:
+    """Slots for an image: `typical` rounded up, or a power of 2 from 256 on: few sizes, so few programs."""
+    size, typical = 1 << (max(count, _LEAST) - 1).bit_length(), round_up(typical, STEP)
+    return min(size, typical) if typical >= count else size
 
 
 def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:

@@ -13,13 +13,13 @@ from mfvpr.utils.errors import InputError
 class Located(NamedTuple):
     """The position of a robot on a route.
 
-    row: of the map, the most probable one.
+    row: of the map, the most probable one; None = the robot is off the map.
     p: probability that the robot is there or at most 2 rows away.
     advance: mean motion from one image to the next, rows.
     off: probability that the robot is not on the map.
     """
 
-    row: int
+    row: int | None
     p: float
     advance: float
     off: float
@@ -41,7 +41,8 @@ class Prediction:
 
     Attributes:
         place: of the best candidate; None = no place, and `reason` says why.
-        alternatives: all candidates, best first; empty if there is no place for another reason than "low confidence".
+        alternatives: all candidates, best first; empty if there is no place for another reason than "low confidence" or
+            "off the map".
         score: of the best candidate; 0 if there is none.
         confidence: probability that the top prediction is correct; None without a confidence or without candidates.
         shift: (x, y) px of the query image as it was given, from its center to the same point in the best candidate,
@@ -82,6 +83,10 @@ class Prediction:
         focal = self.image_width / 2 / math.tan(math.radians(field_of_view) / 2)
         shift, low, high = (math.degrees(math.atan(x / focal)) for x, _ in (self.shift, *self.shift_interval))
         return shift, low, high
+
+    def without_place(self, reason: Reason) -> "Prediction":
+        """The prediction without place and shift; candidates, score and confidence stay."""
+        return replace(self, place=None, shift=None, shift_interval=None, scale=None, reason=reason)
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with at most `most` alternatives and without the position on a route."""

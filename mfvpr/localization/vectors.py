@@ -23,6 +23,10 @@ class Vectors:
         """D; None = there is no descriptor yet."""
         return self._values.shape[1] if self._values.size else None
 
+    def __getitem__(self, row: int) -> Float[np.ndarray, " dimensions"]:
+        """The descriptor of a row."""
+        return self._values[row]
+
     def put(self, row: int, vector: Float[np.ndarray, " dimensions"]) -> None:
         """Store the descriptor of a row."""
         while row >= len(self._values):

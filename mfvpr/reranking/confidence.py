@@ -16,6 +16,7 @@ from mfvpr.reranking.results import Ranked
 Input = Literal["margin", "height", "retrieval", "score"]
 INPUTS: tuple[Input, ...] = ("margin", "height")  # by default
 APART = 5  # rows of the database, by default
+REFUSALS = 0.2, 0.5  # shares of images without enough evidence, by default
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
 _PRIOR = 2  # added candidates of other places, with the variance of all candidates
 
@@ -74,6 +75,8 @@ class Confidence:
         scale: standard deviation of each input over these data.
         weights: of the inputs in these units.
         bias: log odds at the center.
+        refusals: shares of images without enough evidence for a place (`mfvpr.evaluation.evidence`), of places that the
+            database shows and of absent ones.
     """
 
     inputs: tuple[Input, ...]
@@ -82,6 +85,7 @@ class Confidence:
     scale: tuple[float, ...]
     weights: tuple[float, ...]
     bias: float
+    refusals: tuple[float, float] = REFUSALS
 
     def __call__(self, ranked: Ranked, by_retrieval: Ranked) -> Float[np.ndarray, " queries"]:
         """Probabilities, NaN without a prediction; for the arguments see `confidence_inputs`."""

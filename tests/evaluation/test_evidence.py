@@ -1,12 +1,18 @@
-"""Reasons against images, without a map."""
+"""Reasons against images and predictions, without a map."""
+
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from mfvpr.datasets.images import read_image, resize
-from mfvpr.evaluation.evidence import reason_against_image
+from mfvpr.evaluation.evidence import evidence_against, reason_against_image, strength
 from mfvpr.evaluation.system import noise_image
+from mfvpr.reranking.results import Ranked
+from mfvpr.retrieval import FeatureFiles
+from mfvpr.types import Features, Shortlist
+from tests.builders import make_matches, match_set_of
 
 SIZES = [(320, 320), (160, 120), (512, 192)]
 
@@ -43,3 +49,23 @@ def test_plain_images_are_left_to_the_other_tests():
     assert reason_against_image(np.full((48, 64, 3), 128, np.uint8)) is None
     assert reason_against_image(np.full((48, 64, 3), 255, np.uint8)) == "overexposed"
     assert reason_against_image(np.zeros((2, 2, 3), np.uint8)) is None
+
+
+def test_negative_detection_scores_have_no_strength():
+    scores = np.array([0.5, -3.0, 0.25], np.float32)
+    features = Features(np.zeros((3, 2)), np.zeros((3, 4)), scores, np.ones(3, bool), np.ones(2))
+    assert strength(features) == 0.75
+
+
+def test_the_evidence_is_that_of_the_prediction_whatever_the_order_of_the_retrieval():
+    many, few = (make_matches(np.ones((number, 2)), np.ones((number, 2))) for number in (20, 2))
+    candidates = Shortlist(np.array([[3, 7]]), np.ones((1, 2), np.float32), np.ones((1, 2), bool))
+    matched = SimpleNamespace(sequence=SimpleNamespace(images=range(1)), candidates=candidates, bad_queries={},
+                              matches=[match_set_of([[many, few]], 20)])  # fmt: skip
+    pipeline = SimpleNamespace(image_source="images are matched", extractor=FeatureFiles({}))
+    system = SimpleNamespace(pipeline=pipeline, headline="score")
+    for rows, reason in (([3, 7], None), ([7, 3], "too few matches")):
+        rankings = {"score": [Ranked(np.array([rows]), np.ones((1, 2)))]}
+        ranked = SimpleNamespace(dataset=SimpleNamespace(database=range(9)), system=system, matched=[matched],
+                                 systems=rankings)  # fmt: skip
+        assert evidence_against(ranked, None) == [[reason]]

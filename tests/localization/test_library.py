@@ -8,10 +8,12 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr import InputError, Map
+from mfvpr import InputError, Map, Route
+from mfvpr.datasets import read_image
 from mfvpr.datasets.streets import streets_folder
+from mfvpr.evaluation.system import noise_image
 from mfvpr.features import VladFitting
-from mfvpr.localization import Route
+from mfvpr.reranking.drives import STREETS
 from mfvpr.storage import FeatureCache
 from tests.builders import map_system
 from tests.storage.extractors import SIFT, Counted
@@ -68,6 +70,19 @@ def test_an_image_is_located_on_a_route(street, small_street):
         assert prediction == replace(alone, located=by_hand(alone, street.there[:-2]))
         assert prediction.located is not None
         assert "located" not in prediction.as_json()
+
+
+def test_a_robot_off_the_map_has_no_place(street, small_street):
+    known, drive_route = Map(street.folder, street.system, confidence=STREETS), Route()
+    frames = [read_image(path) for path in sorted((small_street / "database").iterdir())]
+    on_map = [known.localize(image, route=drive_route) for image in frames[:4]]
+    assert [prediction.located.row for prediction in on_map] == [*range(4)]
+    for seed in range(10):
+        prediction = known.localize(noise_image((160, 120), seed=seed), route=drive_route)
+    assert (prediction.place, prediction.shift, prediction.reason) == (None, None, "off the map")
+    assert (prediction.located.row, prediction.located.off > 0.9, prediction.located.p < 0.1) == (None, True, True)
+    back = [known.localize(image, route=drive_route) for image in frames[4:9]]
+    assert (back[-1].place, back[-1].located.row, back[-1].reason) == ("0008.png", 8, None)
 
 
 def test_what_is_there_is_not_added_again(street, small_street):
@@ -146,6 +161,9 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     with pytest.warns(UserWarning, match="there are no candidates, so that places that the map does not show"):
         confidence = known.calibrate(small_street / "database", small_street / "queries")
     assert known.confidence == confidence
+    refused = [known.localize(path).reason is not None for path in sorted((small_street / "queries").iterdir())]
+    assert confidence.refusals == ((sum(refused) + 2) / 20, 0.5)  # no query has candidates of other places
+    assert Map.open(tmp_path).confidence == confidence
     prediction = Map.open(tmp_path).localize(query)
     assert prediction == known.localize(query)
     assert 0 < prediction.confidence < 1
@@ -166,6 +184,9 @@ def test_noise_gets_no_place_though_all_predictions_of_the_drive_are_correct(tmp
         street / "database", street / "database"
     )
     known = Map.open(tmp_path / "map", threshold=0.8)
+    on_map, off_map = known.confidence.refusals
+    assert on_map == 2 / 50  # no image of the map is refused
+    assert off_map > 2 * on_map
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
     assert known.localize(image).reason == "no better than noise"
     for row in (2, 20):

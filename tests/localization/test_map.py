@@ -308,16 +308,25 @@ class Unsteady:
             yield row, Features(point, ones[None], point[:, 0], np.ones(1, bool), ones[:2])
 
 
-def test_rows_that_cannot_be_read_leave_no_others_in_their_slots():
+@pytest.mark.parametrize("memory", [None, 120e-9])  # of three rows
+def test_rows_that_cannot_be_read_do_not_change_other_rows(memory):
     rows = Unsteady()
-    resident, [(_, query)] = Resident(rows, typical=1, candidates=2, memory=None), rows.features([0])
-    resident.hold([0, 1], query, 4)
+    resident = Resident(rows, memory)
+    resident.read([0, 1])
     rows.bad = (2,)
     with pytest.raises(InputError, match="row 2"):
-        resident.hold([3, 2], query, 4)
-    for wanted in ([3, 1], [0, 3]):
-        arrays, slots = resident.hold(wanted, query, 4)
-        assert np.asarray(arrays.scores)[slots, 0].tolist() == wanted
+        resident.read([3, 2])
+    for wanted in ([3, 1], [0, 3], [0, 1, 3, 4]):
+        assert [features.scores[0] for features in resident.read(wanted)] == wanted
+
+
+def test_the_least_recently_used_features_make_room():
+    rows, read = Unsteady(), []
+    resident, features = Resident(rows, 120e-9), rows.features  # three rows of 37 bytes
+    rows.features = lambda wanted: (read.extend(wanted), features(wanted))[1]
+    for wanted in ([0, 1, 2], [0, 3], [0], [1], [2, 3]):
+        resident.read(wanted)
+    assert read == [0, 1, 2, 3, 1, 2]
 
 
 def test_a_row_that_is_added_while_its_segment_is_opened_comes_whole_or_later(dataset, folder, tmp_path, monkeypatch):

@@ -33,10 +33,12 @@ def test_it_is_the_causal_filter_of_an_evaluation(advance):
     followed = follow(Evidence.of(Ranked(rows, scores)), drive, there)
     for image, (of_image, its_scores) in enumerate(zip(rows.tolist(), scores.tolist(), strict=True)):
         located = drive_route(prediction(dict(zip(of_image, its_scores, strict=True))), there)
-        assert drive_route.belief[located.row] == pytest.approx(followed.p[image, 0], rel=1e-4)  # rows may be level
+        belief = drive_route.belief[:40][there]
+        assert belief.max() == pytest.approx(followed.p[image, 0], rel=1e-4)  # rows may be level
+        assert (located.row is None) == (located.off >= 0.9)
         assert located.off == pytest.approx(float(followed.off[image]), rel=1e-4)
         np.testing.assert_allclose(drive_route.belief[followed.rows[image]], followed.p[image], rtol=1e-3)
-        assert located.p >= drive_route.belief[located.row] * (1 - located.off) - 1e-6
+        assert located.p >= belief.max() * (1 - located.off) - 1e-6
 
 
 @pytest.mark.parametrize("advance", [0, 1, 4, -2])
@@ -64,6 +66,15 @@ def test_a_wrong_speed_is_a_warning_and_a_right_one_is_none():
         follow(1.0)
 
 
+def test_a_speed_that_was_right_for_long_and_is_wrong_now_is_a_warning():
+    lines, there = [], np.ones(300, bool)
+    drive_route = Route(Drive(1.0), warn=lines.append)
+    for row in [*range(100), *range(100, 124, 4)]:
+        assert row > 100 or not lines
+        drive_route(sharp(row, 0.6), there)
+    assert len(lines) == 1
+
+
 @pytest.mark.parametrize("advance", [3, -2, 0])
 def test_a_sure_robot_moves_as_its_drive_says(advance):
     there, drive_route = np.ones(60, bool), Route(Drive(advance, 0.05, 0.0))
@@ -87,6 +98,42 @@ def test_it_finds_a_robot_that_was_carried_away():
     for turn in range(20):
         stuck(sharp(turn, 0.5), there)
     assert stuck(sharp(150, 0.5), there).row < 30
+
+
+def refusal(reason="too few matches"):
+    return Prediction(None, (), 0.0, None, None, None, None, reason)
+
+
+def test_ten_refused_images_are_off_the_map_and_five_are_not():
+    there, tunnel, elsewhere, untouched = np.ones(200, bool), Route(), Route(), Route()
+    for row in range(20):
+        for drive_route in (tunnel, elsewhere, untouched):
+            drive_route(sharp(row, 0.6), there)
+    for row in range(20, 25):
+        in_tunnel, outside = tunnel(refusal(), there), untouched(sharp(row, 0.6), there)
+        assert in_tunnel.row == outside.row == row
+    assert 0.5 < in_tunnel.off < 0.7
+    after, outside = tunnel(sharp(25, 0.6), there), untouched(sharp(25, 0.6), there)
+    assert (after.row, outside.row) == (25, 25)
+    assert after.p > 0.9 * outside.p
+    assert tunnel(sharp(26, 0.6), there).p > 0.99
+    for _ in range(10):
+        located = elsewhere(refusal(), there)
+    assert located.off >= 0.9
+    assert located.p < 0.1
+    assert located.row is None
+    back = [elsewhere(sharp(row, 0.6), there) for row in range(150, 155)]  # somewhere else on the map
+    assert back[-1].row == 154
+    assert back[-1].p > 0.9
+
+
+@pytest.mark.parametrize(("refusals", "off"), [((0.5, 0.5), 0.5), ((0.4, 0.6), 0.6), ((0.01, 0.9), 2.5 / 3.5)])
+def test_refused_images_are_evidence_as_far_as_the_calibration_says(refusals, off):
+    there, drive_route = np.ones(30, bool), Route(Drive(leaves=1e-9, returns=1e-9))  # off with a probability of 0.5
+    for prediction in (None, refusal("no candidates")):
+        assert drive_route(prediction, there).off == pytest.approx(0.5, abs=1e-6)
+    located = drive_route(refusal(), there, refusals)
+    assert located.off == pytest.approx(off, abs=1e-6)
 
 
 def test_a_sum_of_one_and_never_nan():

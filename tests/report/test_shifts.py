@@ -50,7 +50,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
         fitted = scorer.with_capacity(pair.image_size0, pair.image_size1)
         np.testing.assert_allclose(numbers[:2], fitted.dominant_shift(pair, refine=True), atol=0.02)
         low, high = np.asarray(fitted.shift_interval(pair), np.float64)
-        half = np.hypot((high - low) / 2, SHIFT_FLOOR * np.array([160, 120]))
+        half = np.hypot((high - low) / 2, SHIFT_FLOOR * 160)
         expected = [(low + high) / 2 - half, (low + high) / 2 + half]
         np.testing.assert_allclose(np.reshape(numbers[2:6], (2, 2)).T, expected, atol=0.02)
         assert numbers[6:] == [1, 160, 120]
@@ -75,6 +75,7 @@ def test_a_zoomed_candidate_shows_the_middle_of_the_query_where_it_does(zoom, di
     np.testing.assert_allclose(shifts[0], expected, atol=0.01)
     assert (intervals[0, 0] < expected).all()
     assert (expected < intervals[0, 1]).all()
+    assert (intervals[0, 1] - intervals[0, 0] >= 2 * SHIFT_FLOOR * 320).all()  # of the longer side, along both axes
     assert scales[0] == zoom
     assert sizes[0].tolist() == [*size0]
     assert np.isnan([*shifts[1], *intervals[1].ravel(), scales[1]]).all()
