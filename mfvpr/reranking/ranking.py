@@ -101,7 +101,7 @@ def balancing_c(
 
         mfvpr.balancing_c(shortlist.scores[0], scores[0], shortlist.mask[0])
 
-    Candidates count if `mask` is True and both scores are finite.
+    Candidates count if `mask` is True, and both `retrieval_scores` and `rerank_scores` are finite.
     """
     both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
     retrieval_deviation, deviation = (masked_std(_wide(scores), both) for scores in (retrieval_scores, rerank_scores))

@@ -66,7 +66,7 @@ def test_groups_are_named(tmp_path):
     (accelerator.grid, (2, 3), {"at_once": False}),
 ])  # fmt: skip
 def test_torch_computes_the_same(make, sizes, options):
-    pytest.importorskip("torch", reason="torch is what is compared with")
+    skip_without("torch")
     calls = make(*sizes, **options)[0]
     theirs, ours = calls["torch"](), next(iter(calls.values()))()
     if make is accelerator.matching:

@@ -6,16 +6,16 @@ from experiments.paper.runs import lock_output
 from mfvpr.systems.settings import SettingsError
 
 
-@pytest.mark.parametrize("others", [["figures"], ["runs", "figures", "thesis.tex"]])
-def test_a_folder_with_files_of_others_is_refused(tmp_path, others):
-    for name in others:
+@pytest.mark.parametrize("entries", [["figures"], ["runs", "figures", "thesis.tex"]])
+def test_a_folder_with_files_of_others_is_refused(tmp_path, entries):
+    for name in entries:
         (tmp_path / name).mkdir()
     with (
         pytest.raises(SettingsError, match="expected a new or empty folder, or one of this program"),
         lock_output(tmp_path),
     ):
         pass
-    assert {path.name for path in tmp_path.iterdir()} == {*others}
+    assert {path.name for path in tmp_path.iterdir()} == {*entries}
 
 
 @pytest.mark.parametrize("earlier", [[], ["runs"], ["runs", "tables", "figures", "report.html", ".DS_Store"]])
