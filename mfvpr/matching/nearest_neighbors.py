@@ -89,7 +89,11 @@ def match_rounded(query: Rounded, candidate: Features, *, with_ratio: bool) -> M
         neighbors, settled = mutual_neighbors(fixed_query, rounded, with_second=with_ratio)
         return jax.lax.cond(settled, lambda: neighbors, in_single)
 
-    neighbors = jax.lax.cond(tells_apart(fixed_query, rounded), in_bfloat16, in_single)
+    def on_cpu() -> Neighbors:
+        return jax.lax.cond(tells_apart(fixed_query, rounded), in_bfloat16, in_single)
+
+    # Traced arrays do not say where they are: the program may be compiled for another device than the default.
+    neighbors = jax.lax.platform_dependent(cpu=on_cpu, default=in_single)
     return _matches_of(query.features, candidate, neighbors, with_ratio=with_ratio)
 
 
@@ -117,7 +121,8 @@ def match_candidates(
     stays in the cache, and as many as fit a small part of an accelerator's memory.
 
     `product` is what the descriptors are multiplied in; the matches are the same. `bfloat16`, for `mutual` alone, takes
-    about two thirds of the time of `float32` where the processor has instructions for it. None decides.
+    about two thirds of the time of `float32` where a CPU has instructions for it; other devices always take `float32`.
+    None decides.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
@@ -166,15 +171,17 @@ def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features)
 def choose_product(
     product: Product | None, queries: Features, candidates: Features, cross_check: CrossCheck, chunk_size: int
 ) -> Product:
-    """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster."""
+    """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster.
+
+    On other devices than a CPU always float32: the bounds of `checked` do not hold there.
+    """
     sides = queries, candidates
     lengths = {np.shape(side.descriptors)[-1] for side in sides}
-    if product is None:
-        is_faster = min(lengths) >= LEAST_DIMENSIONS and device_of(sides).platform == "cpu" and has_bfloat16()
-        if not is_faster:
-            return "float32"
-    else:
+    if product is not None:
         require_word("product", product, Product)
+    may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
+    if not may_be_faster or device_of(sides).platform != "cpu":
+        return "float32"
     dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
     conditions = {
         "cross_check=mutual": cross_check == "mutual",
