@@ -130,6 +130,8 @@ def match_candidates(
     chunk_size = pairs_at_once(chunk_size, query, candidates)
     if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # `lax.map` cannot make chunks of them
         chunk_size = 1
+    if 1 < chunk_size < len(candidates.mask):  # as many chunks of equal size: a smaller one is compiled as well
+        chunk_size = -(-len(candidates.mask) // -(-len(candidates.mask) // chunk_size))
     options = {"cross_check": cross_check, "with_ratio": with_ratio, "chunk_size": chunk_size}
     product = choose_product(product, query, candidates, cross_check, chunk_size)
     matches = _match_candidates(query, candidates, product=product, **options)
@@ -137,11 +139,14 @@ def match_candidates(
 
 
 def with_concrete_sizes(matches: Matches, image_size0: Array, image_size1: Array) -> Matches:
-    """Matches `[P, ...]` with concrete image sizes where a caller's `jit` traces those of the compiled program."""
-    if is_concrete(matches.image_size0) or not is_concrete((image_size0, image_size1)):
+    """Matches `[P, ...]` with image sizes on the host, where scorers need them, unless they are traced or None."""
+    sizes = {"image_size0": image_size0, "image_size1": image_size1}
+    if any(size is None or not is_concrete(size) for size in sizes.values()):
         return matches
-    sizes = (np.broadcast_to(single_size(size), (len(matches.mask), 2)) for size in (image_size0, image_size1))
-    return replace(matches, **dict(zip(("image_size0", "image_size1"), sizes, strict=True)))
+    shape = len(matches.mask), 2
+    return replace(matches, **{
+        name: np.broadcast_to(np.asarray(size, getattr(matches, name).dtype), shape) for name, size in sizes.items()
+    })  # fmt: skip
 
 
 @partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size", "product"))
