@@ -259,7 +259,8 @@ def test_the_product_is_no_part_of_a_matcher_s_recipe():
 
 def test_no_pair_of_conversions_hides_what_rounding_takes_away():
     query, _ = make_pair("random")
-    conversions = re.findall(r"(f32|bf16)\[[\d,]+\] = convert_element_type", str(jax.make_jaxpr(checked.round_candidate)(query)))
+    program = str(jax.make_jaxpr(checked.round_candidate)(query))
+    conversions = re.findall(r"(f32|bf16)\[[\d,]+\] = convert_element_type", program)
     assert set(conversions) == {"bf16"}  # XLA may leave out a conversion to bfloat16 and back
 
 
