@@ -222,7 +222,7 @@ def retrieve(
     )
 
 
-def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> tuple[Array, Array]:
+def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> list[Array]:
     """`jax.lax.top_k` of each row, by the largest values of blocks, since an accelerator would sort whole rows.
 
     The values are in the `depth` blocks with the largest maxima, the first of equal ones, or after the last block.
@@ -237,7 +237,7 @@ def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> tupl
     rest = jnp.tile(jnp.arange(count * BLOCK, columns, dtype=jnp.int32), (rows, 1))
     members = jnp.concatenate([members, rest], axis=1)
     largest, places = jax.lax.top_k(jnp.take_along_axis(values, members, axis=1), depth)
-    return largest, jnp.take_along_axis(members, places, axis=1)
+    return [largest, jnp.take_along_axis(members, places, axis=1)]
 
 
 def _at_least_two(rows: Float[Array, "_ dimensions"]) -> Float[Array, "_ dimensions"]:
