@@ -28,7 +28,7 @@ from mfvpr.features import (
     PatchNetVladFeatures,
     SelaVprFeatures,
 )
-from mfvpr.features.network import compile_network
+from mfvpr.features.network import TOGETHER, compile_network
 from mfvpr.networks.d2net import extract
 from mfvpr.networks.imagenet import preprocess
 
@@ -102,8 +102,9 @@ def contests() -> Iterator[Contest]:
 
 
 def _program(function: Callable[[Any, Any], Any], model: Any, batch_size: int) -> Callable[[np.ndarray], Any]:
-    """Run a compiled function whose results stay on the device; images one by one on a CPU, as the extractors do."""
-    program, step = compile_network(model, function), 1 if jax.default_backend() == "cpu" else batch_size
+    """Run a compiled function whose results stay on the device, on as many images at a time as the extractors do."""
+    program = compile_network(model, function)
+    step = 1 if jax.default_backend() == "cpu" else min(batch_size, TOGETHER)
     return lambda batch: jax.block_until_ready(
         [program(batch[start : start + step]) for start in range(0, len(batch), step)]
     )

@@ -16,6 +16,8 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import device_bytes, knows_own_context
 from mfvpr.utils.threads import ordered_map
 
+TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
+
 
 class NetworkExtractor:
     """Base of the extractors with a network, which are dataclasses with these fields."""
@@ -78,8 +80,8 @@ def in_batches(
     """Results of `program` for each image, NumPy.
 
     On a CPU `batch_size` has no effect: images run one by one, which keeps activations in the caches, and two at the
-    same time, since a network leaves some of the cores idle. On other devices the last batch is filled up, so that
-    there is one program.
+    same time, since a network leaves some of the cores idle. On other devices at most `TOGETHER` of them run at the
+    same time, and the last batch is filled up, so that there is one program.
 
     Raises:
         InputError: floating-point images of 0 to 1, in which every network here sees black.
@@ -87,7 +89,7 @@ def in_batches(
     if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
         raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")
     on_host = device_bytes(()) is None
-    size = 1 if on_host else batch_size
+    size = 1 if on_host else min(batch_size, TOGETHER)
 
     def run(start: int) -> list[Any]:
         batch = images[start : start + size]

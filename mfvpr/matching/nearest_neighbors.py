@@ -89,7 +89,11 @@ def match_rounded(query: Rounded, candidate: Features, *, with_ratio: bool) -> M
         neighbors, settled = mutual_neighbors(fixed_query, rounded, with_second=with_ratio)
         return jax.lax.cond(settled, lambda: neighbors, in_single)
 
-    neighbors = jax.lax.cond(tells_apart(fixed_query, rounded), in_bfloat16, in_single)
+    def on_cpu() -> Neighbors:
+        return jax.lax.cond(tells_apart(fixed_query, rounded), in_bfloat16, in_single)
+
+    # Traced arrays do not say where they are: the program may be compiled for another device than the default.
+    neighbors = jax.lax.platform_dependent(cpu=on_cpu, default=in_single)
     return _matches_of(query.features, candidate, neighbors, with_ratio=with_ratio)
 
 
@@ -117,7 +121,8 @@ def match_candidates(
     stays in the cache, and as many as fit a small part of an accelerator's memory.
 
     `product` is what the descriptors are multiplied in; the matches are the same. `bfloat16`, for `mutual` alone, takes
-    about two thirds of the time of `float32` where the processor has instructions for it. None decides.
+    about two thirds of the time of `float32` where a CPU has instructions for it; other devices always take `float32`.
+    None decides.
     """
     if np.ndim(query.mask) != 1 or np.ndim(candidates.mask) != 2:
         shapes = f"{np.shape(query.mask)} and {np.shape(candidates.mask)}"
@@ -125,6 +130,8 @@ def match_candidates(
     chunk_size = pairs_at_once(chunk_size, query, candidates)
     if 0 in (np.shape(query.mask)[0], np.shape(candidates.mask)[1]):  # `lax.map` cannot make chunks of them
         chunk_size = 1
+    if 1 < chunk_size < len(candidates.mask):  # as many chunks of equal size: a smaller one is compiled as well
+        chunk_size = -(-len(candidates.mask) // -(-len(candidates.mask) // chunk_size))
     options = {"cross_check": cross_check, "with_ratio": with_ratio, "chunk_size": chunk_size}
     product = choose_product(product, query, candidates, cross_check, chunk_size)
     matches = _match_candidates(query, candidates, product=product, **options)
@@ -132,11 +139,14 @@ def match_candidates(
 
 
 def with_concrete_sizes(matches: Matches, image_size0: Array, image_size1: Array) -> Matches:
-    """Matches `[P, ...]` with concrete image sizes where a caller's `jit` traces those of the compiled program."""
-    if is_concrete(matches.image_size0) or not is_concrete((image_size0, image_size1)):
+    """Matches `[P, ...]` with image sizes on the host, where scorers need them, unless they are traced or None."""
+    sizes = {"image_size0": image_size0, "image_size1": image_size1}
+    if any(size is None or not is_concrete(size) for size in sizes.values()):
         return matches
-    sizes = (np.broadcast_to(single_size(size), (len(matches.mask), 2)) for size in (image_size0, image_size1))
-    return replace(matches, **dict(zip(("image_size0", "image_size1"), sizes, strict=True)))
+    shape = len(matches.mask), 2
+    return replace(matches, **{
+        name: np.broadcast_to(np.asarray(size, getattr(matches, name).dtype), shape) for name, size in sizes.items()
+    })  # fmt: skip
 
 
 @partial(compiled, static_argnames=("cross_check", "with_ratio", "chunk_size", "product"))
@@ -166,15 +176,17 @@ def pairs_at_once(chunk_size: int | None, query: Features, candidates: Features)
 def choose_product(
     product: Product | None, queries: Features, candidates: Features, cross_check: CrossCheck, chunk_size: int
 ) -> Product:
-    """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster."""
+    """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster.
+
+    On other devices than a CPU always float32: the bounds of `checked` do not hold there.
+    """
     sides = queries, candidates
     lengths = {np.shape(side.descriptors)[-1] for side in sides}
-    if product is None:
-        is_faster = min(lengths) >= LEAST_DIMENSIONS and device_of(sides).platform == "cpu" and has_bfloat16()
-        if not is_faster:
-            return "float32"
-    else:
+    if product is not None:
         require_word("product", product, Product)
+    may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
+    if not may_be_faster or device_of(sides).platform != "cpu":
+        return "float32"
     dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
     conditions = {
         "cross_check=mutual": cross_check == "mutual",

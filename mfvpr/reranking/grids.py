@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.matching.nearest_neighbors import filter_matches
-from mfvpr.reranking.ranking import BIN_STEP, check_candidates, matched_sizes
+from mfvpr.reranking.ranking import BIN_STEP, check_candidates, fit_to_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.scoring.parameters import numbers_by_name, whole_numbers, with_capacity, with_parameters
 from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs, with_static_functions
@@ -59,20 +59,22 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     outer = [name for name in values if name not in WEIGHTINGS]
     settings, weightings = _product(values, outer), _product(values, inner)
     rows = int(np.prod([len(values[name]) for name in outer]))
-    groups = by_capacity(scorer, settings, rows, *matched_sizes(matches))
+    groups = fit_to_sizes(partial(by_capacity, scorer, settings, rows), matches)
+    on_cpu = device_of(matches).platform == "cpu"
 
     def score(matches: Matches) -> list[Array]:
-        # One after the other, because programs that run at the same time would share the cache.
+        # On a CPU one after the other, because programs that run at the same time would share the cache.
         scores = (
             score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
             for fitted, part in groups
         )
-        return [jax.block_until_ready(group_scores) for group_scores in scores]
+        return [jax.block_until_ready(group_scores) if on_cpu else group_scores for group_scores in scores]
 
     # A plain function may close over traced values, which only the thread that traces them can use.
     use_threads = is_concrete((scorer, matches, values)) and not plain
     scores = _on_every_core(score, matches) if use_threads else score(matches)
-    xp: Any = np if is_concrete(scores) else jnp  # single operations of JAX would wait for its queue
+    # On a CPU, single operations of JAX would wait for its queue; elsewhere NumPy would wait for the device.
+    xp: Any = np if on_cpu and is_concrete(scores) else jnp
     order = np.argsort(np.concatenate([part for _, part in groups]))
     names = outer + inner
     scores = xp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
@@ -114,10 +116,14 @@ def score_settings(
     """Scores `[G, W, C]` of matches `[C, K, ...]` for every combination of G settings and W weightings.
 
     Settings are scored one after the other, because all at once would leave the cache, and in one traced computation,
-    so that other values cost no compilation. A histogram needs a capacity that suffices for every `bin_size`.
+    so that other values cost no compilation; those of a histogram on an accelerator at once, as many as fit `CHUNK`.
+    A histogram needs a capacity that suffices for every `bin_size`.
     Weightings: `max_distance`, and `weight` (index of the scorer's `ChosenWeight`). Without any, G or W is 1.
     """
-    scores = (_on_host if on_host(scorer) else _in_jax)(scorer, matches, settings, weightings)
+    if on_host(scorer):
+        scores = _on_host(scorer, matches, settings, weightings)
+    else:
+        scores = _in_jax(scorer, matches, settings, weightings, on_cpu=device_of(matches).platform == "cpu")
     require_real("scorer", scores)
     return scores
 
@@ -135,8 +141,10 @@ def _on_host(
     return np.array([[score(setting, weighting) for weighting in rows(weightings)] for setting in rows(settings)])
 
 
-@compiled
-def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]) -> Array:
+@partial(compiled, static_argnames="on_cpu")
+def _in_jax(
+    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array], *, on_cpu: bool
+) -> Array:
     # The Gaussians of a histogram are the same for all weightings. A subclass may score in another way.
     is_histogram = isinstance(scorer, HistogramOfShifts) and type(scorer).__call__ is HistogramOfShifts.__call__
     weights = jax.vmap(partial(_weights_of_pair, scorer, weightings))(matches) if is_histogram else None
@@ -147,7 +155,12 @@ def _in_jax(scorer: Any, matches: Matches, settings: Mapping[str, Array], weight
             return varied.batch_scores_by_weights(matches, weights).T
         return jax.vmap(partial(_score_weightings, varied, weightings), out_axes=-1)(matches)
 
-    return _map(score_setting, settings)
+    if on_cpu or weights is None or not settings:
+        return _map(score_setting, settings)
+    fitting = max(1, scorer.pairs_at_once(matches, weights.shape[1]) // max(1, len(weights)))
+    num_settings = len(next(iter(settings.values())))
+    together = max(size for size in range(1, min(fitting, num_settings) + 1) if num_settings % size == 0)
+    return jax.lax.map(score_setting, dict(settings), batch_size=together)
 
 
 def _apply_weighting(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
@@ -233,9 +246,9 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
             f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)} "
             f"(nearest: {nearest[0]})"
         )
-    points = jnp.asarray(axis)
+    points = np.asarray(axis) if is_concrete(axis) else jnp.asarray(axis)  # on the host, which takes them apart
     if not (jnp.issubdtype(points.dtype, jnp.integer) and (name == "weight" or name in whole_numbers(scorer))):
-        points = points.astype(float)
+        points = points.astype(jnp.result_type(float))
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
     return points

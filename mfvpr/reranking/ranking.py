@@ -1,7 +1,9 @@
 """Scores of the candidates of one query, fusion with the retrieval scores, and the ranking."""
 
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,7 @@ from mfvpr.utils.numerics import (
     or_nan,
 )
 
+Tree = TypeVar("Tree")
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
 
@@ -44,7 +47,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     check_host(scorer)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
-    return _score_candidates(with_capacity(scorer, *matched_sizes(matches), multiple=BIN_STEP), matches)
+    return _score_candidates(fit_to_sizes(partial(with_capacity, scorer, multiple=BIN_STEP), matches), matches)
 
 
 @compiled
@@ -60,14 +63,17 @@ def check_candidates(matches: Matches) -> None:
                          "[K] the score is scorer(matches)")  # fmt: skip
 
 
-def matched_sizes(matches: Matches) -> tuple[Num[Array, "*pairs0 2"], Num[Array, "*pairs1 2"]]:
-    """Sizes of both images, without pairs that have no matches and arbitrary sizes."""
+def fit_to_sizes(fit: Callable[[Array, Array], Tree], matches: Matches) -> Tree:
+    """`fit(sizes0, sizes1)` for the sizes of both images, without pairs that have no matches and arbitrary sizes."""
     sizes = matches.image_size0, matches.image_size1
     if not is_concrete((matches.mask, sizes)) or any(size is None for size in sizes):
-        return sizes
+        return fit(*sizes)
+    size0, size1 = (np.broadcast_to(size, (len(matches.mask), 2)) for size in sizes)
+    if (size0 == size0[:1]).all() and (size1 == size1[:1]).all():  # an accelerator need not say which have matches
+        with suppress(InputError):  # perhaps no pair has matches
+            return fit(size0[:1], size1[:1])
     has_matches = np.any(matches.mask, axis=-1)
-    size0, size1 = (np.broadcast_to(size, (*has_matches.shape, 2))[has_matches] for size in sizes)
-    return size0, size1
+    return fit(size0[has_matches], size1[has_matches])
 
 
 def combine(

@@ -17,7 +17,9 @@ from mfvpr.utils.ragged import repeat_last
 from mfvpr.utils.whitening import Whitening, fit_whitening
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
-ROWS = 2**16  # database rows at a time; fixed, because the last bits of the similarities depend on it
+ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it
+ROWS_SHARE = 1 / 4  # of an accelerator's free memory, for the database rows there
+BLOCK = 128  # database rows, of which an accelerator first looks at the largest similarity
 
 
 Queries = Float[np.ndarray, "queries dimensions"]
@@ -30,7 +32,7 @@ class ExactSearch:
 
     Attributes:
         memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
-            None = a sixteenth of the free memory. The result does not depend on it, in any bit.
+            None = a sixteenth of the free memory. On a CPU, the result does not depend on it, in any bit.
     """
 
     memory: float | None = None
@@ -52,9 +54,10 @@ class ExactSearch:
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
             raise InputError(f"excluded: expected rows for {len(queries)} queries and {len(database)} database images, "
                              f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
-        chunk_size = self._chunk_size(len(queries), min(len(database), ROWS))
+        num_rows = min(len(database), _rows_at_once(database.shape[1]))
+        chunk_size = self._chunk_size(len(queries), num_rows)
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
-        for rows in _parts(len(database), ROWS):
+        for rows in _parts(len(database), num_rows):
             on_device = jax.device_put(as_array(database[rows]))  # once for all chunks
             for part in _parts(len(queries), chunk_size):
                 mask = None if excluded is None else repeat_last(~excluded.dense(part)[:, rows], chunk_size)
@@ -62,7 +65,7 @@ class ExactSearch:
                 shortlist = retrieve(chunk, on_device, num_candidates=num_candidates, mask=mask)
                 best = shortlists.get(part.start)
                 shortlist = shortlist if best is None else _best(best, shortlist, rows.start)
-                shortlists[part.start] = jax.tree.map(np.asarray, shortlist)  # waits: one chunk at a time
+                shortlists[part.start] = jax.device_get(shortlist)  # waits: one chunk at a time
         joined = jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists.values())
         return jax.tree.map(lambda field: field[: len(queries)], joined)
 
@@ -160,6 +163,13 @@ def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
     return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
 
 
+def _rows_at_once(dimensions: int) -> int:
+    """Database rows at a time: on an accelerator as many as fit `ROWS_SHARE`, since every part costs a wait."""
+    device = device_of(())
+    fitting = 0 if device.platform == "cpu" else int(ROWS_SHARE * free_bytes(device)) // (4 * dimensions)
+    return max(ROWS, fitting)
+
+
 def _parts(total: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, total)) for start in range(0, total, size))
 
@@ -199,7 +209,9 @@ def retrieve(
     similarity = similarity[: len(queries), : len(database)]
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask.astype(bool))
     depth = min(num_candidates, database_descriptors.shape[0])
-    scores, indices = jax.lax.top_k(masked(similarity, usable, -jnp.inf), depth)
+    largest, in_blocks = partial(jax.lax.top_k, k=depth), partial(_largest_in_blocks, depth=depth)
+    similarity = masked(similarity, usable, -jnp.inf)
+    scores, indices = jax.lax.platform_dependent(similarity, cpu=largest, default=in_blocks)
     padding = ((0, 0), (0, num_candidates - depth))
     scores = jnp.pad(scores, padding, constant_values=-jnp.inf)
     is_candidate = scores > -jnp.inf
@@ -208,6 +220,24 @@ def retrieve(
         scores=masked(scores, is_candidate),
         mask=is_candidate,
     )
+
+
+def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> list[Array]:
+    """`jax.lax.top_k` of each row, by the largest values of blocks, since an accelerator would sort whole rows.
+
+    The values are in the `depth` blocks with the largest maxima, the first of equal ones, or after the last block.
+    """
+    rows, columns = values.shape
+    count = columns // BLOCK
+    if count <= depth:
+        return jax.lax.top_k(values, depth)
+    maxima = jnp.max(values[:, : count * BLOCK].reshape(rows, count, BLOCK), axis=2)
+    blocks = jnp.sort(jax.lax.top_k(maxima, depth)[1], axis=1)  # in their order, so that the first of equal values wins
+    members = (blocks[:, :, None] * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[None, None]).reshape(rows, -1)
+    rest = jnp.tile(jnp.arange(count * BLOCK, columns, dtype=jnp.int32), (rows, 1))
+    members = jnp.concatenate([members, rest], axis=1)
+    largest, places = jax.lax.top_k(jnp.take_along_axis(values, members, axis=1), depth)
+    return [largest, jnp.take_along_axis(members, places, axis=1)]
 
 
 def _at_least_two(rows: Float[Array, "_ dimensions"]) -> Float[Array, "_ dimensions"]:

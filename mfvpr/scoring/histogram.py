@@ -25,6 +25,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import compiled, is_concrete, positive, round_up
 
 MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
+CHUNK = 2**29  # bytes of the votes and bins that exist at the same time on an accelerator
 
 
 class ShiftHistogram(NamedTuple):
@@ -119,10 +120,17 @@ class HistogramOfShifts:
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
     ) -> Float[jax.Array, "candidates weightings"]:
         """`scores_by_weights` of pairs `[C, K, ...]`; on a CPU pair by pair, without most bins where that pays."""
-        score_all_bins = jax.vmap(self.scores_by_weights)
-        if self.temperature is not None:
-            return score_all_bins(matches, weights)
-        return jax.lax.platform_dependent(matches, weights, cpu=self._score_pair_by_pair, default=score_all_bins)
+        on_cpu = self._score_pair_by_pair if self.temperature is None else jax.vmap(self.scores_by_weights)
+        return jax.lax.platform_dependent(matches, weights, cpu=on_cpu, default=self._score_in_chunks)
+
+    def pairs_at_once(self, matches: Matches, num_weights: int) -> int:
+        """Pairs whose weighted votes and bins fit `CHUNK`."""
+        capacity = self._capacity(matches)
+        return max(1, CHUNK // (4 * num_weights * capacity * (matches.mask.shape[-1] + capacity)))
+
+    def _score_in_chunks(self, matches: Matches, weights: Array) -> Array:
+        chunk_size = self.pairs_at_once(matches, weights.shape[1])
+        return jax.lax.map(lambda pair: self.scores_by_weights(*pair), (matches, weights), batch_size=chunk_size)
 
     def _score_pair_by_pair(self, matches: Matches, weights: Array) -> Array:
         capacity, shifts = self._capacity(matches), jax.vmap(self._shifts_by_scale)(matches)

@@ -1,6 +1,7 @@
 """Bins of a histogram of shifts, votes for them, and the peak between bins. Lengths are pixels."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -95,7 +96,14 @@ def pool_bins(
     """Scores of one pair by `pool(scores, inside)` of its bins `[B, B]`, for each weighting of its matches."""
     votes_x, votes_y = votes(shifts, lattice, capacity)
     inside = lattice.inside(capacity)
-    return map_rows(lambda weights: pool(bin_scores(votes_x, votes_y, weights), inside), weights)
+
+    def score(weights: Array) -> Array:
+        return pool(bin_scores(votes_x, votes_y, weights), inside)
+
+    if len(weights) == 1:
+        return score(weights[0])[None]
+    # One after the other they stay in the cache of a CPU; an accelerator needs long operations.
+    return jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, score), default=jax.vmap(score))
 
 
 def map_rows(function: Callable[[Array], Array], rows: Array) -> Array:

@@ -32,6 +32,13 @@ def test_results_stand_in_the_order_of_the_images(program, monkeypatch, memory, 
         np.testing.assert_array_equal(doubled, 2 * image.astype(int))
 
 
+def test_an_accelerator_takes_few_images_at_the_same_time(monkeypatch):
+    monkeypatch.setattr(network, "device_bytes", lambda _: 1e9)
+    sizes = []
+    network.in_batches(lambda batch: sizes.append(len(batch)) or batch[:, 0, 0, 0], np.repeat(IMAGES, 3, axis=0), 32)
+    assert sizes == [8, 8, 8]
+
+
 def test_two_images_run_at_the_same_time():
     both = threading.Barrier(2, timeout=30)
     calls = []

@@ -1,6 +1,9 @@
 """Products of bfloat16 that are checked, against checked products of all pairs in NumPy."""
 
+import re
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -252,6 +255,26 @@ def test_features_of_images_match_as_in_float32_by_candidates_and_by_pairs():
 def test_the_product_is_no_part_of_a_matcher_s_recipe():
     recipes = [recipe_of(mfvpr.NearestNeighborMatcher(product=product)) for product in (None, "bfloat16")]
     assert recipes[0] == recipes[1]
+
+
+def test_no_pair_of_conversions_hides_what_rounding_takes_away():
+    query, _ = make_pair("random")
+    program = str(jax.make_jaxpr(checked.round_candidate)(query))
+    conversions = re.findall(r"(f32|bf16)\[[\d,]+\] = convert_element_type", program)
+    assert set(conversions) == {"bf16"}  # XLA may leave out a conversion to bfloat16 and back
+
+
+def test_other_devices_than_a_cpu_take_float32(monkeypatch):
+    query, candidate = make_pair("random")
+    batch = stack([candidate])
+    monkeypatch.setattr(nearest_neighbors, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    choose = partial(nearest_neighbors.choose_product, queries=query, candidates=batch, cross_check="mutual")
+    assert {choose(product, chunk_size=8) for product in (None, "bfloat16", "float32")} == {"float32"}
+    # A program that was traced for a CPU and is compiled for a GPU has no products of bfloat16.
+    function = jax.jit(partial(match_rounded, with_ratio=False)).trace(prepare_query(query), candidate)
+    products = {platform: "xbf16>) -> tensor" in function.lower(lowering_platforms=(platform,)).as_text()
+                for platform in ("cpu", "cuda")}  # fmt: skip
+    assert products == {"cpu": True, "cuda": False}
 
 
 def test_gradients_are_those_of_float32():

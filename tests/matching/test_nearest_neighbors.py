@@ -275,6 +275,17 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
         match_candidates(make_features(rng, 20), make_features(rng, 20))
 
 
+def test_image_sizes_stay_on_the_host():
+    """Scorers need them there; a copy from an accelerator would wait for the matches."""
+    rng = np.random.default_rng(0)
+    query, candidates = jax.device_put((make_features(rng, 9), stack([make_features(rng, 9) for _ in range(3)])))
+    matches = match_candidates(query, candidates)
+    assert {type(matches.image_size0), type(matches.image_size1)} == {np.ndarray}
+    np.testing.assert_array_equal(matches.image_size0, np.tile(query.image_size, (3, 1)))
+    np.testing.assert_array_equal(matches.image_size1, candidates.image_size)
+    assert match_candidates(replace(query, image_size=None), candidates).image_size0 is None
+
+
 def test_image_sizes_stay_known_under_a_callers_jit():
     """So that capacities that follow from them need not be set."""
     rng = np.random.default_rng(0)

@@ -1,11 +1,13 @@
 """Nearest neighbors in blocks, against the sort of all: sizes that come out even and that do not, ties, nothing."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
+from mfvpr.matching import similarity
 from mfvpr.matching.similarity import count_from, lines_of, nearest, without
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
@@ -43,6 +45,17 @@ def assert_neighbors(index, largest, values, place):
     has_neighbor = expected > -np.inf
     np.testing.assert_array_equal(np.asarray(index)[has_neighbor], order[has_neighbor])
     assert place or not np.asarray(index)[~has_neighbor].any()
+
+
+@pytest.mark.parametrize("kind", ["random", "ties", "holes"])
+def test_the_method_of_accelerators_finds_the_same_neighbors(kind, monkeypatch):
+    values = make(40, 64, kind)
+    for axis in (0, 1):
+        *on_cpu, _, _ = two_of(values, axis)
+        with monkeypatch.context() as patched:
+            patched.setattr(similarity, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+            *elsewhere, _, _ = two_of.__wrapped__(values, axis)
+        jax.tree.map(np.testing.assert_array_equal, on_cpu, elsewhere)
 
 
 @pytest.mark.parametrize("kind", ["random", "ties", "peaks", "holes"])

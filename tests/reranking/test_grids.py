@@ -3,6 +3,7 @@
 import itertools
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from mfvpr import (
 )
 from mfvpr.reranking import grids
 from mfvpr.reranking.grids import by_capacity
+from mfvpr.scoring import histogram
 from tests.builders import random_matches, stack
 from tests.scorers import FOREIGN, Strongest, Wrapped, title
 
@@ -71,6 +73,19 @@ def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch
     pairs = random_pairs(np.random.default_rng(1).integers(0, 9, 13), capacity=8)
     scores = score_grid(MatchCount(), replace(pairs, confidence=None), max_distance=[0.7, 1.5])
     np.testing.assert_array_equal(scores, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
+
+
+@pytest.mark.parametrize("chunk", [1, 10**5, 2**29])
+@pytest.mark.parametrize("temperature", [None, 0.5])
+def test_accelerators_score_settings_and_pairs_together(chunk, temperature, monkeypatch):
+    pairs, scorer = random_pairs((9, 0, 5), capacity=9), HistogramOfShifts(temperature=temperature)
+    axes = {"sigma": [9.0, 20.0, 31.0, 40.0], "weight": ["dmf", "unit"]}
+    expected = score_grid(scorer, pairs, **axes)
+    jax.clear_caches()
+    monkeypatch.setattr(histogram, "CHUNK", chunk)
+    monkeypatch.setattr(HistogramOfShifts, "_score_pair_by_pair", HistogramOfShifts._score_in_chunks)
+    monkeypatch.setattr(grids, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    np.testing.assert_allclose(score_grid(scorer, pairs, **axes), expected, rtol=1e-6)
 
 
 def test_kinds_of_weights_and_distances_are_axes_too(matches):

@@ -1,5 +1,7 @@
 """Shortlists, positives and recall."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -49,6 +51,30 @@ def test_the_first_of_equal_rows_wins_whatever_is_searched_at_a_time(rows, monke
     queries = np.eye(2, dtype=np.float32)
     shortlist = ExactSearch().shortlist(queries, queries[[0, 1, 0, 0, 1, 0]], 3)
     np.testing.assert_array_equal(shortlist.indices, [[0, 2, 3], [1, 4, 0]])
+
+
+@pytest.mark.parametrize("columns", [3, 256, 1000, 1024])
+@pytest.mark.parametrize("kind", ["random", "ties", "few"])
+def test_the_largest_in_blocks_are_the_largest(columns, kind):
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(6, columns)) if kind == "random" else rng.integers(0, 3, (6, columns)).astype(float)
+    if kind == "few":
+        values[rng.random((6, columns)) < 0.99] = -np.inf
+    for depth in (1, 3):
+        expected = np.argsort(-values, axis=1, kind="stable")[:, :depth]
+        scores, indices = retrieval._largest_in_blocks(values.astype(np.float32), depth)
+        np.testing.assert_array_equal(indices, expected)
+        np.testing.assert_array_equal(scores, np.take_along_axis(values.astype(np.float32), expected, axis=1))
+    queries, database = unit(rng.normal(size=(6, 3))), unit(rng.normal(size=(columns, 3)))
+    assert retrieve(queries, database, num_candidates=3).mask.all()
+
+
+def test_an_accelerator_takes_as_many_rows_as_fit(monkeypatch):
+    monkeypatch.setattr(retrieval, "ROWS", 4)
+    assert retrieval._rows_at_once(16) == 4
+    monkeypatch.setattr(retrieval, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    monkeypatch.setattr(retrieval, "free_bytes", lambda _: 4096)
+    assert [retrieval._rows_at_once(dimensions) for dimensions in (16, 1000)] == [16, 4]
 
 
 @pytest.mark.optimized
