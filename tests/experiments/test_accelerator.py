@@ -9,6 +9,7 @@ import pytest
 
 from experiments.benchmark import accelerator, accelerator_checks
 from mfvpr.utils.errors import InputError
+from tests.needs import skip_without
 
 
 @pytest.mark.parametrize("parts", [
