@@ -62,7 +62,7 @@ def test_files_of_other_programs(tmp_path):
 
 def test_files_that_exist_stay(tmp_path):
     """Only files of weights and of confidences are replaced, by their like."""
-    names, one = ["1.jpg"], np.ones((1, 1))
+    names, single = ["1.jpg"], np.ones((1, 1))
     model = Confidence(("margin",), 5, (0.0,), (1.0,), (1.0,), 0.0)
     writers = {
         "a.h5": lambda path: io.write_features(path, names, [(0, feature(0))]),
