@@ -68,11 +68,15 @@ def test_files_that_exist_stay(tmp_path):
         "a.h5": lambda path: io.write_features(path, names, [(0, feature(0))]),
         "a.npz": lambda path: io.write_features(path, names, [(0, feature(0))]),
         "a": lambda path: io.write_features(path, names, [(0, feature(0))]),
-        "g.npy": lambda path: io.write_global_descriptors(path, names, one),
-        "g.npz": lambda path: io.write_global_descriptors(path, names, one),
-        "g.h5": lambda path: io.write_global_descriptors(path, names, one),
-        "s.npz": lambda path: io.write_shortlist(path, Shortlist(0 * one.astype(int), one, one > 0), names, names),
-        "s.txt": lambda path: io.write_shortlist(path, Shortlist(0 * one.astype(int), one, one > 0), names, names),
+        "g.npy": lambda path: io.write_global_descriptors(path, names, single),
+        "g.npz": lambda path: io.write_global_descriptors(path, names, single),
+        "g.h5": lambda path: io.write_global_descriptors(path, names, single),
+        "s.npz": lambda path: io.write_shortlist(
+            path, Shortlist(0 * single.astype(int), single, single > 0), names, names
+        ),
+        "s.txt": lambda path: io.write_shortlist(
+            path, Shortlist(0 * single.astype(int), single, single > 0), names, names
+        ),
         "t.txt": lambda path: io.write_trajectory(path, ["0 0 0 0 0 0 1"], [0]),
         "c.json": lambda path: write_confidences(path, {"histogram": model}, {}),
         "w.json": lambda path: write_weight(path, WEIGHT, {}),
@@ -82,7 +86,7 @@ def test_files_that_exist_stay(tmp_path):
         file = path / "1.jpg.npz" if name == "a" else path
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(b"precious")
-        with pytest.raises(InputError, match="expected a new file, got one that exists"):
+        with pytest.raises(InputError, match="expected a new file, got single that exists"):
             write(path)
         assert file.read_bytes() == b"precious"
         file.unlink()
