@@ -100,7 +100,7 @@ def _set_up_jax(compiled: bool) -> None:
     from mfvpr.utils.compiled_programs import VARIABLE, keep_compiled_programs
 
     os.environ[VARIABLE] = str(compiled).lower()  # which a map reads as well
-    keep_compiled_programs()
+    keep_compiled_programs(lambda line: tell(f"warning: {line}"))
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
