@@ -234,9 +234,7 @@ class Map(MapImages):
             alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
         )
         if self.threshold is not None and not (p is not None and p >= self.threshold):
-            prediction = replace(
-                prediction, place=None, shift=None, shift_interval=None, scale=None, reason="low confidence"
-            )
+            prediction = replace(prediction, place=None, shift=None, shift_interval=None, reason="low confidence")
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _match(

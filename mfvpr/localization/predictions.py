@@ -48,7 +48,6 @@ class Prediction:
             as if both images had the size of the query; None without a place, if no match votes, or if the score is no
             histogram of shifts.
         shift_interval: its 95 % interval (low, high), each (x, y); None likewise.
-        scale: how much larger the candidate shows the place; None likewise.
         reason: why there is no place; None if there is one.
         image_width: of the query image, px.
         located: position on the route, if there is one.
@@ -60,7 +59,6 @@ class Prediction:
     confidence: float | None
     shift: tuple[float, float] | None
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
-    scale: float | None
     reason: Reason | None = None
     image_width: int = 0
     located: Located | None = None
@@ -108,4 +106,4 @@ class Localization(NamedTuple):
 
 def refusal(reason: Reason, described: Described, image_width: int) -> Localization:
     """A prediction without place and candidates."""
-    return Localization(Prediction(None, (), 0.0, None, None, None, None, reason, image_width), described, None)
+    return Localization(Prediction(None, (), 0.0, None, None, None, reason, image_width), described, None)

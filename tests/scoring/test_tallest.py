@@ -145,8 +145,6 @@ OPTIONS = [
     {"weight": DescriptorDistanceWeight(), "max_bins": 140},
     {"temperature": 0.3},
     {"weight": UnitWeight()},
-    {"scales": (0.8, 1.0, 1.3), "scale_deviation": 0.4},
-    {"scales": (1.0, 1.5), "temperature": 0.3},
 ]
 
 
