@@ -162,7 +162,7 @@ RULES: dict[str, Rule] = {
         "stride": whole(1, 8),
         "block": whole(-24, 23),
         "previous_queries": whole(0, 1000),
-        ".sequence": either(or_list(one_of("causal", "lagged", "smoothed", "viterbi")), None),
+        ".sequence": either(or_list(one_of("causal", "lagged", "smoothed")), None),
         "trials": whole(1, 100_000),
         "batch hidden": whole(1, 1024),
         # numbers
