@@ -28,6 +28,9 @@ Database = Float[np.ndarray, "database dimensions"]
 class ExactSearch:
     """Search for the largest dot products in chunks, with the result of `retrieve`.
 
+    Above 65,536 database rows, the last bits of scores depend on the block of 65,536 rows: of equal descriptors in
+    different blocks, any may come first.
+
     Attributes:
         memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
             None = a sixteenth of the free memory. The result does not depend on it, in any bit.
@@ -153,8 +156,8 @@ def _project(
 
 @compiled
 def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
-    """Merge shortlists; rows of the second count from `start`; the first wins ties."""
-    second = replace(second, indices=jnp.where(second.mask, second.indices + start, -1))
+    """Merge shortlists; rows of the second count from `start`; the first wins ties, so it also fills missing places."""
+    second = replace(second, indices=second.indices + start)
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
     return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
