@@ -62,7 +62,7 @@ def test_shifts_have_exact_times_and_their_order(write, tmp_path, newline):
     assert [row["place"] for row in cells] == ["", '{"x": 1.5, "y": "é"}', "", "1.png"]
     assert [row["reason"] for row in cells] == ["cannot be read, it is damaged", "", "low confidence", ""]
     assert [row["image"] for row in cells] == [LINES[row]["image"] for row in (1, 3, 2, 0)]
-    numbers = ["0.9400000000000001", "61.1", "-12.5", "47.6", "-16.0", "76.0", "24.4", "1.0", "448"]
+    numbers = ["0.9400000000000001", "61.1", "-12.5", "47.6", "-16.0", "76.0", "24.4", "448"]
     names = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "image_width")
     assert [cells[3][name] for name in names] == numbers
     assert cells[2]["confidence"] == "0.1"
