@@ -71,10 +71,10 @@ class Prediction:
     def shift_angles(self, field_of_view: float) -> tuple[float, float, float] | None:
         """Horizontal angles in degrees of `shift` and of both ends of its interval, of a pinhole camera.
 
-        `field_of_view` is the horizontal one of the camera, in degrees, above 0 and below 180.
+        `field_of_view` is the horizontal one of the camera, in degrees, from 5 and below 180.
         """
-        if not 0 < field_of_view < 180:
-            raise InputError(f"field_of_view={field_of_view}: expected degrees above 0 and below 180")
+        if not 5 <= field_of_view < 180:
+            raise InputError(f"field_of_view={field_of_view}: expected degrees from 5 and below 180, not radians")
         if self.shift is None or self.shift_interval is None:
             return None
         focal = self.image_width / 2 / math.tan(math.radians(field_of_view) / 2)

@@ -169,6 +169,8 @@ class _CalledPairs:
                              f"matched_kpts1, got {type(result).__name__}")  # fmt: skip
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
         except ValueError as error:
             raise InputError(f"{where}: expected arrays, got lists of different lengths") from error
         confidence = values[2] if len(values) == 3 else None

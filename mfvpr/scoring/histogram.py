@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from mfvpr.scoring.lattice import Lattice, bin_scores, climb, pool_bins, smooth_tallest, tallest, votes
-from mfvpr.scoring.parameters import SCORE, check_choices, choice, flag, integer, number, numbers, table_value
+from mfvpr.scoring.parameters import SCORE, check_plain, choice, flag, integer, number, numbers, table_value
 from mfvpr.scoring.shifts import are_finite, image_sizes, match_shifts, require_sizes, where_usable
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
@@ -68,7 +68,8 @@ class HistogramOfShifts:
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
-            and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
+            and smooth in everything but the number of bins. None is the paper's maximum; an array
+            not above 0 scores NaN.
     """
 
     bin_size: float | Array = number(15.0, "px")
@@ -88,7 +89,7 @@ class HistogramOfShifts:
         None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
     )
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""

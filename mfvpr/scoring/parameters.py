@@ -121,20 +121,23 @@ def summary(method: type) -> str:
     return (getmodule(method).__doc__ or method.__name__).splitlines()[0]
 
 
-def check_choices(method: Any) -> None:
-    """Raise a ValueError if a field holds a word that is not one of its choices."""
+def check_plain(method: Any) -> None:
+    """Raise an InputError if a field holds a word that is not one of its choices, or a Python float out of bounds."""
     for name, parameter in parameters_of(method).items():
         choices, value = parameter.choices, getattr(method, name)
         if choices and parameter.named is None and value not in choices:
             expected = ", ".join(map(str, choices))
-            raise ValueError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+            raise InputError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+    check_bounds(method, all_arrays=False)
 
 
-def check_bounds(method: Any) -> None:
-    """Raise an InputError if a field holds a number out of bounds; no number may be traced."""
+def check_bounds(method: Any, *, all_arrays: bool = True) -> None:
+    """Raise an InputError if a field holds a number out of bounds; no number may be traced if `all_arrays` count."""
     for name, parameter in parameters_of(method).items():
         value, (low, high) = getattr(method, name), parameter.bounds
-        if parameter.choices or value is None:
+        parts = value if isinstance(value, tuple) else (value,)
+        is_plain = not parameter.whole and all(isinstance(part, int | float) for part in parts)
+        if parameter.choices or value is None or not (is_plain or all_arrays):
             continue
         values = np.ravel(np.asarray(value, float))
         if not ((values >= low) & (values <= high) | (values == parameter.none)).all():

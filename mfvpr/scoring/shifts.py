@@ -1,5 +1,7 @@
 """Shifts of matches, and the image sizes that bound them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
@@ -15,6 +17,7 @@ def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
     Example:
         mfvpr.match_shifts(matches)  # [K, 2], (x, y)
     """
+    matches = replace(matches)  # checks the shapes, as in `match_weights`
     start, end = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
     return end - start
 

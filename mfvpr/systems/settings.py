@@ -176,7 +176,7 @@ RULES: dict[str, Rule] = {
         "c": either(_NOT_NEGATIVE, "auto"),
         "fusion.c": either(_NOT_NEGATIVE, "auto", "zscore"),
         "fusion.weights": any_of("weights by name, such as {retrieval: 0.5, anchor: 1}, or null", one_of(None)),
-        "field_of_view": either(number(1, 179), None),
+        "field_of_view": either(number(5, 179), None),
         "route": either(number(-1000, 1000), None, "auto"),
     }.items()
     for name in names.split()

@@ -75,7 +75,7 @@ class Cluster:
         """Start worker processes on this machine, until the block ends; `options` are those of `LocalCluster` of Dask.
 
         Each has an equal share of the processors, or as many threads of XLA as the variable PJRT_NPROC says. Scripts
-        need `if __name__ == "__main__":` before it.
+        need `if __name__ == "__main__":` before it. An `InputError` if a worker does not start.
         """
         threads = os.environ.get("PJRT_NPROC") or str(max(1, available_cpus() // max(1, workers)))
         options = {"dashboard_address": "127.0.0.1:0", "security": True, "env": {"PJRT_NPROC": threads}} | options

@@ -108,8 +108,9 @@ def test_a_shift_is_in_px_of_the_image_that_was_given(small_street, tmp_path, wi
                 for x, _ in (prediction.shift, *prediction.shift_interval)]  # fmt: skip
     assert prediction.shift_angles(80.0) == pytest.approx(expected, rel=1e-12)
     assert prediction.as_json()["shift_fraction"] == prediction.shift_fraction
-    with pytest.raises(InputError, match=r"field_of_view=180: expected degrees"):
-        prediction.shift_angles(180)
+    for field_of_view in (180, 1.2, np.nan):
+        with pytest.raises(InputError, match=r"field_of_view=.*: expected degrees"):
+            prediction.shift_angles(field_of_view)
 
 
 def test_without_a_shift_there_is_no_angle(dataset, folder):

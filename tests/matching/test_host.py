@@ -182,6 +182,7 @@ def test_pairs_without_matches_score_0(dataset):
         ((np.zeros((4, 2)), np.zeros((4, 2)), np.full(4, 3.0)), "0 to 1"),
         ({"points": 3}, "matched_kpts0"),
         (([[1.0], [2.0, 3.0]], np.zeros((2, 2))), "different lengths"),
+        ((np.zeros((4, 2)), np.ma.masked_equal(np.eye(4, 2), 1.0)), "masked"),
     ],
 )
 def test_wrong_results_of_a_function(dataset, result, message):
