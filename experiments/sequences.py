@@ -8,7 +8,7 @@ taken as it is, every fourth image, every second backwards, with stops, and in c
 The field's methods see the same images as "causal": those before.
 
 - single: each image alone
-- causal, lagged, smoothed, viterbi: `DriveFilter` of the scores
+- causal, lagged, smoothed: `DriveFilter` of the scores
 - at speed 1: causal, told that the robot moves one row from one image to the next
 - frames: frame correlation with the 2 images before (Camara & Preucil, RAS 2020)
 - SeqSLAM 1, SeqSLAM any: straight trajectories of 10 images, 0.8 to 1.2 or -8 to 8 rows from one to the next, through
@@ -108,7 +108,7 @@ class Place:
         ranked = Ranked(self._ranked.rows[images], self._ranked.scores[images])
         shortlist = Shortlist(ranked.rows, ranked.scores, ranked.rows >= 0)
         first = {"single": ranked.rows[:, 0]}
-        for method in ("causal", "lagged", "smoothed", "viterbi"):
+        for method in ("causal", "lagged", "smoothed"):
             first[method] = DriveFilter(method)(ranked, self._rows).rows[:, 0]
         first["at speed 1"] = DriveFilter("causal", Drive(advance=1))(ranked, self._rows).rows[:, 0]
         frames = np.where(shortlist.mask, FrameCorrelation()(shortlist, ranked.scores), -np.inf)

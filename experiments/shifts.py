@@ -56,7 +56,7 @@ def measure(street: Path, system: System, cache: FeatureCache) -> Shifts:
     rows = np.arange(FRAMES, dtype=np.int32)
     same_places = Shortlist(rows[:, None], np.ones((FRAMES, 1), np.float32), np.ones((FRAMES, 1), bool))
     matches = match(queries, database, same_places, pipeline.matcher)
-    shifts, intervals, _, sizes = dominant_shifts(scorer, matches, rows, np.zeros_like(rows))
+    shifts, intervals, sizes = dominant_shifts(scorer, matches, rows, np.zeros_like(rows))
     truth = np.loadtxt(street / TRUTH, delimiter=",", skiprows=1, usecols=(2, 3))
     return shifts / sizes, intervals / sizes[:, None], truth / dataset.database.read(0).shape[1::-1]
 

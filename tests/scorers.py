@@ -72,7 +72,7 @@ OWN = [
     HistogramOfShifts(),
     HistogramOfShifts(bin_size=20.0, sigma=12.0, truncate=3.0, align="zero_center", weight=UnitWeight()),
     HistogramOfShifts(shift_range=(100.0, 50.0), align="zero_edge", direction="query_minus_candidate"),
-    HistogramOfShifts(scales=(0.7, 1.0, 1.41), scale_deviation=0.5, weight=RatioWeight()),
+    HistogramOfShifts(weight=RatioWeight()),
     AnchorPoints(),
     AnchorPoints(window_mode="asymmetric", first="candidate", cell_weight="cell_sum", include_self=False),
     AggregatedScore(),

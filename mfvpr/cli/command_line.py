@@ -24,7 +24,7 @@ from mfvpr.cli.groups import PROGRAMS, check_choice, choices, choices_with, grou
 from mfvpr.cli.launch import import_job, on_interrupt, one_line
 from mfvpr.cli.overrides import PATHS, compose_program, quote, register_resolvers, split_first
 from mfvpr.cli.wording import in_settings
-from mfvpr.systems.settings import CONF, SettingsError, check, nodes
+from mfvpr.systems.settings import CONF, REMOVED, SettingsError, check, nodes
 
 _MULTIRUN = ("-m", "--multirun")
 _NAME = r"[A-Za-z_][\w/@]*(?:\.\w+)*"  # of a setting, or of a group
@@ -100,7 +100,7 @@ def _set_up_jax(compiled: bool) -> None:
     from mfvpr.utils.compiled_programs import VARIABLE, keep_compiled_programs
 
     os.environ[VARIABLE] = str(compiled).lower()  # which a map reads as well
-    keep_compiled_programs()
+    keep_compiled_programs(lambda line: tell(f"warning: {line}"))
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
@@ -183,6 +183,8 @@ def _suggestion(wrong: str, config: str, arguments: Sequence[str]) -> str:
     """Suggest a setting for an unknown one: in its group, in another choice of its group, or a similar name."""
     if wrong in _RENAMED:
         return f"its name is {_RENAMED[wrong]} now"
+    if wrong.rpartition(".")[2] in REMOVED:
+        return "it was removed in version 0.3.0"
     chosen = [argument for argument in arguments if argument.partition("=")[0] in groups(config)]
     settings: Any = OmegaConf.to_container(compose_program(config, chosen))
     values = dict(nodes(settings))

@@ -13,7 +13,7 @@ from mfvpr.cli.groups import check_choice, choices
 from mfvpr.cli.overrides import compose_program, quote
 from mfvpr.evaluation import System
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError, check, nodes
+from mfvpr.systems.settings import SettingsError, check, nodes, without_removed
 from mfvpr.utils.errors import InputError
 
 _PROGRAM = "config"  # its settings include those of systems
@@ -65,4 +65,4 @@ def _read_run(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError("another file")
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise SettingsError(f"{path}: expected the run.json of a run of mfvpr evaluate, got {error}") from error
-    return values
+    return without_removed(values)

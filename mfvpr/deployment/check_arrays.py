@@ -14,7 +14,7 @@ def check_inputs(program: Program) -> dict[str, np.ndarray]:
     lengths = shapes.candidates, shapes.keypoints
     spread = 0.01 * (1 + np.arange(shapes.candidates))[:, None, None]  # of image size and descriptors
     points0 = rng.uniform(size=(shapes.keypoints, 2)) * size
-    points1 = points0 + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2))
+    points1 = np.clip(points0 + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2)), 0, size)
     descriptors0 = _unit(rng.normal(size=(shapes.keypoints, shapes.dimension or 1)))
     descriptors1 = _unit(descriptors0 + spread * rng.normal(size=(*lengths, shapes.dimension or 1)))
     mask = rng.uniform(size=lengths) < 0.9

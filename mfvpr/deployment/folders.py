@@ -51,7 +51,11 @@ class ExportedProgram:
     run: Callable[..., tuple[Array, ...]] = field(repr=False)
 
     def __call__(self, **arrays: Any) -> dict[str, np.ndarray]:
-        """Outputs by name, NumPy. Raises an `InputError` if an array is missing, or has another shape or dtype."""
+        """Outputs by name, NumPy.
+
+        Raises an `InputError` if an array is missing or has another shape or dtype, or if an image size that the
+        program takes is not above 0, or is too small for the points: by more than 2 px and 1 %.
+        """
         if arrays.keys() != (expected := {each.name: each for each in self.inputs}).keys():
             raise InputError(f"inputs: expected {', '.join(expected)}, got {', '.join(arrays) or 'none'}")
         values = {name: as_array(array) for name, array in arrays.items()}
@@ -59,7 +63,11 @@ class ExportedProgram:
             got = str(getattr(values[name], "dtype", type(values[name]).__name__)), np.shape(values[name])
             if got != (each.dtype, each.shape):
                 raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got[0]} {[*got[1]]}")
-        outputs = self.run(*(values[name] for name in expected))
+        _require_sizes({name: np.asarray(array) for name, array in values.items()})
+        return self._outputs(values)
+
+    def _outputs(self, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        outputs = self.run(*(arrays[each.name] for each in self.inputs))
         return {each.name: np.asarray(values) for each, values in zip(self.outputs, outputs, strict=True)}
 
     def check(self) -> float:
@@ -67,7 +75,7 @@ class ExportedProgram:
         inputs, outputs = (
             {each.name: _read_array(self.folder, each) for each in tensors} for tensors in (self.inputs, self.outputs)
         )
-        return largest_difference(self(**inputs), outputs)
+        return largest_difference(self._outputs(inputs), outputs)
 
 
 def export(
@@ -215,6 +223,24 @@ def _read_description(folder: Path) -> dict[str, Any]:
     return description
 
 
+def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise an InputError for sizes of images that cannot be right, as width and height exchanged often cannot."""
+    for side in "01":
+        name, sizes = f"image_size{side}", arrays.get(f"image_size{side}")
+        mask = arrays.get("mask", arrays.get(f"mask{side}"))
+        if sizes is None or mask is None:
+            continue
+        sizes = np.broadcast_to(sizes[..., None, :], (*mask.shape, 2))[mask]
+        points = arrays.get(f"points{side}", arrays.get(f"keypoints{side}"))
+        points = np.zeros_like(sizes) if points is None else points[mask]
+        margin = np.maximum(2.0, 0.01 * sizes)
+        wrong = ~(sizes > 0) | (points < -margin) | (points > sizes + margin)
+        if wrong.any():
+            row = int(wrong.any(axis=1).argmax())
+            raise InputError(f"{name}: expected (width, height) of images that contain all points, got "
+                             f"{sizes[row].tolist()} with a point {points[row].tolist()}")  # fmt: skip
+
+
 def _is_tensor(entry: Any) -> bool:
     """Whether a JSON value describes an input or an output."""
     if not isinstance(entry, dict) or entry.keys() != {*Tensor._fields}:
@@ -232,7 +258,7 @@ def _read_array(folder: Path, tensor: Tensor) -> np.ndarray:
     require_file(path)
     try:
         return np.load(path, allow_pickle=False)
-    except ValueError as error:
+    except (ValueError, EOFError) as error:
         raise InputError(f"{path}: expected an array, got a damaged file; export it again") from error
 
 

@@ -156,7 +156,6 @@ class Explanation:
     peak: Float[Array, "2"]  # the refined peak between bin centers, px
     weights: Float[Array, " slots"]
     agrees: Bool[Array, " slots"]  # whether a shift lies within two standard deviations of the peak along both axes
-    scale: Float[Array, ""]  # the dominant one of the scorer's scales, to which all of this belongs
     direction: str  # of the shifts, as the scorer defines it
 
 
@@ -170,61 +169,56 @@ def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
 def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
     shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
     weights = match_weights(scorer.weight, matches)
-    agrees, scale = scorer.agrees(matches, peak), scorer.dominant_scale(matches)
-    return scorer.histogram(matches), scorer(matches), shift, peak, weights, agrees, scale
+    return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
 
 
 def dominant_shifts(
     scorer: HistogramOfShifts, match_set: MatchSet,
     queries: Int[np.ndarray, " pairs"], places: Int[np.ndarray, " pairs"],
-) -> tuple[
-    Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"],
-    Float[np.ndarray, " pairs"], Float[np.ndarray, "pairs 2"],
-]:  # fmt: skip
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, "pairs 2"]]:  # fmt: skip
     """Shifts from the center of a query to the same point in a candidate, with their intervals; one program.
 
     Returns:
-        Refined dominant shifts (candidate minus query), their 95 % intervals (low, high), and the scales; NaN if no
-        match votes. Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of
-        the resized query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to
-        whose px they refer.
+        Refined dominant shifts (candidate minus query), and their 95 % intervals (low, high); NaN if no match votes.
+        Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of the resized
+        query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they
+        refer.
     """
     fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
-    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2)))]
+    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))]
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[part], places[part], match_set.capacity, total=SHIFTS_AT_ONCE)
         values = (*pair_shifts(fitted, pairs), np.asarray(pairs.image_size0))
-        shifts, intervals, scales, sizes = (each[: len(queries[part])] for each in values)
-        parts.append((shifts, intervals, scales, sizes))
-    shifts, intervals, scales, sizes = map(np.concatenate, zip(*parts, strict=True))
-    return shifts, intervals, scales, sizes
+        shifts, intervals, sizes = (each[: len(queries[part])] for each in values)
+        parts.append((shifts, intervals, sizes))
+    shifts, intervals, sizes = map(np.concatenate, zip(*parts, strict=True))
+    return shifts, intervals, sizes
 
 
 def pair_shifts(
     scorer: HistogramOfShifts, matches: Matches
-) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, " pairs"]]:
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
     votes, *values = jax.tree.map(np.array, _pair_shifts(scorer, matches))
     for of_pairs in values:  # the host makes the NaN: `jax_debug_nans` stops at those of programs
         of_pairs[~votes] = np.nan
-    shifts, intervals, scales = values
-    return shifts, intervals, scales
+    shifts, intervals = values
+    return shifts, intervals
 
 
 @compiled
-def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array, Array]:
+def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
     """Whether any match votes `[P]`, and `pair_shifts`, 0 without votes."""
 
-    def of_pair(pair: Matches) -> tuple[Array, Array, Array, Array]:
-        scale, votes = scorer.dominant_scale(pair), scorer(pair) > 0
+    def of_pair(pair: Matches) -> tuple[Array, Array, Array]:
+        votes = scorer(pair) > 0
         shifts = jnp.concatenate([scorer.dominant_shift(pair, refine=True)[None], scorer.shift_interval(pair)])
         if scorer.direction == "query_minus_candidate":
             shifts = -shifts[jnp.array([0, 2, 1])]
-        offset = (at_least_single(pair.image_size1) - at_least_single(pair.image_size0))[None] / 2  # of the centers
-        shifts = jnp.where(votes, offset + jnp.sqrt(scale) * (shifts - offset), 0.0)
+        shifts = jnp.where(votes, shifts, 0.0)
         interval = _widened(shifts[1:], SHIFT_FLOOR * at_least_single(pair.image_size0).max())
-        return votes, shifts[0], interval, jnp.where(votes, scale, 0.0)
+        return votes, shifts[0], interval
 
     return jax.vmap(of_pair)(matches)
 

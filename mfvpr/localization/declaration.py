@@ -11,7 +11,7 @@ from mfvpr.evaluation.system import System
 from mfvpr.storage.manifest import MANIFEST
 from mfvpr.storage.maps import has_rows
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError, check
+from mfvpr.systems.settings import SettingsError, check, without_removed
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 
@@ -30,6 +30,7 @@ def read_declaration(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict) or content["format"] != _FORMAT or not {*_GROUPS} <= {*content}:
             raise ValueError
+        content = without_removed(content)
         settings = _SCORE_ALONE | {name: content[name] for name in (*_GROUPS, *_SCORE_ALONE) if name in content}
         check(settings)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):

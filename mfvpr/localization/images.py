@@ -217,6 +217,8 @@ class MapImages:
                 if np.shape(vector) != (length,):
                     raise InputError(f"{name}: expected a descriptor [{length}], got {list(np.shape(vector))}. Take it "
                                      "from `describing` of this map.")  # fmt: skip
+                if np.asarray(vector).dtype.kind == "f" and not np.isfinite(vector).all():
+                    raise InputError(f"{name}: expected a descriptor of finite numbers, got NaN or infinity")
                 if name in self._row_of_name or name in new_names:
                     raise InputError(f"{name}: the map has an image of this name; choose another")
                 new_names.add(name)

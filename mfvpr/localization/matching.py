@@ -78,20 +78,20 @@ def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
 
 def shift_of(
     scorers: Iterable[Scorer], pair: Matches, size: tuple[int, int]
-) -> tuple[Point | None, tuple[Point, Point] | None, float | None]:
-    """`shift`, `shift_interval` and `scale` of a `Prediction` by the first histogram of shifts, from one pair.
+) -> tuple[Point | None, tuple[Point, Point] | None]:
+    """`shift` and `shift_interval` of a `Prediction` by the first histogram of shifts, from one pair.
 
     Shifts of the resized images become px of the query image, whose size is (width, height).
     """
     scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
     if scorer is None:
-        return None, None, None
+        return None, None
     histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
-    shift, interval, scale = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
+    shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
     stretch = np.divide(size, np.asarray(pair.image_size0)[0])
     shift, interval = stretch * shift, stretch * interval
     low, high = _point(interval[0]), _point(interval[1])
-    return _point(shift), (low, high) if low and high else None, float(scale) if np.isfinite(scale) else None
+    return _point(shift), (low, high) if low and high else None
 
 
 def _point(values: np.ndarray) -> Point | None:

@@ -49,7 +49,6 @@ class Prediction:
             as if both images had the size of the query; None without a place, if no match votes, or if the score is no
             histogram of shifts.
         shift_interval: its 95 % interval (low, high), each (x, y); None likewise.
-        scale: how much larger the candidate shows the place; None likewise.
         reason: why there is no place; None if there is one.
         image_width: of the query image, px.
         located: position on the route, if there is one.
@@ -61,7 +60,6 @@ class Prediction:
     confidence: float | None
     shift: tuple[float, float] | None
     shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
-    scale: float | None
     reason: Reason | None = None
     image_width: int = 0
     located: Located | None = None
@@ -74,10 +72,10 @@ class Prediction:
     def shift_angles(self, field_of_view: float) -> tuple[float, float, float] | None:
         """Horizontal angles in degrees of `shift` and of both ends of its interval, of a pinhole camera.
 
-        `field_of_view` is the horizontal one of the camera, in degrees, above 0 and below 180.
+        `field_of_view` is the horizontal one of the camera, in degrees, from 5 and below 180.
         """
-        if not 0 < field_of_view < 180:
-            raise InputError(f"field_of_view={field_of_view}: expected degrees above 0 and below 180")
+        if not 5 <= field_of_view < 180:
+            raise InputError(f"field_of_view={field_of_view}: expected degrees from 5 and below 180, not radians")
         if self.shift is None or self.shift_interval is None:
             return None
         focal = self.image_width / 2 / math.tan(math.radians(field_of_view) / 2)
@@ -86,7 +84,7 @@ class Prediction:
 
     def without_place(self, reason: Reason) -> "Prediction":
         """The prediction without place and shift; candidates, score and confidence stay."""
-        return replace(self, place=None, shift=None, shift_interval=None, scale=None, reason=reason)
+        return replace(self, place=None, shift=None, shift_interval=None, reason=reason)
 
     def as_json(self, most: int = 5) -> dict[str, Any]:
         """JSON values, with at most `most` alternatives and without the position on a route."""
@@ -113,4 +111,4 @@ class Localization(NamedTuple):
 
 def refusal(reason: Reason, described: Described, image_width: int) -> Localization:
     """A prediction without place and candidates."""
-    return Localization(Prediction(None, (), 0.0, None, None, None, None, reason, image_width), described, None)
+    return Localization(Prediction(None, (), 0.0, None, None, None, reason, image_width), described, None)

@@ -170,6 +170,8 @@ class _CalledPairs:
                              f"matched_kpts1, got {type(result).__name__}")  # fmt: skip
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
         except Exception as error:  # of NumPy for ragged lists, of any library for tensors that are not dense
             reason = shorten(" ".join(str(error).split()), 160)
             raise InputError(f"{where}: expected dense arrays, got others ({reason})") from error

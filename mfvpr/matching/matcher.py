@@ -102,7 +102,8 @@ def match_pairs(
     Args:
         queries: keypoints `[B, N0, 2]`.
         candidates: keypoints `[S, N1, 2]`.
-        pairs: int32 rows of queries and candidates, `[P, 2]`; an `InputError` if there are no such images.
+        pairs: int32 rows of queries and candidates, `[P, 2]`; an `InputError` if there are no such images. Traced rows
+            are not checked: JAX takes the nearest row.
 
     Returns:
         Matches with leading axis P and the slots of the matcher; pairs beyond `count` have no matches.

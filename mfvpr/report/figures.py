@@ -135,7 +135,6 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     axes.add_patch(Rectangle((corner_x, corner_y), 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
     axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
     words = "histogram of shifts: score {:.4g}, peak at ({:.1f}, {:.1f}) px"
-    words += f" of images zoomed by {explanation.scale:.3g}" if explanation.scale != 1 else ""
     axes.set_title(words.format(explanation.score, *explanation.peak), fontsize=9)
     return image
 

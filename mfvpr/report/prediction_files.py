@@ -23,7 +23,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
 
 CandidateLayout = Literal["preds", "hloc", "kapture"]
-_NUMBERS = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "scale", "image_width")
+_NUMBERS = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "image_width")
 _CELLS = (*_NUMBERS, "reason")
 SHIFT_COLUMNS = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "place", *_CELLS, "image")
 _FRAME = "camera"  # header.frame_id
@@ -138,7 +138,7 @@ def _image_of(line: Mapping[str, Any]) -> LocalizedImage:
     if "error" in line:
         return LocalizedImage(name, cells={"reason": str(line["error"])})
     low, high = line["shift_interval"] or [[None, None]] * 2
-    numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["scale"], line["image_width"]]
+    numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
     if not all(number is None or math.isfinite(number) for number in numbers):
         raise ValueError("a number that is not finite")
     cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}

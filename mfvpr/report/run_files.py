@@ -24,7 +24,7 @@ from mfvpr.storage.extraction import open_sinks
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.versions import versions
 
-SHIFTS = ("query", "prediction", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "scale", "width",
+SHIFTS = ("query", "prediction", "shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "width",
           "height")  # of shifts.csv  # fmt: skip
 
 
@@ -114,9 +114,9 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
 def write_shifts(folder: Path, evaluation: EvaluationReport, scorer: HistogramOfShifts) -> None:
     """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
 
-    A line has the refined dominant shift of the query's middle, its 95 % interval, and how much larger the candidate
-    shows it; empty if no match votes. Their px are those of the resized images, whose width and height follow. Queries
-    that are refused have no line, features of several scales no file.
+    A line has the refined dominant shift of the query's middle, and its 95 % interval; empty if no match votes. Their
+    px are those of the resized images, whose width and height follow. Queries that are refused have no line, features
+    of several scales no file.
     """
     names = evaluation.ranked.dataset.database.names
     sequences = zip(evaluation.ranked.matched, evaluation.ranked.systems[evaluation.headline], strict=True)
@@ -127,8 +127,8 @@ def write_shifts(folder: Path, evaluation: EvaluationReport, scorer: HistogramOf
         predictions = ranked.rows[:, 0]
         queries = np.flatnonzero((predictions >= 0) & ~evaluation.refused[place])
         places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
-        shifts, intervals, scales, sizes = dominant_shifts(scorer, match_set, queries, places)
-        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), scales[:, None], sizes], axis=1)
+        shifts, intervals, sizes = dominant_shifts(scorer, match_set, queries, places)
+        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
         lines = [
             [matched.sequence.images.names[query], names[predictions[query]],
              *("" if np.isnan(value) else format_number(value) for value in row)]

@@ -118,17 +118,16 @@ class DriveModel:
     kidnapped: Float[Array, ""]
     correct: Float[Array, ""]
     reach: int = field(metadata={"static": True})  # rows; at least the largest change of the row
-    best: bool = field(default=False, metadata={"static": True})  # the most probable path to a state, instead of all
 
     @classmethod
-    def of(cls, drive: Drive, there: Bool[np.ndarray, " rows"], *, best: bool = False) -> "DriveModel":
+    def of(cls, drive: Drive, there: Bool[np.ndarray, " rows"]) -> "DriveModel":
         """The model of a drive along the rows that are there."""
         speeds = np.array(SPEEDS if drive.advance is None else [drive.advance], np.float32)
         shifts = np.round(speeds).astype(np.int32)
         steps = np.stack([_gaussian(part, drive.spread) for part in (speeds - shifts).tolist()])
         changes, kidnapped, correct = _speed_changes(speeds), np.float32(drive.kidnapped), np.float32(drive.correct)
         reach = 16 * math.ceil((np.abs(shifts).max() + steps.shape[1] // 2) / 16)  # few sizes, so few programs
-        return cls(there, speeds, shifts, steps, changes, kidnapped, correct, reach, best)
+        return cls(there, speeds, shifts, steps, changes, kidnapped, correct, reach)
 
     @property
     def anywhere(self) -> Float[Array, "speeds rows"]:
@@ -161,18 +160,12 @@ class DriveModel:
 
     def normalize(self, belief: Float[Array, "speeds rows"]) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
         """A belief of total 1, and its total before; if images and motion exclude each other, nothing is known."""
-        total = self._total(belief)
+        total = belief.sum()
         return jnp.where(total > 0, belief / jnp.where(total > 0, total, 1.0), self.anywhere), total
 
     def by_row(self, belief: Float[Array, "speeds rows"]) -> Float[Array, " rows"]:
         """Probabilities of the rows at any speed."""
-        return self._total(belief, axis=0)
-
-    def _add(self, first: Array, second: Array) -> Array:
-        return jnp.maximum(first, second) if self.best else first + second
-
-    def _total(self, values: Array, axis: int | None = None) -> Array:
-        return values.max(axis) if self.best else values.sum(axis)
+        return belief.sum(axis=0)
 
     @property
     def _is_inside(self) -> Bool[Array, "1 wide"]:
@@ -186,23 +179,21 @@ class DriveModel:
         wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
         starts = reach - self.shifts - self.steps.shape[1] // 2
         moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
-        outside = self._total(jnp.where(self._is_inside, 0.0, moved))
-        carried = self._add(self.kidnapped * self._total(belief), outside)
+        outside = jnp.where(self._is_inside, 0.0, moved).sum()
+        carried = self.kidnapped * belief.sum() + outside
         inside = jnp.where(self._is_inside, moved, 0.0)[:, reach : reach + size]
-        return self._add(inside, carried * self.anywhere)
+        return inside + carried * self.anywhere
 
     def _seen_from_before(self, later: Array) -> Array:
         """Probabilities of `later` by the state before a motion: the transpose of `_moved`."""
-        anywhere = self._total(later * self.anywhere)
+        anywhere = (later * self.anywhere).sum()
         wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
         starts = self.reach + self.shifts - self.steps.shape[1] // 2
         moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
-        return self._add((1 - self.kidnapped) * moved, self.kidnapped * anywhere)
+        return (1 - self.kidnapped) * moved + self.kidnapped * anywhere
 
     def _changed(self, changes: Array, values: Array) -> Array:
-        """Products of changes `[speeds, speeds]` and values `[speeds, rows]`, summed or the largest."""
-        if self.best:
-            return (changes[:, :, None] * values[None]).max(axis=1)
+        """Products of changes `[speeds, speeds]` and values `[speeds, rows]`."""
         return jnp.matmul(changes, values, precision=jax.lax.Precision.HIGHEST)
 
     def _convolve(self, values: Array, steps: Array, starts: Array, size: int) -> Array:
@@ -212,7 +203,7 @@ class DriveModel:
         aligned = jax.vmap(cut)(values, starts)
 
         def add_step(k: int, total: Array) -> Array:
-            return self._add(total, steps[:, k, None] * jax.lax.dynamic_slice_in_dim(aligned, k, size, axis=1))
+            return total + steps[:, k, None] * jax.lax.dynamic_slice_in_dim(aligned, k, size, axis=1)
 
         return jax.lax.fori_loop(0, number, add_step, jnp.zeros((len(values), size)))
 

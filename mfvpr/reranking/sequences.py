@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -17,7 +17,7 @@ from mfvpr.types import Array
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import compiled
 
-Method = Literal["causal", "lagged", "smoothed", "viterbi"]
+Method = Literal["causal", "lagged", "smoothed"]
 LAG = 5  # images
 
 
@@ -36,8 +36,7 @@ class DriveFilter:
         systems = {"mine": mfvpr.System(pipeline, scorers, sequences={"histogram": (DriveFilter("smoothed"),)})}
 
     Attributes:
-        method: "causal" uses the queries before, "lagged" also the next 5, "smoothed" all. "viterbi" uses all as well,
-            and ranks by the most probable path through a row instead of the row's probability.
+        method: "causal" uses the queries before, "lagged" also the next 5, "smoothed" all.
         drive: motion of the robot.
     """
 
@@ -59,8 +58,8 @@ class DriveFilter:
     ) -> Ranked:
         """Rank all rows of the database, from rankings of the queries in their order; as many rows as candidates.
 
-        Scores are probabilities of the rows, small if the query seems to show a place that is not in the database. With
-        "viterbi", those of a query are relative to the best path's. Rows that a query has in `excluded` are not ranked.
+        Scores are probabilities of the rows, small if the query seems to show a place that is not in the database.
+        Rows that a query has in `excluded` are not ranked.
         """
         size = ranked.rows.shape[1]
         left_out = 0 if excluded is None else int(excluded.sum(axis=1).max(initial=0))
@@ -89,12 +88,12 @@ def follow(
     off = np.array([*itertools.accumulate(np.asarray(chances).tolist(), step, initial=drive.off)][1:])
     if method == "lagged":
         rows, p = (values[LAG:] for values in _lagged(_pad(evidence, LAG), model, lag=LAG, depth=depth)[:2])
-    if method in ("smoothed", "viterbi"):
+    if method == "smoothed":
         length = math.isqrt(images - 1) + 1
         padded = _pad(evidence, -images % length)
         parts = jax.tree.map(lambda values: values.reshape(-1, length, *values.shape[1:]), padded)
         is_image = (np.arange(padded.odds.size) < images).reshape(-1, length)
-        smoothed = _smoothed(parts, is_image, replace(model, best=method == "viterbi"), depth=depth)
+        smoothed = _smoothed(parts, is_image, model, depth=depth)
         rows, p = (values.reshape(-1, depth)[:images] for values in smoothed)
     return Followed(np.asarray(rows), np.asarray(p), off)
 

@@ -30,6 +30,9 @@ Database = Float[np.ndarray, "database dimensions"]
 class ExactSearch:
     """Search for the largest dot products in chunks, with the result of `retrieve`.
 
+    Above 65,536 database rows, the last bits of scores depend on the block of 65,536 rows: of equal descriptors in
+    different blocks, any may come first.
+
     Attributes:
         memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
             None = a sixteenth of the free memory. On a CPU, the result does not depend on it, in any bit.
@@ -156,8 +159,8 @@ def _project(
 
 @compiled
 def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
-    """Merge shortlists; rows of the second count from `start`; the first wins ties."""
-    second = replace(second, indices=jnp.where(second.mask, second.indices + start, -1))
+    """Merge shortlists; rows of the second count from `start`; the first wins ties, so it also fills missing places."""
+    second = replace(second, indices=second.indices + start)
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
     return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
@@ -209,8 +212,8 @@ def retrieve(
     similarity = similarity[: len(queries), : len(database)]
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask.astype(bool))
     depth = min(num_candidates, database_descriptors.shape[0])
-    largest, in_blocks = partial(jax.lax.top_k, k=depth), partial(_largest_in_blocks, depth=depth)
-    similarity = masked(similarity, usable, -jnp.inf)
+    similarity, largest = masked(similarity, usable, -jnp.inf), partial(_largest, depth=depth)
+    in_blocks = partial(_largest_in_blocks, depth=depth)
     scores, indices = jax.lax.platform_dependent(similarity, cpu=largest, default=in_blocks)
     padding = ((0, 0), (0, num_candidates - depth))
     scores = jnp.pad(scores, padding, constant_values=-jnp.inf)
@@ -222,22 +225,28 @@ def retrieve(
     )
 
 
-def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> list[Array]:
-    """`jax.lax.top_k` of each row, by the largest values of blocks, since an accelerator would sort whole rows.
+def _largest(values: Float[Array, "rows columns"], depth: int) -> tuple[Array, Array]:
+    """The largest values of each row and their columns; the first column wins a tie."""
+    largest, columns = jax.lax.top_k(values, depth)  # a list or a tuple, as JAX's version has it
+    return largest, columns
+
+
+def _largest_in_blocks(values: Float[Array, "rows columns"], depth: int) -> tuple[Array, Array]:
+    """`_largest` by the largest values of blocks, since an accelerator would sort whole rows.
 
     The values are in the `depth` blocks with the largest maxima, the first of equal ones, or after the last block.
     """
     rows, columns = values.shape
     count = columns // BLOCK
     if count <= depth:
-        return jax.lax.top_k(values, depth)
+        return _largest(values, depth)
     maxima = jnp.max(values[:, : count * BLOCK].reshape(rows, count, BLOCK), axis=2)
-    blocks = jnp.sort(jax.lax.top_k(maxima, depth)[1], axis=1)  # in their order, so that the first of equal values wins
+    blocks = jnp.sort(_largest(maxima, depth)[1], axis=1)  # in their order, so that the first of equal values wins
     members = (blocks[:, :, None] * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[None, None]).reshape(rows, -1)
     rest = jnp.tile(jnp.arange(count * BLOCK, columns, dtype=jnp.int32), (rows, 1))
     members = jnp.concatenate([members, rest], axis=1)
-    largest, places = jax.lax.top_k(jnp.take_along_axis(values, members, axis=1), depth)
-    return [largest, jnp.take_along_axis(members, places, axis=1)]
+    largest, places = _largest(jnp.take_along_axis(values, members, axis=1), depth)
+    return largest, jnp.take_along_axis(members, places, axis=1)
 
 
 def _at_least_two(rows: Float[Array, "_ dimensions"]) -> Float[Array, "_ dimensions"]:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.parameters import check_choices, choice, flag, number, table_value
+from mfvpr.scoring.parameters import check_plain, choice, flag, number, table_value
 from mfvpr.scoring.shifts import image_sizes, match_shifts
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_confidence, match_weights
@@ -31,7 +31,7 @@ class AggregatedScore:
         clamp: a shift that is further from the center than the image is wide counts 0 instead of growing again.
         temperature: px; T > 0 replaces |x| by the hyperbola sqrt(x^2 + T^2) - T, and the clamp of z by
             T log(1 + e^(z / T)), so that the score is smooth in the points (except for `median`). None is the paper's;
-            not above 0 scores NaN.
+            an array not above 0 scores NaN.
     """
 
     weight: Weight = table_value(NAMED_WEIGHTS, "dmf", file=SUFFIX)
@@ -39,7 +39,7 @@ class AggregatedScore:
     clamp: bool = flag(False)
     temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.scoring.parameters import check_choices, choice, flag, integer, number, table_value
+from mfvpr.scoring.parameters import check_plain, choice, flag, integer, number, table_value
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_confidence, match_weights
@@ -45,7 +45,8 @@ class AnchorPoints:
         first: image whose cells are the anchors, `query` or `candidate`.
         include_self: an anchor counts itself.
         cell_weight: w_a, summed weights of the matches that voted for the winner, of all matches of the cell, or 1.
-        temperature: without unit; T > 0 scores the soft form below. None is the paper's; not above 0 scores NaN.
+        temperature: without unit; T > 0 scores the soft form below. None is the paper's; an array
+            not above 0 scores NaN.
 
     The soft form is smooth in points and weights. A point at u, in cells, belongs to cell c along an axis in proportion
     to e^(-(u - c - 1/2)^2 / T); A0 and A1 are these memberships in both images, and V = A0^T diag(w) A1 the votes of
@@ -70,7 +71,7 @@ class AnchorPoints:
     )
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_plain(self)
         if not 0 < self.num_bins <= MAX_BINS:
             raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.parameters import check_choices, choice
+from mfvpr.scoring.parameters import check_plain, choice
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Matches, value
 
@@ -21,7 +21,7 @@ class MatchCount:
 
     single: str = choice("count", "zero", note="a pair with one match")
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from mfvpr.scoring.parameters import check_choices, choice, flag, integer
+from mfvpr.scoring.parameters import check_plain, choice, flag, integer
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
@@ -44,7 +44,7 @@ class GridAnchors:
     outside: str = choice("unequal", "zero", note="beyond the grid, of the CPU and of the GPU path")
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_plain(self)
         if self.side < 1 or not 1 <= self.size <= self.side or self.size % 2 == 0:
             raise InputError(f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd "
                              "patch up to it")  # fmt: skip

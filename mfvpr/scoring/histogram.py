@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.scoring.lattice import Lattice, bin_scores, climb, map_rows, pool_bins, smooth_tallest, tallest, votes
-from mfvpr.scoring.parameters import ANY, SCORE, check_choices, choice, flag, integer, number, numbers, table_value
-from mfvpr.scoring.shifts import are_finite, compensate_scale, image_sizes, match_shifts, require_sizes, where_usable
+from mfvpr.scoring.lattice import Lattice, bin_scores, climb, pool_bins, smooth_tallest, tallest, votes
+from mfvpr.scoring.parameters import SCORE, check_plain, choice, flag, integer, number, numbers, table_value
+from mfvpr.scoring.shifts import are_finite, image_sizes, match_shifts, require_sizes, where_usable
 from mfvpr.scoring.tallest import tallest_bins
 from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.scoring.weights import Weight, match_weights
@@ -68,12 +68,9 @@ class HistogramOfShifts:
         max_bins: capacity of bins per axis; by default as many as concrete values need, at most 1024. If image sizes
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
-        scales: sizes of the place in the candidate relative to the query, for a camera that moves forward. Each scale
-            has its own histogram, and the score is the largest of their tallest bins. The paper has scale 1 only.
-        scale_deviation: octaves; the votes at scale z count exp(-(log2 z)^2 / (2 scale_deviation^2)), because more
-            scales give incorrect pairs more chances as well.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
-            and smooth in everything but the number of bins. None is the paper's maximum; not above 0 scores NaN.
+            and smooth in everything but the number of bins. None is the paper's maximum; an array
+            not above 0 scores NaN.
     """
 
     bin_size: float | Array = number(15.0, "px")
@@ -89,15 +86,11 @@ class HistogramOfShifts:
     max_bins: int | None = integer(
         None, "capacity per axis", "None = what the image size needs", bounds=(1, MAX_BINS), swept=False
     )
-    scales: tuple[float, ...] = numbers(
-        (1.0,), ANY, "", "of the place, candidate over query; [1] = the paper's", bounds=(0.1, 10.0)
-    )
-    scale_deviation: float | Array = number(math.inf, "octaves", "of the scales' prior; None = all count alike")
     temperature: float | Array | None = number(
         None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
     )
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""
@@ -107,13 +100,11 @@ class HistogramOfShifts:
         self, matches: Matches, weights: Float[Array, "weightings slots"]
     ) -> Float[jax.Array, " weightings"]:
         """Scores of one pair with several weights of its matches (0 on padding)."""
-        shifts, lattice, capacity = self._shifts_by_scale(matches), self._lattice(matches), self._capacity(matches)
+        shifts, lattice, capacity = self._shifts(matches), self._lattice(matches), self._capacity(matches)
         pool = tallest
         if self.temperature is not None:
             pool = partial(smooth_tallest, temperature=positive(self.temperature, shifts.dtype))
-        scores = map_rows(lambda shifts: pool_bins(shifts, weights, lattice, capacity, pool), shifts)
-        scores = self._weigh_scales(scores)
-        scores = jax.vmap(lambda by_scale: pool(by_scale, jnp.ones_like(by_scale, bool)))(scores.T)
+        scores = pool_bins(shifts, weights, lattice, capacity, pool)
         return where_usable(scores, matches, shifts, weights, lattice.usable(capacity))
 
     def batch_scores_by_weights(
@@ -133,17 +124,15 @@ class HistogramOfShifts:
         return jax.lax.map(lambda pair: self.scores_by_weights(*pair), (matches, weights), batch_size=chunk_size)
 
     def _score_pair_by_pair(self, matches: Matches, weights: Array) -> Array:
-        capacity, shifts = self._capacity(matches), jax.vmap(self._shifts_by_scale)(matches)
+        capacity, shifts = self._capacity(matches), jax.vmap(self._shifts)(matches)
         lattice = jax.vmap(self._lattice)(matches)
-        by_scale = jnp.swapaxes(shifts, 0, 1)
-        scores = map_rows(lambda shifts: tallest_bins(shifts, weights, lattice, capacity), by_scale)
-        scores = jnp.max(self._weigh_scales(scores), axis=0)
+        scores = tallest_bins(shifts, weights, lattice, capacity)
         usable = jax.vmap(lambda lattice: lattice.usable(capacity))(lattice)
         return jax.vmap(where_usable)(scores, matches, shifts, weights, usable)
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
-        """All bins of one pair with their centers, at the scale that has the tallest bin."""
-        scores, lattice, usable, _ = self._vote(matches)
+        """All bins of one pair with their centers."""
+        scores, lattice, usable = self._vote(matches)
         x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
         return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
 
@@ -152,15 +141,9 @@ class HistogramOfShifts:
 
         It is the center of the tallest bin, the first in row-major order on a tie. With `refine` it is the peak
         between bin centers: the maximum of the same sum of Gaussians over all shifts that is uphill from that bin, to
-        1e-4 sigma, within `shift_range`. The derivatives of the peak do not depend on the bins. With several `scales`,
-        let z be the dominant one and c0, c1 the centers of query and candidate: a point p of the query lies at
-        c1 + z (p - c0) + sqrt(z) (shift - c1 + c0) in the candidate.
+        1e-4 sigma, within `shift_range`. The derivatives of the peak do not depend on the bins.
         """
         return _dominant_shift(self._fit_to(matches), matches, refine=refine)
-
-    def dominant_scale(self, matches: Matches) -> Float[jax.Array, ""]:
-        """Scale that has the tallest bin: the first on a tie, 1 without votes."""
-        return _dominant_scale(self._fit_to(matches), matches)
 
     def shift_interval(
         self, matches: Matches, *, level: float = 0.95, sharpness: float = 24.0
@@ -178,7 +161,7 @@ class HistogramOfShifts:
 
     def agrees(self, matches: Matches, shift: Float[Array, "2"]) -> Bool[jax.Array, " slots"]:
         """Matches within two standard deviations of a `shift` (x, y) px along both axes."""
-        shifts = self._shifts_by_scale(matches)[self._vote(matches)[-1] if len(self.scales) > 1 else 0].T
+        shifts = self._shifts(matches).T
         near = jnp.all(jnp.abs(shifts - shift[None]) <= 2 * self._deviation(shifts.dtype), axis=-1)
         return near & matches.mask
 
@@ -221,20 +204,13 @@ class HistogramOfShifts:
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
-    def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array, Array]:
-        """Scores `[B, B]` (y, x) of the scale with the tallest bin, -inf out of range; bins; whether usable; scale."""
+    def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array]:
+        """Scores `[B, B]` (y, x) of the bins, -inf out of range; bins; whether usable."""
         lattice, capacity = self._lattice(matches), self._capacity(matches)
-        shifts, weights = self._shifts_by_scale(matches), match_weights(self.weight, matches)
-        scores = map_rows(lambda shifts: bin_scores(*votes(shifts, lattice, capacity), weights), shifts)
-        scores = self._weigh_scales(scores)
-        scores = jnp.where(lattice.inside(capacity)[None], scores, -jnp.inf)
-        scale = jnp.argmax(jnp.max(scores, axis=(1, 2)))
+        shifts, weights = self._shifts(matches), match_weights(self.weight, matches)
+        scores = bin_scores(*votes(shifts, lattice, capacity), weights)
         usable = lattice.usable(capacity) & are_finite(shifts, weights[None])[0]
-        return scores[scale], lattice, usable, scale
-
-    def _weigh_scales(self, scores: Float[Array, "scales ..."]) -> Float[Array, "scales ..."]:
-        octaves = jnp.log2(jnp.asarray(self.scales, scores.dtype)) / positive(self.scale_deviation, scores.dtype)
-        return scores * jnp.exp(-0.5 * octaves**2).reshape(-1, *(1,) * (scores.ndim - 1))
+        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, usable
 
     def _lattice(self, matches: Matches) -> Lattice:
         dtype = match_shifts(matches).dtype
@@ -270,9 +246,9 @@ class HistogramOfShifts:
         num_bins = xp.maximum(xp.ceil((upper - edge) / bin_size - slack), 1)
         return edge + bin_size / 2, xp.where((bin_size > 0) & (lower <= upper), num_bins, 0)
 
-    def _shifts_by_scale(self, matches: Matches) -> Float[Array, "scales 2 slots"]:
-        """Shifts along x and along y, at every scale."""
-        shifts = jnp.stack([match_shifts(compensate_scale(matches, scale)).T for scale in self.scales])
+    def _shifts(self, matches: Matches) -> Float[Array, "2 slots"]:
+        """Shifts along x and along y."""
+        shifts = match_shifts(matches).T
         # The barrier keeps the copy: strided coordinates would keep the exponentials from being vectorized.
         return jax.lax.optimization_barrier(shifts if self.direction == "candidate_minus_query" else -shifts)
 
@@ -283,10 +259,10 @@ class HistogramOfShifts:
 
 @partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, lattice, usable, scale = scorer._vote(matches)
+    scores, lattice, usable = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([lattice.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
-    shifts, weights = scorer._shifts_by_scale(matches)[scale].T, match_weights(scorer.weight, matches)
+    shifts, weights = scorer._shifts(matches).T, match_weights(scorer.weight, matches)
     if refine:
         shift = climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
         if scorer.shift_range is not None:
@@ -297,16 +273,9 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
 
 
 @compiled
-def _dominant_scale(scorer: HistogramOfShifts, matches: Matches) -> Array:
-    scores, _, usable, scale = scorer._vote(matches)
-    dominant = jnp.where(jnp.max(scores) > 0, jnp.asarray(scorer.scales, scores.dtype)[scale], 1.0)
-    return jnp.where(usable | ~jnp.any(matches.mask), dominant, jnp.nan)
-
-
-@compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
     """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
-    scores, lattice, usable, _ = scorer._vote(matches)
+    scores, lattice, usable = scorer._vote(matches)
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.scoring import planes
-from mfvpr.scoring.parameters import check_choices, choice, flag, integer, number
+from mfvpr.scoring.parameters import check_plain, choice, flag, integer, number
 from mfvpr.scoring.shifts import query_features, require_sizes
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -41,10 +41,11 @@ class Homography:
 
     Attributes:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
-        max_iterations: maximum number of samples; less than 1 scores NaN. Degenerate draws do not count, but the search
-            ends early if almost all draws (49 of 50) are degenerate.
+        max_iterations: maximum number of samples; an array less than 1 scores NaN. Degenerate draws do not count, but
+            the search ends early if almost all draws (49 of 50) are degenerate.
         confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
-            as the best model has; from 1 on it never stops early, not above 0 scores NaN.
+            as the best model has; an array of 1 never stops early, one not above 0 scores
+            NaN.
         measure: `inliers` counts inliers; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after the count.
@@ -62,7 +63,7 @@ class Homography:
     per_feature: bool = flag(False)
     seed: int = integer(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

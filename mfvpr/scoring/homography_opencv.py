@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.scoring.parameters import check_bounds, check_choices, choice, number
+from mfvpr.scoring.parameters import check_bounds, check_plain, choice, number
 from mfvpr.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, is_concrete
@@ -37,7 +37,7 @@ class OpenCvHomography:
     estimator: str = choice("ransac", "magsac")
     few: str = choice("count", "zero", note="less than 4 matches")
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
         """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""

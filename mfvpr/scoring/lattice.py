@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from mfvpr.types import Array
 from mfvpr.utils.numerics import masked, safe_sqrt
 
+_NEAR = 32.0  # temperatures; e^32 is far from overflow
 _MOST_STEPS = 100  # hardly any pair needs 10
 _TOLERANCE = 1e-4  # standard deviations
 
@@ -80,10 +81,14 @@ def smooth_tallest(
     values: Float[Array, "*bins"], mask: Bool[Array, "*bins"], *, temperature: Array
 ) -> Float[Array, ""]:
     """T log(mean of e^(v / T)) of the values where `mask`."""
-    # Relative to the maximum nothing overflows or cancels. The maximum drops out, so that its gradient would be 0.
+    # Relative to the maximum nothing overflows. The maximum drops out, so that its gradient would be 0.
     largest = jax.lax.stop_gradient(jnp.max(values))
     below = (masked(values, mask, largest) - largest) / temperature
-    return largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))
+    far = largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))
+    # Where the sum of both terms would cancel: small values, or one peak in many bins.
+    is_near = (largest <= _NEAR * temperature) & (jnp.min(values) >= -temperature)
+    ratios = masked(values / temperature, mask & is_near)
+    return jnp.where(is_near, temperature * jnp.log1p(jnp.mean(jnp.expm1(ratios), where=mask)), far)
 
 
 def pool_bins(

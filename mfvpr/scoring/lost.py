@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.scoring.parameters import check_choices, choice, flag
+from mfvpr.scoring.parameters import check_plain, choice, flag
 from mfvpr.scoring.shifts import image_sizes
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -39,7 +39,7 @@ class LostScore:
     form: str = choice("weighted", "unweighted", "described")
     mirrored: bool = flag(False, "views from opposite directions")
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

@@ -22,7 +22,6 @@ from mfvpr.utils.errors import InputError
 
 POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 silently overflows or underflows
 SCORE = "units of the score"
-ANY = -1  # length of a list: one or more
 _KEY = "parameter"  # of the field's metadata
 
 
@@ -36,7 +35,7 @@ class Parameter:
     choices: tuple[Any, ...] = ()  # all allowed values; empty = numbers within `bounds`
     bounds: tuple[float, float] = POSITIVE
     whole: bool = False  # numbers are integers
-    length: int = 0  # of a list of numbers; 0 = one number, ANY = a list of one or more
+    length: int = 0  # of a list of numbers; 0 = one number
     none: float | None = None  # field value for None, which is allowed if it is the default
     named: Mapping[str, Any] | None = None  # field values by the words of `choices`
     file: str = ""  # suffix of files that are allowed in place of a word; "" = no files
@@ -79,10 +78,10 @@ def number(
 def numbers(
     default: Sequence[float] | None, length: int, unit: str = "", note: str = "", *, bounds: tuple = POSITIVE
 ) -> Any:
-    """Declare a tuple of `length` numbers, static for the length ANY; None is allowed if it is the default."""
+    """Declare a tuple of `length` numbers, None is allowed if it is the default."""
     plain = None if default is None else list(default)
     parameter = Parameter(plain, unit, note, bounds=bounds, length=length, swept=False)
-    return _field(default, parameter, static=length == ANY)
+    return _field(default, parameter)
 
 
 def integer(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
@@ -122,20 +121,23 @@ def summary(method: type) -> str:
     return (getmodule(method).__doc__ or method.__name__).splitlines()[0]
 
 
-def check_choices(method: Any) -> None:
-    """Raise a ValueError if a field holds a word that is not one of its choices."""
+def check_plain(method: Any) -> None:
+    """Raise an InputError if a field holds a word that is not one of its choices, or a Python float out of bounds."""
     for name, parameter in parameters_of(method).items():
         choices, value = parameter.choices, getattr(method, name)
         if choices and parameter.named is None and value not in choices:
             expected = ", ".join(map(str, choices))
-            raise ValueError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+            raise InputError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+    check_bounds(method, all_arrays=False)
 
 
-def check_bounds(method: Any) -> None:
-    """Raise an InputError if a field holds a number out of bounds; no number may be traced."""
+def check_bounds(method: Any, *, all_arrays: bool = True) -> None:
+    """Raise an InputError if a field holds a number out of bounds; no number may be traced if `all_arrays` count."""
     for name, parameter in parameters_of(method).items():
         value, (low, high) = getattr(method, name), parameter.bounds
-        if parameter.choices or value is None:
+        parts = value if isinstance(value, tuple) else (value,)
+        is_plain = not parameter.whole and all(isinstance(part, int | float) for part in parts)
+        if parameter.choices or value is None or not (is_plain or all_arrays):
             continue
         values = np.ravel(np.asarray(value, float))
         if not ((values >= low) & (values <= high) | (values == parameter.none)).all():

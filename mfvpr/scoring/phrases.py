@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.scoring.parameters import check_choices, choice, integer, number
+from mfvpr.scoring.parameters import check_plain, choice, integer, number
 from mfvpr.scoring.shifts import match_shifts
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -26,7 +26,7 @@ class VisualPhrases:
 
     Attributes:
         length: matches per phrase, from 1 to 8 (else a ValueError).
-        cell_size: width of the cells, px; not above 0 scores NaN.
+        cell_size: width of the cells, px; an array not above 0 scores NaN.
         align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the upper cell.
     """
 
@@ -35,7 +35,7 @@ class VisualPhrases:
     align: str = choice("zero_center", "zero_edge")
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_plain(self)
         if not 1 <= self.length <= MAX_LENGTH:
             raise ValueError(f"VisualPhrases(length={self.length}): expected from 1 to {MAX_LENGTH} matches")
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.scoring.parameters import check_choices, choice, flag, numbers
+from mfvpr.scoring.parameters import check_plain, choice, flag, numbers
 from mfvpr.scoring.shifts import image_sizes, match_shifts, query_features
 from mfvpr.scoring.weights import match_confidence
 from mfvpr.types import Array, Matches, value
@@ -34,7 +34,7 @@ class RapidSpatialScore:
     size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = what reach says")
     per_feature: bool = flag(False)
 
-    __post_init__ = check_choices
+    __post_init__ = check_plain
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32; an InputError if `per_feature` is set and the matches have no `count0`."""

@@ -1,6 +1,5 @@
 """Shifts of matches, and the image sizes that bound them."""
 
-import math
 from dataclasses import replace
 
 import jax
@@ -18,28 +17,9 @@ def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
     Example:
         mfvpr.match_shifts(matches)  # [K, 2], (x, y)
     """
+    matches = replace(matches)  # checks the shapes, as in `match_weights`
     start, end = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
     return end - start
-
-
-def compensate_scale(matches: Matches, scale: float) -> Matches:
-    """Matches of one pair, rescaled as if both images showed the place at the same size.
-
-    `scale` is the size of the place in the candidate relative to the query. Points are scaled about the centers of
-    their images, by sqrt(scale) in the query and 1 / sqrt(scale) in the candidate: errors count the same in both.
-    """
-    if scale == 1:
-        return matches
-    require_sizes(matches.image_size0, matches.image_size1)
-    root = math.sqrt(scale)
-    points0 = _scale_about_center(matches.points0, matches.image_size0, root)
-    points1 = _scale_about_center(matches.points1, matches.image_size1, 1 / root)
-    return replace(matches, points0=points0, points1=points1)
-
-
-def _scale_about_center(points: Array, image_size: Array, factor: float) -> Float[Array, "slots 2"]:
-    center = at_least_single(image_size)[None] / 2
-    return center + factor * (at_least_single(points) - center)
 
 
 def require_sizes(*image_sizes: Array | None) -> None:

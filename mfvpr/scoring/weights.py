@@ -104,15 +104,22 @@ WEIGHTS: dict[str, Weight] = {
 def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"]:
     """Weights `[K]` of one pair's `matches` by a `weight`, times their confidence, 0 on padding.
 
+    An `InputError` if the weight returns another shape, or if the arrays of the matches have different lengths.
+
     Example:
         mfvpr.match_weights(mfvpr.DescriptorDistanceWeight(), matches)  # [K]
     """
+    matches = replace(matches)  # checks the shapes, which `jax.tree.map` may have changed: they would be broadcast
     # Padding is set to 1 before the weight's arithmetic: its NaN would reappear in the gradients.
     clean = {
         name: masked(values if name in INDICES else at_least_single(values), matches.mask, 1)
         for name, values in per_match(matches).items()
     }
-    weights = masked(at_least_single(weight(replace(matches, **clean))), matches.mask)
+    weights = at_least_single(weight(replace(matches, **clean)))
+    if weights.shape != matches.mask.shape:
+        raise InputError(f"weight: expected a weight for each of {list(matches.mask.shape)} matches, got an array "
+                         f"{list(weights.shape)}")  # fmt: skip
+    weights = masked(weights, matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
 
 

@@ -162,7 +162,7 @@ RULES: dict[str, Rule] = {
         "stride": whole(1, 8),
         "block": whole(-24, 23),
         "previous_queries": whole(0, 1000),
-        ".sequence": either(or_list(one_of("causal", "lagged", "smoothed", "viterbi")), None),
+        ".sequence": either(or_list(one_of("causal", "lagged", "smoothed")), None),
         "trials": whole(1, 100_000),
         "batch hidden": whole(1, 1024),
         # numbers
@@ -176,11 +176,13 @@ RULES: dict[str, Rule] = {
         "c": either(_NOT_NEGATIVE, "auto"),
         "fusion.c": either(_NOT_NEGATIVE, "auto", "zscore"),
         "fusion.weights": any_of("weights by name, such as {retrieval: 0.5, anchor: 1}, or null", one_of(None)),
-        "field_of_view": either(number(1, 179), None),
+        "field_of_view": either(number(5, 179), None),
         "route": either(number(-1000, 1000), None, "auto"),
     }.items()
     for name in names.split()
 }
+# Settings of a histogram that were removed in version 0.3.0, and the values with which they changed nothing.
+REMOVED = {"scales": [1.0], "scale_deviation": None}
 # Settings that take effect with another one only, and the words of the error.
 _NEEDS = (
     ("also", "report", "report=DATASET,... as well, to learn on several data sets and report on others"),
@@ -229,11 +231,22 @@ def check(settings: Mapping[str, Any]) -> None:
             raise SettingsError(f"{name}={value}: expected {expected}")
 
 
+def without_removed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of an old file without `REMOVED` ones that changed nothing."""
+    return {
+        name: without_removed(value) if isinstance(value, Mapping) else value
+        for name, value in settings.items()
+        if name not in REMOVED or value != REMOVED[name]
+    }
+
+
 def _check_values(settings: Mapping[str, Any], methods: Mapping[str, str]) -> None:
     for path, value in nodes(settings):
         if isinstance(value, Mapping):
             continue
         rule = _rule(path, methods)
+        if rule is None and path.rpartition(".")[2] in REMOVED:
+            raise SettingsError(f"{path}={value}: this setting was removed in version 0.3.0")
         if rule is None and methods["scorer"] and path.startswith("scorer."):
             name = path.removeprefix("scorer.")
             raise SettingsError(f"scorer={methods['scorer']} has no setting {name}; see --help")
@@ -289,7 +302,7 @@ def _limit_rule(*, length: int = 0, optional: bool = False, file: str = "", **li
     if file:
         files = pattern(f"(?s).*{re.escape(file)}", f"a file that ends in {file}")
         rule = any_of(f"{rule.expected}, or {files.expected}", rule, files)
-    rule = list_of(rule, max(length, 0)) if length else rule
+    rule = list_of(rule, length) if length else rule
     return either(rule, None) if optional else rule
 
 

@@ -1,6 +1,7 @@
 """Work on many processes or machines, by Dask Distributed (extra `cluster`)."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import lru_cache
+from importlib import import_module
 from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
@@ -39,24 +41,31 @@ class Cluster:
     every block checks. If a worker dies, another worker repeats its block. Results are those of one process to the bit
     if all machines have the same processors or GPUs, number of XLA threads, and options of JAX, which workers read from
     their environment. Put extractors and matchers of your own into a module that workers can import.
+
+    A scheduler runs the code that it gets. `local` and `slurm` encrypt its connections, by a key pair that only this
+    process and its workers have. The dashboard listens on 127.0.0.1: other users of the machine can read it.
     """
 
     def __init__(self, client: Any) -> None:
         """Use the workers of `client`, a `distributed.Client`, whatever started them; they need one thread each."""
-        self._client = client
+        self._client, self._dashboard = client, client.dashboard_link
 
     def __str__(self) -> str:
         address = self._client.scheduler.address
-        return f"{len(self._client.nthreads())} workers at {address}, dashboard {self._client.dashboard_link}"
+        return f"{len(self._client.nthreads())} workers at {address}, dashboard {self._dashboard}"
 
     @classmethod
     @contextmanager
     def connect(cls, address: str) -> Iterator["Cluster"]:
-        """The workers of the scheduler at `tcp://HOST:PORT`; an `InputError` if nothing answers there."""
+        """The workers of the scheduler at `tcp://HOST:PORT`, or `tls://HOST:PORT` with the key of Dask's configuration.
+
+        An `InputError` if no scheduler answers there.
+        """
         try:
             client = _distributed().Client(address, set_as_default=False)
-        except OSError:
-            raise InputError(f"cluster: expected a scheduler at {address}, got no answer; check the address") from None
+        except (OSError, TypeError):  # the latter for tls:// without a key
+            hint = "check the address and, for tls://, distributed.comm.tls of Dask's configuration"
+            raise InputError(f"cluster: expected a scheduler at {address}, got no answer; {hint}") from None
         with client:
             yield cls(client)
 
@@ -66,14 +75,21 @@ class Cluster:
         """Start worker processes on this machine, until the block ends; `options` are those of `LocalCluster` of Dask.
 
         Each has an equal share of the processors, or as many threads of XLA as the variable PJRT_NPROC says. Scripts
-        need `if __name__ == "__main__":` before it.
+        need `if __name__ == "__main__":` before it. An `InputError` if a worker does not start.
         """
         threads = os.environ.get("PJRT_NPROC") or str(max(1, available_cpus() // max(1, workers)))
-        options = {"dashboard_address": ":0", "env": {"PJRT_NPROC": threads}} | options
+        options = {"dashboard_address": "127.0.0.1:0", "security": True, "env": {"PJRT_NPROC": threads}} | options
         resource_tracker.ensure_running()  # its start would unblock the signal
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # workers end with this process
         try:  # Dask does not count JAX's memory
             started = _distributed().LocalCluster(n_workers=workers, threads_per_worker=1, memory_limit=0, **options)
+        except RuntimeError as error:
+            reason: BaseException = error
+            while reason.__cause__:
+                reason = reason.__cause__
+            line = f"{' '.join(str(reason).split())} ({type(reason).__name__})"
+            hint = "in a script, put `if __name__ == '__main__':` before the cluster"
+            raise InputError(f"cluster: a worker process did not start: {line}; {hint}") from None
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with started, cls.connect(started) as cluster:
@@ -83,12 +99,18 @@ class Cluster:
     @contextmanager
     def slurm(cls, workers: int, options: str = "") -> Iterator["Cluster"]:
         """Start Slurm jobs of one worker each until the block ends; `options` of `sbatch`, such as `--gpus=1`."""
-        with cls.local(0, host="tcp://") as cluster:
+        with cls.local(0, host="tls://") as cluster:
+            cluster._dashboard = re.sub(r"//.*:", "//127.0.0.1:", cluster._dashboard)
             worker = [sys.executable, "-m", "distributed.cli.dask_worker", cluster._client.scheduler.address,
-                      "--nthreads=1", "--memory-limit=0", "--no-dashboard", "--death-timeout=60"]  # fmt: skip
+                      "--nthreads=1", "--memory-limit=0", "--no-dashboard", "--dashboard-address=127.0.0.1:0",
+                      "--death-timeout=60"]  # fmt: skip
             script = f"export PJRT_NPROC=${{PJRT_NPROC:-${{SLURM_CPUS_PER_TASK:-1}}}}; exec {shlex.join(worker)}"
             array = ["--parsable", "--requeue", "--job-name=mfvpr", f"--array=1-{workers}"]
-            job = _run_slurm("sbatch", *array, *shlex.split(options), f"--wrap={script}").partition(";")[0].strip()
+            security, name = cluster._client.security, "DASK_DISTRIBUTED__COMM__TLS__"
+            keys = {f"{name}CA_FILE": security.tls_ca_file, f"{name}WORKER__KEY": security.tls_worker_key,
+                    f"{name}WORKER__CERT": security.tls_worker_cert}  # fmt: skip
+            command = ["sbatch", *array, *shlex.split(options), f"--wrap={script}"]
+            job = _run_slurm(*command, **keys).partition(";")[0].strip()
             try:
                 yield cluster
             finally:
@@ -145,15 +167,18 @@ def _distributed() -> Any:
         from dask import config
 
         config.update_defaults({"logging": _LOGGING})  # read by the next import
+        import_module("cryptography")  # of temporary keys
         import distributed
     except ImportError:
-        raise InputError("cluster: Dask Distributed is not installed; pip install 'mfvpr[cluster]'") from None
+        raise InputError(
+            "cluster: Dask Distributed or cryptography is not installed; pip install 'mfvpr[cluster]'"
+        ) from None
     config.update_defaults(_SETTINGS)
     return distributed
 
 
-def _run_slurm(*command: str) -> str:
-    done = subprocess.run(command, capture_output=True, text=True)
+def _run_slurm(*command: str, **variables: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | variables)
     if done.returncode:
         raise InputError(f"cluster: {shlex.join(command[:2])}: {' '.join(done.stderr.split())}; check cluster.options")
     return done.stdout

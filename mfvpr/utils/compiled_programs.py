@@ -4,6 +4,9 @@ import math
 import os
 import platform
 import re
+import stat
+import warnings
+from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -19,27 +22,43 @@ VARIABLE = "MFVPR_COMPILED"
 _PROCESSOR = r"^(?:vendor_id|cpu family|model|flags|CPU implementer|CPU part|Features|cpu|isa)\s*:.*$"
 
 
-def keep_compiled_programs() -> None:
+def keep_compiled_programs(warn: Callable[[str], object] = warnings.warn) -> None:
     """Let JAX read compiled programs from disk, and write new ones there, for the rest of this process.
 
     They lie in a subfolder of `$MFVPR_CACHE/compiled`, by default `~/.cache/mfvpr/compiled`, for each processor and
-    version: they hold machine code for one processor, and the folder may be shared or copied. Delete it at any time.
-    Where it cannot be written, it is only read. Nothing changes with `MFVPR_COMPILED=false`, or if JAX has a folder of
-    its own (`jax_compilation_cache_dir`) or no compilation cache.
+    version: they hold machine code for one processor, and the folder may be copied. Delete it at any time.
+    Where it cannot be written, it is only read. Nothing changes with `MFVPR_COMPILED=false`, without a home folder or
+    `MFVPR_CACHE`, or if JAX has a folder of its own (`jax_compilation_cache_dir`) or no compilation cache. A folder
+    that another user owns (except root) or can write to is not used, and `warn` gets a line once.
     """
     is_on, config = os.environ.get(VARIABLE) or "true", dict[str, Any](jax.config.values)
     require_word(VARIABLE, is_on, Literal["true", "false"])
     if is_on == "false" or config["jax_compilation_cache_dir"] or not config["jax_enable_compilation_cache"]:
         return
     folder = _folder()
+    if folder.parts[0] == "~":  # no home folder
+        return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(0o755, parents=True, exist_ok=True)
+        masks = {folder: 0o022, folder.parent: 0o002, folder.parents[1]: 0o002}
+        foreign = [path for path, mask in masks.items() if _is_foreign(path.stat(), mask)]
     except OSError:
+        return
+    if foreign:
+        warn(f"{foreign[0]}: expected a folder that is yours and that nobody else can write to, as it holds machine "
+             "code; compiled programs are not kept; run `chmod go-w` on it, or set MFVPR_CACHE")  # fmt: skip
+        os.environ[VARIABLE] = "false"  # also for later calls and child processes
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     seconds = 0.0 if os.access(folder, os.W_OK) else math.inf  # of a compilation, from which on it is written
     jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
     compilation_cache.reset_cache()  # JAX looks for a folder once, at the first compilation
+
+
+def _is_foreign(status: os.stat_result, mask: int) -> bool:
+    """Whether another user may change a folder; in a sticky one, such as /tmp, only entries of his own."""
+    is_open = status.st_mode & mask and not (mask == 0o002 and status.st_mode & stat.S_ISVTX)
+    return bool(is_open) or status.st_uid not in {0, os.getuid()}
 
 
 def _folder() -> Path:

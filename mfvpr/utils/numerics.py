@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Num, Shaped
 
-from mfvpr.utils.errors import NoGradientError
+from mfvpr.utils.errors import InputError, NoGradientError
 
 if TYPE_CHECKING:  # type checkers do not see that `jax.Device` is a class
     from jaxlib._jax import Device
@@ -51,7 +51,13 @@ def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.
 
 
 def as_array(values: Any) -> Any:
-    """`values`; lists as NumPy's arrays, arrays of other libraries (DLPack) as NumPy's, or JAX's on an accelerator."""
+    """`values`; lists as NumPy's arrays, arrays of other libraries (DLPack) as NumPy's, or JAX's on an accelerator.
+
+    An `InputError` for a masked NumPy array, whose mask would be lost.
+    """
+    if np.ma.is_masked(values):
+        raise InputError("arrays: expected arrays without a mask of NumPy, got masked entries; leave them out, for "
+                         "instance by array.compressed()")  # fmt: skip
     if isinstance(values, list | tuple):
         return np.asarray(values)
     if not _is_foreign(values):

@@ -110,7 +110,7 @@ def test_lines_of_localize(convert, tmp_path, settings):
     dataset = dataset_of(settings["dataset"])
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     line = {"image": "/drive/1403636579763555584.png", "place": "a", "confidence": None, "shift": None, "reason": None,
-            "shift_interval": None, "scale": None, "image_width": 9,
+            "shift_interval": None, "image_width": 9,
             "alternatives": [{"name": dataset.database.names[3], "score": 2.0}]}  # fmt: skip
     (tmp_path / "lines").write_text(json.dumps(line) + "\n" + json.dumps({"image": "/drive/1.5.png", "error": "bad"}))
     files = ("--poses", tmp_path / "tum.txt", "--database", dataset.database.root)

@@ -11,7 +11,7 @@ from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.cli import axes, command_line, declare, groups, help_text, overrides
 from mfvpr.scoring import ALONE, SCORERS, match_shifts
 from mfvpr.scoring.parameters import (
-    check_choices,
+    check_plain,
     choice,
     flag,
     from_values,
@@ -46,7 +46,7 @@ class Nearness:
     inner: tuple = ()  # no setting
 
     def __post_init__(self) -> None:
-        check_choices(self)
+        check_plain(self)
 
     def __call__(self, matches: Matches) -> Array:
         shifts = jnp.abs(match_shifts(matches))

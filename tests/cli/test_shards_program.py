@@ -126,7 +126,7 @@ def test_ctrl_c_leaves_no_worker_and_the_next_run_goes_on(settings, plain, evalu
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-*.npz")}
     code, _, stderr = evaluate("cluster=local", "cluster.workers=3", f"out={tmp_path}/out")
     assert code == 0
-    assert "cluster: 3 workers at tcp://127.0.0.1:" in stderr
+    assert "cluster: 3 workers at tls://127.0.0.1:" in stderr
     assert tables(tmp_path / "out") == tables(plain)
     assert stored.items() <= {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-*.npz")}.items()
 
@@ -142,7 +142,7 @@ def test_slurm_starts_the_workers_and_ends_them(settings, plain, evaluate, tmp_p
     cluster = "cluster=slurm", "cluster.workers=2", f"cluster.options={options}"
     code, _, stderr = evaluate(*cluster, f"out={tmp_path}/out")
     assert code == 0, stderr
-    assert "cluster: 0 workers at tcp://" in stderr
+    assert "cluster: 0 workers at tls://" in stderr
     assert tables(tmp_path / "out") == tables(plain)
     assert options in (tmp_path / "options").read_text()
     assert (tmp_path / "ended").read_text() == "12345\n"

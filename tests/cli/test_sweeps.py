@@ -61,7 +61,7 @@ def test_the_best_setting_is_honestly_named(swept):
     assert len(repr(result)) < 200
 
 
-@pytest.mark.parametrize("method", ["causal", "viterbi"])
+@pytest.mark.parametrize("method", ["causal", "smoothed"])
 def test_a_sequence_ranks_as_in_an_evaluation(dataset, method):
     """Its queries have been fused with the retrieval before."""
     sift, cache = Sift(), FeatureCache()

@@ -15,6 +15,8 @@ from jax import export as jax_export
 import mfvpr
 from mfvpr import ExportShapes, InputError
 from mfvpr.deployment import folders
+from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.retrieval import Retrieval
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.thorough
@@ -90,6 +92,34 @@ def test_wrong_inputs_are_refused(written, change, message):
         program()
 
 
+@pytest.mark.parametrize(("name", "size"), [
+    ("image_size0", [0, 0]), ("image_size0", [-320, 240]), ("image_size0", [np.nan, 240]), ("image_size0", [240, 320]),
+    ("image_size1", [[320, 240], [240, 320], [320, 240]]),
+])  # fmt: skip
+def test_image_sizes_that_cannot_be_right_are_refused(written, name, size):
+    program = mfvpr.load_exported(written)
+    with pytest.raises(InputError, match=rf"^{name}: expected \(width, height\)"):
+        program(**inputs_of(program) | {name: np.array(size, np.float32)})
+
+
+def test_sizes_of_padding_may_be_anything(written):
+    program = mfvpr.load_exported(written)
+    inputs = inputs_of(program)
+    expected = program(**inputs)
+    inputs["image_size1"][-1] = inputs["points1"][-1] = np.nan  # the last candidate has no matches
+    assert program(**inputs)["scores"].tolist() == expected["scores"].tolist()
+
+
+def test_a_system_checks_the_keypoints_of_both_images(tmp_path):
+    pipeline = mfvpr.Pipeline(Sift(), Retrieval(Aggregated(Sift(), VladFitting())))
+    system = mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts()})
+    program = mfvpr.export(tmp_path / "system", system, SHAPES, onnx=False)
+    inputs = inputs_of(program)
+    for name in ("image_size0", "image_size1"):
+        with pytest.raises(InputError, match=name):
+            program(**inputs | {name: inputs[name][..., ::-1].copy()})
+
+
 def edit(folder, change):
     path = folder / "export.json"
     description = json.loads(path.read_text())
@@ -133,6 +163,14 @@ def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
     with pytest.raises(InputError, match=message) as error:
         mfvpr.load_exported(folder)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no array"])
+def test_a_check_with_a_damaged_array_is_one_line(folder, content):
+    program = mfvpr.load_exported(folder)
+    (folder / "check" / "mask.npy").write_bytes(content)  # after the hashes were compared
+    with pytest.raises(InputError, match=r"mask\.npy: expected an array, got a damaged file"):
+        program.check()
 
 
 def exchange_program(folder, content):

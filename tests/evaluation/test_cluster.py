@@ -2,6 +2,8 @@
 
 import os
 import signal
+import socket
+import ssl
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
@@ -132,3 +134,33 @@ def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(datas
 def test_a_cluster_needs_a_folder(dataset, cluster):
     with pytest.raises(InputError, match="cluster: expected a cache with a root"):
         rank_dataset(dataset, system_of(), runtime=Runtime(cluster=cluster))
+
+
+def test_who_has_no_key_of_the_cluster_reaches_neither_scheduler_nor_workers(cluster):
+    client, context = cluster._client, ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    client.wait_for_workers(3)  # again, if an earlier test killed some
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    addresses = {client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())}
+    assert len(addresses) >= 7
+    for address in addresses:
+        host, port = address.removeprefix("tls://").split(":")
+        assert host == "127.0.0.1"
+        encrypted = context.wrap_socket(socket.create_connection((host, int(port))))
+        with encrypted, pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
+            encrypted.recv(1)
+        with pytest.raises(InputError, match="got no answer"), Cluster.connect(address):
+            pass
+
+
+def test_the_dashboard_listens_on_this_machine_alone(cluster):
+    port = int(str(cluster).rpartition(":")[2].partition("/")[0])
+    with socket.socket() as other:
+        other.bind(("127.0.0.2", port))  # free, unless the dashboard listens on all addresses
+
+
+def test_a_worker_that_does_not_start_is_one_line(monkeypatch):
+    monkeypatch.setenv("PYTHONHOME", "/none")
+    with pytest.raises(InputError, match="a worker process did not start") as raised, Cluster.local(1):
+        pass
+    assert "\n" not in str(raised.value)

@@ -19,6 +19,6 @@ def test_images_are_what_their_names_say():
 
 def test_a_line_counts_refusals_and_correct_predictions():
     candidate = lambda row: (Alternative(row, "", "", 1.0),)  # noqa: E731
-    predictions = [Prediction("", candidate(row), 1.0, None, None, None, None) for row in (0, 9)]
-    predictions.append(Prediction(None, (), 0.0, None, None, None, None, "too few matches"))
+    predictions = [Prediction("", candidate(row), 1.0, None, None, None) for row in (0, 9)]
+    predictions.append(Prediction(None, (), 0.0, None, None, None, "too few matches"))
     assert unusable.row("blur", [2, 3, 4], predictions) == "| blur | 3 | 33 | 1 too few matches | 50 |"

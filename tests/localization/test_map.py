@@ -85,7 +85,6 @@ def test_an_image_of_the_map_is_found_where_it_is(dataset, folder):
     (low_x, low_y), (high_x, high_y) = prediction.shift_interval
     assert low_x <= prediction.shift[0] <= high_x
     assert low_y <= prediction.shift[1] <= high_y
-    assert prediction.scale == 1
     assert prediction.reason is None
     assert len(prediction.as_json(2)["alternatives"]) == 2
 
@@ -109,8 +108,9 @@ def test_a_shift_is_in_px_of_the_image_that_was_given(small_street, tmp_path, wi
                 for x, _ in (prediction.shift, *prediction.shift_interval)]  # fmt: skip
     assert prediction.shift_angles(80.0) == pytest.approx(expected, rel=1e-12)
     assert prediction.as_json()["shift_fraction"] == prediction.shift_fraction
-    with pytest.raises(InputError, match=r"field_of_view=180: expected degrees"):
-        prediction.shift_angles(180)
+    for field_of_view in (180, 1.2, np.nan):
+        with pytest.raises(InputError, match=r"field_of_view=.*: expected degrees"):
+            prediction.shift_angles(field_of_view)
 
 
 def test_without_a_shift_there_is_no_angle(dataset, folder):
@@ -183,7 +183,7 @@ def test_unsure_answers_are_no_place(dataset, folder):
     refused = opened(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
     assert refused.place is None
     assert refused.confidence < 1e-9
-    assert (refused.reason, refused.shift, refused.shift_interval, refused.scale) == ("low confidence", *[None] * 3)
+    assert (refused.reason, refused.shift, refused.shift_interval) == ("low confidence", None, None)
     assert refused.alternatives == sure.alternatives
     assert opened(folder, confidence=SURE, threshold=sure.confidence).localize(image).place == sure.place
     with pytest.raises(InputError, match="expected a confidence as well"):

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.thorough
 
 
 def without_place(reason, image):
-    return Prediction(None, (), 0.0, None, None, None, None, reason, image.shape[1])
+    return Prediction(None, (), 0.0, None, None, None, reason, image.shape[1])
 
 
 @pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])

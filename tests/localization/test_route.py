@@ -15,7 +15,7 @@ from mfvpr.utils import InputError
 def prediction(scores, p=None):
     """A prediction with scores by row."""
     alternatives = tuple(Alternative(row, str(row), row, score) for row, score in scores.items())
-    return Prediction(None, alternatives, 0.0, p, None, None, None)
+    return Prediction(None, alternatives, 0.0, p, None, None)
 
 
 def sharp(row, p=1.0):

@@ -5,6 +5,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
 
 import mfvpr
@@ -173,7 +174,9 @@ def test_nothing_is_written_of_rows_that_cannot_be_stored(images, folder):
     known = opened(folder)
     features, vector = known.describing.image(images.paths[6])
     files = sorted(folder.rglob("*"))
-    for bad, words in ((vector[:5], r"^bad: .*\[36\], got \[5\]"), (vector.astype(str) + "x", r"row 7: could not")):
+    infinite, not_a_number = (np.append(vector[1:], value) for value in (np.inf, np.nan))
+    for bad, words in ((vector[:5], r"^bad: .*\[36\], got \[5\]"), (vector.astype(str) + "x", r"row 7: could not"),
+                       (infinite, "^bad: .* finite"), (not_a_number, "^bad: .* finite")):  # fmt: skip
         entries = [Entry("good", 0, vector), Entry("bad", 1, bad)]
         with pytest.raises(ValueError, match=words):
             known.add_described(entries, [features] * 2)

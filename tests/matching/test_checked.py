@@ -164,6 +164,45 @@ def test_rounded_products_stay_within_the_bound(dimensions):
     assert (direction.window / 2 < 0.01).all()  # or it would hold whatever the products are
 
 
+mutual_neighbors = jax.jit(
+    lambda query, candidate, with_second: checked.mutual_neighbors(
+        checked.round_query(query), checked.round_candidate(candidate), with_second=with_second
+    ),
+    static_argnames="with_second",
+)
+
+
+def features_of(rows):
+    return mfvpr.Features.of(np.zeros((len(rows), 2), np.float32), np.asarray(rows, np.float32), image_size=(9, 9))
+
+
+def test_sums_are_checked_where_bfloat16_loses_nothing():
+    """All products of a query are exactly equal, so only the order of sums tells the candidates apart."""
+    rng = np.random.default_rng(0)
+    values = np.asarray(jnp.asarray(rng.lognormal(sigma=3, size=700), jnp.bfloat16), np.float32)
+    queries = np.asarray(jnp.asarray(rng.uniform(0.1, 1, 8), jnp.bfloat16), np.float32)
+    wrong = 0
+    for query in queries:
+        rows0, rows1 = np.full((1, 700), query), np.stack([rng.permutation(values) for _ in range(12)])
+        pair = features_of(rows0), features_of(rows1)
+        neighbors, settled = mutual_neighbors(*pair, with_second=False)
+        assert settled
+        products = numpy_products(rows0, rows1)[0]
+        assert int(neighbors.match[0]) == int(products.argmax())
+        summed = checked._products(checked.round_query(pair[0]), checked.round_candidate(pair[1]))
+        wrong += int(np.argmax(summed[:12, 0]) != products.argmax())
+    assert wrong > 0  # or no sum had to be checked
+
+
+def test_too_many_second_neighbors_are_not_settled():
+    rng = np.random.default_rng(0)
+    query, near = unit(rng.normal(size=(2, DIMENSIONS)))
+    crowd = unit(near + 1e-6 * rng.normal(size=(checked.MOST_CHECKS + 4, DIMENSIONS)))
+    pair = features_of(query[None]), features_of([query, *crowd])
+    for with_second in (False, True):
+        assert mutual_neighbors(*pair, with_second=with_second)[1] == (not with_second)
+
+
 @pytest.mark.parametrize("with_ratio", [False, True])
 @pytest.mark.parametrize("noise", [0, 1e-4])
 def test_too_many_close_products_are_left_to_float32(noise, with_ratio):

@@ -192,6 +192,7 @@ def test_pairs_without_matches_score_0(dataset):
         ({"points": 3}, "matched_kpts0"),
         (([[1.0], [2.0, 3.0]], np.zeros((2, 2))), "expected dense arrays"),
         ((Sparse(), np.zeros((4, 2))), r"expected dense arrays, got others \(no layout"),
+        ((np.zeros((4, 2)), np.ma.masked_equal(np.eye(4, 2), 1.0)), "masked"),
     ],
 )
 def test_wrong_results_of_a_function(dataset, result, message):

@@ -23,12 +23,11 @@ CELLS = {
     "confidence": None,
     "shift": None,
     "shift_interval": None,
-    "scale": None,
     "image_width": 448,
 }
 LINES = [
     {"image": "/drive/1403636580000000001.png", "place": "1.png", "score": 19.09, "confidence": 0.9400000000000001,
-     "shift": [61.1, -12.5], "shift_interval": [[47.6, -16.0], [76.0, 24.4]], "scale": 1.0, "reason": None,
+     "shift": [61.1, -12.5], "shift_interval": [[47.6, -16.0], [76.0, 24.4]], "reason": None,
      "image_width": 448, "alternatives": [{"row": 1, "name": "1.png", "place": "1.png", "score": 19.09}]},
     {"image": "/drive/1403636579763555584.png", "error": "cannot be read, it is damaged"},
     {**CELLS, "image": "/drive/1403636579900000000.png", "place": None, "reason": "low confidence", "confidence": 0.1,
@@ -63,8 +62,8 @@ def test_shifts_have_exact_times_and_their_order(write, tmp_path, newline):
     assert [row["place"] for row in cells] == ["", '{"x": 1.5, "y": "é"}', "", "1.png"]
     assert [row["reason"] for row in cells] == ["cannot be read, it is damaged", "", "low confidence", ""]
     assert [row["image"] for row in cells] == [LINES[row]["image"] for row in (1, 3, 2, 0)]
-    numbers = ["0.9400000000000001", "61.1", "-12.5", "47.6", "-16.0", "76.0", "24.4", "1.0", "448"]
-    names = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "scale", "image_width")
+    numbers = ["0.9400000000000001", "61.1", "-12.5", "47.6", "-16.0", "76.0", "24.4", "448"]
+    names = ("confidence", "shift_x", "shift_y", "low_x", "low_y", "high_x", "high_y", "image_width")
     assert [cells[3][name] for name in names] == numbers
     assert cells[2]["confidence"] == "0.1"
     assert cells[2]["shift_x"] == cells[0]["image_width"] == ""
@@ -123,12 +122,12 @@ def test_files_of_a_run(tmp_path):
         "query,prediction,refused,score,confidence,reason\n"
         "a.png,no place,,,,too few features\nb.png,2.png,,5,0.75,\nc.png,no place,1.png,9,0.25,low confidence\n"
     )
-    (tmp_path / "shifts.csv").write_text(f"{','.join(SHIFTS)}\nb.png,2.png,1.5,-2,1,2,-3,-1,1,336,240\n")
+    (tmp_path / "shifts.csv").write_text(f"{','.join(SHIFTS)}\nb.png,2.png,1.5,-2,1,2,-3,-1,336,240\n")
     images = read_run_images(tmp_path, ["a.png", "b.png", "c.png"])
     assert [image.place for image in images] == [None, "2.png", None]
     assert [image.cells.get("reason") for image in images] == ["too few features", None, "low confidence"]
     assert images[1].cells == {"confidence": "0.75", "shift_x": "1.5", "shift_y": "-2", "low_x": "1", "high_x": "2",
-                               "low_y": "-3", "high_y": "-1", "scale": "1", "image_width": "336"}  # fmt: skip
+                               "low_y": "-3", "high_y": "-1", "image_width": "336"}  # fmt: skip
     shortlist = shortlist_of(images, DATABASE)
     assert shortlist.indices.tolist() == [[-1, -1], [2, 0], [-1, -1]]
     assert shortlist.scores.tolist() == [[0, 0], [5, 4.5], [0, 0]]

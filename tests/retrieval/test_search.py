@@ -103,6 +103,17 @@ def test_parts_of_the_database_change_nothing(rows, monkeypatch):
     np.testing.assert_allclose(shortlist.scores, expected.scores, atol=1e-6)
 
 
+@pytest.mark.parametrize("usable", [[0, 7], [4], [6, 7], []])
+def test_candidates_that_no_part_of_the_database_has_are_minus_1(usable, monkeypatch):
+    monkeypatch.setattr(retrieval, "ROWS", 3)
+    database = np.full((8, 4), np.nan, np.float32)
+    database[usable] = 0.5
+    shortlist = ExactSearch().shortlist(np.full((2, 4), 0.5, np.float32), database, 5)
+    expected = [*usable, *[-1] * (5 - len(usable))]
+    assert shortlist.indices.tolist() == [expected] * 2
+    assert shortlist.mask.tolist() == [[row >= 0 for row in expected]] * 2
+
+
 @pytest.mark.optimized
 def test_a_whitened_query_has_the_same_bits_alone_and_in_company():
     rng = np.random.default_rng(1)

@@ -32,6 +32,7 @@ from tests.builders import SIZE, per_match, random_matches, stack
 from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
 from tests.scoring import batches
 from tests.scoring.batches import pair_of
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -117,6 +118,36 @@ def test_integers_and_double_precision_mode_are_welcome(scorer):
 def test_misspelled_choices_raise(scorer, field, word):
     with pytest.raises(ValueError, match=rf"{scorer.__name__}\({field}='{word}'\): expected one of"):
         scorer(**{field: word})
+
+
+@pytest.mark.parametrize(
+    ("scorer", "values"),
+    [
+        (HistogramOfShifts, {"sigma": -3}), (HistogramOfShifts, {"temperature": np.nan}),
+        (HistogramOfShifts, {"shift_range": (10.0, -1.0)}), (AnchorPoints, {"tolerance": 0.0}),
+        (Homography, {"confidence": 1.5}), (VisualPhrases, {"cell_size": np.float64(-1)}),
+        (RapidSpatialScore, {"size": (0.0, 10.0)}), (AggregatedScore, {"temperature": -1}),
+    ],
+)  # fmt: skip
+def test_python_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
+    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected numbers from"):
+        scorer(**values)
+    scorer(**jax.tree.map(jnp.asarray, values))
+
+
+@pytest.mark.parametrize("name", ["points1", "scores0"])
+@pytest.mark.parametrize("scorer", [HistogramOfShifts(), AggregatedScore(), AnchorPoints()])
+def test_arrays_of_unequal_length_are_not_broadcast(scorer, name):
+    """`jax.tree.map` can make them, and checks nothing."""
+    matches = random_matches(np.random.default_rng(0), 5)
+    whole = getattr(matches, name)
+    with unchecked_shapes(), pytest.raises(InputError, match=f"Matches.{name}: expected shape"):
+        scorer(jax.tree.map(lambda leaf: leaf[:1] if leaf is whole else leaf, matches))
+    with (
+        unchecked_shapes(),
+        pytest.raises(InputError, match=r"weight: expected a weight for each of \[5\] matches, got an array \[1\]"),
+    ):
+        replace(scorer, weight=lambda matches: matches.distance[:1])(matches)
 
 
 def test_positions_of_the_arguments_are_the_papers_order():

@@ -35,7 +35,6 @@ HARD = [
     AggregatedScore(mean="weighted", clamp=True),
     AggregatedScore(mean="median", clamp=True),
     MatchCount(),
-    HistogramOfShifts(bin_size=20.0, scales=(0.7, 1.0, 1.41), scale_deviation=0.5, weight=RatioWeight(), max_bins=36),
 ]
 SOFT = [
     replace(HARD[0], temperature=0.3),
@@ -47,7 +46,6 @@ SOFT = [
     replace(HARD[6], temperature=20.0),
     replace(HARD[7], temperature=5.0),
     replace(HARD[8], temperature=20.0),
-    replace(HARD[0], temperature=0.3, scales=(0.8, 1.0, 1.25), scale_deviation=0.4),
 ]
 RELATIVES = [
     RapidSpatialScore(),
@@ -59,7 +57,7 @@ RELATIVES = [
     LostScore(form="unweighted", mirrored=True),
     LostScore(form="described"),
 ]
-NUMBERS = ("bin_size", "sigma", "scale_deviation", "tolerance", "temperature", "weight")  # the window moves whole cells
+NUMBERS = ("bin_size", "sigma", "tolerance", "temperature", "weight")  # the window moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
 PER_KEYPOINT = ("keypoints", "descriptors", "scores")
 

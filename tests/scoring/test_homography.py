@@ -175,8 +175,8 @@ def test_no_homography_explains_a_line_or_a_point(points1, points0):
 
 @pytest.mark.parametrize("threshold", [0.0, 1e-6, 1e12, np.inf])
 def test_any_threshold_scores(threshold):
-    assert 0 <= score(pair(9, 40, 0.5), threshold) <= (40 if threshold > 1 else 8)
-    assert np.isnan(score(pair(9, 40, 0.5), -threshold or np.nan))
+    assert 0 <= score(pair(9, 40, 0.5), np.float32(threshold)) <= (40 if threshold > 1 else 8)
+    assert np.isnan(score(pair(9, 40, 0.5), np.float32(-threshold or np.nan)))
 
 
 @pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
@@ -209,7 +209,7 @@ def test_no_generator_of_jax_draws_otherwise_in_a_batch():
 
 @pytest.mark.parametrize(("limit", "numbers"), [("max_iterations", (np.nan, 0.0)), ("confidence", (np.nan, -1.0, 0.0))])
 def test_limits_without_meaning_score_nan(limit, numbers):
-    assert np.isnan([score(pair(9, 40, 0.5), **{limit: number}) for number in numbers]).all()
+    assert np.isnan([score(pair(9, 40, 0.5), **{limit: np.float32(number)}) for number in numbers]).all()
 
 
 @pytest.mark.slow

@@ -1,9 +1,10 @@
-"""The peak between bins, in float64 by NumPy."""
+"""The smooth maximum over bins, and the peak between bins, in float64 by NumPy."""
 
 import jax
 import numpy as np
+import pytest
 
-from mfvpr.scoring.lattice import climb
+from mfvpr.scoring.lattice import climb, smooth_tallest
 
 SIGMA = np.float32(8)
 
@@ -57,3 +58,23 @@ def test_derivatives_of_the_peak():
         peaks, slopes, bends = jax.jit(jax.vmap(lambda step: (peak(step), slope(step), jax.grad(slope)(step))))(steps)
     np.testing.assert_allclose(slopes[1], np.gradient(peaks, steps)[1], rtol=1e-4)
     np.testing.assert_allclose(bends[1], np.gradient(slopes, steps)[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("peak", [3.0, 100.0])
+def test_the_smooth_maximum_has_the_digits_of_float32_at_any_temperature(peak):
+    rng = np.random.default_rng(0)
+    values = rng.exponential(1e-3, (48, 48))
+    values[5, 7:9] = peak, 0.7 * peak
+    values, mask = np.float32(values), np.arange(48) < 40
+    mask = mask[:, None] & mask
+    smooth = jax.jit(jax.value_and_grad(lambda values, t: smooth_tallest(values, mask, temperature=t)))
+    for temperature in np.geomspace(0.01, 1e4, 60).astype(np.float32):
+        ratios = values[mask].astype(np.float64) / temperature
+        powers = np.exp(ratios - ratios.max())
+        expected = (
+            np.log1p(np.expm1(ratios).mean()) if abs(ratios).max() < 500 else ratios.max() + np.log(powers.mean())
+        )
+        score, slopes = smooth(values, temperature)
+        np.testing.assert_allclose(score, temperature * expected, rtol=1e-5)
+        np.testing.assert_allclose(slopes[mask], powers / powers.sum(), rtol=3e-5, atol=1e-30)
+        assert not np.asarray(slopes)[~mask].any()

@@ -143,8 +143,9 @@ def test_an_edge_belongs_to_the_cell_above_and_shifts_just_below_it_to_the_cell_
 def test_cells_without_a_width_and_phrases_without_a_length_are_no_score():
     matches, empty = random_matches(np.random.default_rng(4), 30), make_matches([], [], capacity=30)
     for size in (0.0, -1.0, np.nan):
-        assert np.isnan(score(VisualPhrases(cell_size=size), matches))
-        assert score(VisualPhrases(cell_size=size), empty) == 0
+        scorer = VisualPhrases(cell_size=np.float32(size))
+        assert np.isnan(score(scorer, matches))
+        assert score(scorer, empty) == 0
     for length in (0, 9):
         with pytest.raises(ValueError, match=rf"VisualPhrases\(length={length}\): .*1 to 8"):
             VisualPhrases(length)

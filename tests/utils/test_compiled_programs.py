@@ -4,7 +4,9 @@ import os
 import subprocess
 import sys
 
+import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from mfvpr.utils import InputError, compiled_programs, numerics
 from tests.programs import ROOT
@@ -53,6 +55,60 @@ def test_nothing_is_written_if_the_user_says_so(tmp_path):
 def test_a_folder_that_cannot_be_made_costs_only_the_compilation(tmp_path):
     (tmp_path / "file").touch()
     assert run(tmp_path / "file") == ["25.0", "False", "None"]
+
+
+@pytest.fixture
+def keep(monkeypatch, tmp_path):
+    """Warnings of `keep_compiled_programs` where JAX has no folder yet, and JAX's folder."""
+    names = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+    before = {name: jax.config.values[name] for name in names}
+    monkeypatch.setenv("MFVPR_COMPILED", "true")
+    monkeypatch.setenv("MFVPR_CACHE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    warnings = list[str]()
+
+    def call():
+        jax.config.update("jax_compilation_cache_dir", None)
+        compiled_programs.keep_compiled_programs(warnings.append)
+        return warnings, jax.config.jax_compilation_cache_dir
+
+    yield call
+    for name in names:
+        jax.config.update(name, before[name])
+    compilation_cache.reset_cache()
+
+
+def test_without_a_home_nothing_is_kept(keep, monkeypatch, tmp_path):
+    monkeypatch.setenv("MFVPR_CACHE", "")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as of an unknown user without HOME
+    assert keep() == ([], None)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("case", ["owner", "group", "others", "above"])
+def test_machine_code_of_others_is_not_read(keep, monkeypatch, tmp_path, case):
+    folder = compiled_programs._folder()
+    folder.mkdir(0o755, parents=True)
+    if case == "owner" and os.getuid():
+        monkeypatch.setattr(os, "getuid", lambda: 54321)
+    elif case == "owner":
+        os.chown(folder, 54321, -1)
+    else:
+        path, mode = {"group": (folder, 0o775), "others": (folder, 0o1757), "above": (tmp_path, 0o757)}[case]
+        path.chmod(mode)
+    for _ in range(2):  # it warns once
+        (warning,), used = keep()
+        assert "expected a folder that is yours" in warning
+        assert used is None
+
+
+def test_ones_own_folder_below_tmp_is_used_with_the_usual_umask(keep, tmp_path):
+    tmp_path.chmod(0o1777)
+    before = os.umask(0o002)  # which lets the group write
+    try:
+        assert keep() == ([], str(compiled_programs._folder()))
+    finally:
+        os.umask(before)
 
 
 def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path):

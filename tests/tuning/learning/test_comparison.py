@@ -110,7 +110,7 @@ def test_anchors_start_near_the_hard_score():
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_start_that_is_not_above_0_is_refused(value):
     with pytest.raises(InputError, match=r"^sigma=.*: .*above 0"):
-        first_numbers(replace(HISTOGRAM, sigma=value), 1.0)
+        first_numbers(replace(HISTOGRAM, sigma=np.float32(value)), 1.0)
 
 
 def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
