@@ -163,16 +163,13 @@ def scoring(pairs: int, *, name: str) -> Timed:
     return calls | with_torch("score", *arrays, scorer=name), pairs / 1e3, "1000 pairs"
 
 
-def grid(queries: int, candidates: int, *, at_once: bool = False) -> Timed:
-    """1,000 settings of the histogram, for one query after the other, or for all pairs in one call."""
-    m, score = matches_of(queries * candidates), partial(mfvpr.score_grid, mfvpr.HistogramOfShifts(), **AXES)
-    pairs = queries * candidates if at_once else candidates
-    starts = range(0, queries * candidates, pairs)
-    parts = [jax.tree.map(lambda field, start=start: field[start : start + pairs], m) for start in starts]
+def grid(queries: int, candidates: int) -> Timed:
+    """1,000 settings of the histogram for all pairs."""
+    m = matches_of(queries * candidates)
     arrays = m.points1 - m.points0, m.scores0 + m.scores1, m.distance, m.mask
     axes = {"sigmas": AXES["sigma"], "bin_sizes": AXES["bin_size"], "max_distances": AXES["max_distance"]}
-    calls = {"mfvpr": ready(lambda: [score(part) for part in parts])}
-    calls |= with_torch("grid", *arrays, pairs=pairs, **axes)
+    calls = {"mfvpr": ready(mfvpr.score_grid, mfvpr.HistogramOfShifts(), m, **AXES)}
+    calls |= with_torch("grid", *arrays, **axes)
     return calls, np.prod([len(axis) for axis in AXES.values()]) * queries * candidates / 1e3, "1000 pairs"
 
 
@@ -233,7 +230,6 @@ CASES = [
     *(Case("scores", f"{name}, {{:,}} pairs", partial(scoring, name=name), (pairs,), (4,), (name, pairs) == ("sum", 50))
       for pairs in (50, 1000, 10_000) for name in ("histogram", "anchor", "sum")),
     Case("grids", "1,000 settings, {} queries x {}", grid, (100, 50), (1, 2), True),
-    Case("grids", "1,000 settings, {} queries x {}, one call", partial(grid, at_once=True), (100, 50), (1, 2)),
     *(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (3, 2000, 16), queries == 1)
       for queries in (1, 100, 1000)),
     *(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,), (step, batch) == (aliked, 8))

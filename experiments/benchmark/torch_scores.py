@@ -88,18 +88,14 @@ def score(
 
 
 def grid(
-    shifts: Tensor, weights: Tensor, distance: Tensor, mask: Tensor, *, pairs: int, sigmas: Sequence[float],
+    shifts: Tensor, weights: Tensor, distance: Tensor, mask: Tensor, *, sigmas: Sequence[float],
     bin_sizes: Sequence[float], max_distances: Sequence[float],
 ) -> Tensor:  # fmt: skip
-    """Scores of all settings, with weights and 1, `pairs` pairs at a time: `[bins * sigmas, C, 2 * distances]`."""
+    """Scores of all settings, with weights and 1: `[bins * sigmas, C, 2 * distances]`."""
     centers, limits = [bin_centers(size, mask.device) for size in bin_sizes], distance.new_tensor(max_distances)
-    scores = []
-    for start in range(0, len(mask), pairs):
-        part = slice(start, start + pairs)
-        near = ((distance[part, None] <= limits[:, None]) & mask[part, None]).float()
-        both = torch.cat([weights[part, None] * near, near], 1)
-        scores.append(torch.stack([histogram(shifts[part], both, c, sigma) for c in centers for sigma in sigmas]))
-    return torch.cat(scores, 1)
+    near = ((distance[:, None] <= limits[:, None]) & mask[:, None]).float()
+    both = torch.cat([weights[:, None] * near, near], 1)
+    return torch.stack([histogram(shifts, both, c, sigma) for c in centers for sigma in sigmas])
 
 
 def search(queries: Tensor, database: Tensor, *, candidates: int) -> Tensor:
@@ -110,8 +106,8 @@ def search(queries: Tensor, database: Tensor, *, candidates: int) -> Tensor:
 def rank(rows: Tensor, *fields: Tensor) -> Tensor:
     """Rankings of candidates `[Q, C]` by histograms; fields are points, descriptors and scores of both sides."""
     rankings, centers = [], bin_centers(BIN, rows.device)
-    for number, row in enumerate(rows):
-        points0, query, scores0 = (field[number] for field in fields[:3])
+    for row in rows:  # of the candidates of a query, whose number is that of the first
+        points0, query, scores0 = (field[row[0]] for field in fields[:3])
         points1, candidates, scores1 = (field[row] for field in fields[3:])
         nearest1, mutual = match(query, candidates)
         weights = torch.where(mutual, scores0 + torch.gather(scores1, 1, nearest1), 0.0)
