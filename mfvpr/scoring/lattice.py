@@ -111,11 +111,6 @@ def pool_bins(
     return jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, score), default=jax.vmap(score))
 
 
-def map_rows(function: Callable[[Array], Array], rows: Array) -> Array:
-    """`function` of every row, one row at a time; without a loop for a single row."""
-    return function(rows[0])[None] if len(rows) == 1 else jax.lax.map(function, rows)
-
-
 def climb(
     start: Float[Array, "2"],
     shifts: Float[Array, "slots 2"],
