@@ -13,6 +13,7 @@ from tests.scorers import FOREIGN, OWN, one_of_each_class, title
 pytestmark = pytest.mark.thorough
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_what_keeps_the_contract_passes(scorer, monkeypatch):
     """These scores more closely than other people's need to."""

@@ -120,6 +120,7 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
     assert first.bn.use_running_average
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name.startswith("selavpr") else []) for name in PUBLIC]
 )

@@ -28,6 +28,7 @@ def settings(street, *more):
             "candidates=2", "recall.tolerances=[0]", "recall.ks=[1]", "matching=import", *more)  # fmt: skip
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(
     ("tool", "more"),
     [

@@ -51,6 +51,7 @@ def evaluated(root, out, *overrides):
     return rows, {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
 def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
     content = sweep(tmp_path / "swept", *GRID, f"final={final}")

@@ -43,6 +43,7 @@ def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch
     assert not recwarn
 
 
+@pytest.mark.slow
 def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
     for more, notes in (((), 1), (("features=sift",), 0)):

@@ -140,6 +140,7 @@ def test_many_labels_are_a_loop_over_all_pairs():
         np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
 
 
+@pytest.mark.slow
 def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
     names = [f"{number}.png" for number in range(30_000)]
     write_text(tmp_path / "l.csv", "name,label\n" + "".join(f"{name},{len(name)}\n" for name in reversed(names)))

@@ -48,6 +48,7 @@ def seasons(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def check_other_drawings(draw, folder, num_frames, tmp_path):
     """The same seed gives the same bytes, and each file of another seed differs."""
     draw(tmp_path / "again", num_frames=num_frames, image_size=SIZE)
@@ -130,6 +131,7 @@ def test_existing_folder_is_an_error(tmp_path):
         draw_streets(tmp_path, num_frames=1, image_size=SIZE)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("seasons, folders", [(False, 2), (True, 8)])
 def test_interrupted_drawing_leaves_nothing_and_the_cache_is_used_afterwards(seasons, folders, tmp_path):
     def interrupt(done, total):

@@ -167,6 +167,7 @@ def mixed_sizes():
     return match_set_of(pairs, 64), listed
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
 def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scorer):
     match_set, listed = mixed_sizes

@@ -187,6 +187,7 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
 
 
+@pytest.mark.slow
 def test_a_confidence_that_tells_nothing_is_a_warning(street, small_street, tmp_path):
     rows = ["query,database", *(f"{row:04d}.png,{(row + 5) % 10:04d}.png" for row in range(10))]
     (tmp_path / "far.csv").write_text("\n".join(rows))

@@ -75,6 +75,7 @@ def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch
     np.testing.assert_array_equal(scores, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("chunk", [1, 10**5, 2**29])
 @pytest.mark.parametrize("temperature", [None, 0.5])
 def test_accelerators_score_settings_and_pairs_together(chunk, temperature, monkeypatch):

@@ -214,6 +214,7 @@ def test_a_function_that_changes_is_not_taken_for_what_it_was():
         np.testing.assert_allclose(score_candidates(scorer, matches), 2 * before, rtol=2e-6)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 @pytest.mark.parametrize("field", ["points0", "points1", "scores0", "distance", "ratio"])
 def test_one_match_that_is_no_number_leaves_no_score(field, broken):

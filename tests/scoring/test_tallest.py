@@ -148,6 +148,7 @@ OPTIONS = [
 ]
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("options", OPTIONS, ids=str)
 def test_a_grid_equals_pair_by_pair(matches, options):
     """Every option, pairs of different sizes, searched (5 px) and whole (15 px), empty and single pairs."""

@@ -93,6 +93,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize(
     ("scorer", "axes"), CASES, ids=lambda value: "" if isinstance(value, dict | list) else title(value)
 )
@@ -116,6 +117,7 @@ def test_one_setting_beside_a_grid_leaves_it_whole(data):
         np.testing.assert_array_equal(rows[:, :CANDIDATES], one_by_one(scorer, setting, *data))
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("settings_per_block", [1, 5, 100])
 @pytest.mark.parametrize("queries_per_block", [1, 4, 100])
 def test_chunks_change_nothing(data, settings_per_block, queries_per_block):
