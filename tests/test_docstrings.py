@@ -20,7 +20,7 @@ from tests.builders import fill, make_features, stack, unit
 from tests.programs import ROOT, composed
 
 PAGES = [ROOT / "README.md", ROOT / "mfvpr" / "datasets" / "README.md"]
-SLOW = ["mfvpr.Cluster", "mfvpr.LightGlueMatcher", "mfvpr.Map", "mfvpr.load_system", "mfvpr.sweep"]
+SLOW = ["mfvpr.Cluster", "mfvpr.LightGlueMatcher", "mfvpr.Map", "mfvpr.Route", "mfvpr.load_system", "mfvpr.sweep"]
 PLAIN = re.compile(r"(?<!float \| )\b(Array|ndarray|Features|Matches|Image)\b")  # an annotation without a shape
 SHAPED = re.compile(r"\b(Bool|Float|Int|Integer|Num|Shaped|UInt8)\[")
 SHAPE = re.compile(r"`\[.*?\]`")  # in a docstring

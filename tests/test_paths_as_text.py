@@ -86,7 +86,7 @@ def test_files_that_exist_stay(tmp_path):
         file = path / "1.jpg.npz" if name == "a" else path
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(b"precious")
-        with pytest.raises(InputError, match="expected a new file, got single that exists"):
+        with pytest.raises(InputError, match="expected a new file, got one that exists"):
             write(path)
         assert file.read_bytes() == b"precious"
         file.unlink()

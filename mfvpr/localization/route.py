@@ -41,10 +41,13 @@ _ODDS, _ODDS_OF_ONE = math.log(1000), math.log(10)  # for another speed than the
 class Route:
     """The belief, updated with every image. Rows may be added to the map between two images.
 
-        route = Route()
+        street = mfvpr.Map.create("map", "day", system)
+        route = mfvpr.Route(mfvpr.Drive(advance=1.0))
         located = street.localize("query.jpg", route=route).located
 
-    `warn` is called once if the images fit another speed much better than the given one.
+    Args:
+        drive: motion of the robot; an InputError for anything else.
+        warn: called once if the images fit another speed much better than the given one.
     """
 
     def __init__(self, drive: Drive = DEFAULT_DRIVE, *, warn: Callable[[str], object] = warnings.warn) -> None:

@@ -49,6 +49,8 @@ STREETS = Confidence(("margin", "height"), 5, (1.288, 1.852), (0.998, 0.662), (0
 class Drive:
     """Motion of a robot along the rows of a map.
 
+        drive = mfvpr.Drive(advance=1.0, spread=0.5)  # as fast as the drive of the map
+
     Attributes:
         advance: mean motion from one image to the next, rows; below 0 = against the order of the map. None = learned
             from the images, between -8 and 8, and it may change on the way.
@@ -57,6 +59,9 @@ class Drive:
         leaves: probability, for each image, that the robot leaves the map.
         returns: probability, for each image, that a robot that left the map is on it again.
         correct: probability that the top prediction is correct while the robot is on the map.
+
+    Raises:
+        InputError: a field is no number, or out of its range.
     """
 
     advance: float | None = None

@@ -56,7 +56,8 @@ def test_the_outputs_in_the_folder_are_those_of_this_library(exported, tmp_path)
                        for tensors in (program.inputs, program.outputs))  # fmt: skip
     assert [*outputs] == ["scores", "shift"]
     assert (outputs["scores"][:2] > 0).all()
-    assert largest_difference(program(**inputs), outputs) < 1e-5
+    values = program.run(*inputs.values())  # the call would refuse points outside of their image
+    assert largest_difference(dict(zip(outputs, values, strict=True)), outputs) < 1e-5
 
 
 @pytest.mark.parametrize("example", EXAMPLES)

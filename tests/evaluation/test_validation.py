@@ -95,7 +95,7 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
          r"histogram \+ retrieval .*system"),
         ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*the class MatchCount"),
         ({"scorers": {"h": 5}}, r"scorers: .*h .*got 5"),
-        ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=-1.0)}}, "sigma=-1.0: expected numbers from"),
+        ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=np.float32(-1.0))}}, "sigma=-1.0: expected numbers from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each of"),
         ({"scorers": {"v": lambda matches: matches.points0[0, 0].astype(complex)}}, "scorer: expected real number"),
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "retrieval_score='euclidean': expected one of"),

@@ -101,7 +101,7 @@ def test_it_finds_a_robot_that_was_carried_away():
 
 
 def refusal(reason="too few matches"):
-    return Prediction(None, (), 0.0, None, None, None, None, reason)
+    return Prediction(None, (), 0.0, None, None, None, reason)
 
 
 def test_ten_refused_images_are_off_the_map_and_five_are_not():

@@ -136,7 +136,7 @@ def test_a_saved_result_is_a_run_folder(result, dataset, tmp_path):
     result.write_report(tmp_path / "all.html")
     assert "one/mine" in (tmp_path / "all.html").read_text("utf-8")
     mfvpr.Result({("one", "mine"): result.parts["one", "mine"]}, result.cache).write_report(tmp_path / "one.html")
-    assert "queries in" in (tmp_path / "one.html").read_text("utf-8")
+    assert "queries worth one" in (tmp_path / "one.html").read_text("utf-8")
 
 
 def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
