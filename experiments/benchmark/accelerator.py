@@ -265,7 +265,8 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
         peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
         group_reports[group] = {"seconds": seconds, "first_calls_s": first_calls, "peak_bytes": peak, "rows": rows}
         table = Table(names, [[_cell(row.get(name, "")) for name in names] for row in rows], text_columns=2)
-        title = f"{group}: {seconds:.1f} s, of first calls {first_calls:.1f} s; peak memory so far {peak} bytes"
+        title = f"{group}: {seconds:.1f} s, of first calls {first_calls:.1f} s; "
+        title += "no GPU: sizes are tiny, and times mean nothing" if on_cpu else f"peak memory so far {peak} bytes"
         write_report(out, title, [table], report)
     return report
 

@@ -58,6 +58,8 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
         raise InputError(f"hits: expected [Q], one of every query, got {list(hits.shape)}; call it for each row")
+    if not 0 < level < 1:
+        raise InputError(f"level={level}: expected a number between 0 and 1, such as 0.95")
     if len(hits) == 0:
         return 0.0, 1.0
     effective = len(hits) / design_effect(hits)

@@ -88,8 +88,8 @@ def read_confidence(folder: Path, system: System) -> Confidence | None:
         return None
     confidences, origin = read_confidences(folder / _FILE)
     if system.headline not in confidences or origin.get("system") != _fingerprint(system):
-        raise InputError(f"{folder / _FILE}: expected the confidence of this map's system, got that of another one; "
-                         "remove the file, then calibrate again")  # fmt: skip
+        raise InputError(f"{folder / _FILE}: expected the confidence of this map's system, got that of another "
+                         "system or version; remove the file, then calibrate again")  # fmt: skip
     return confidences[system.headline]
 
 

@@ -79,7 +79,7 @@ class Route:
                              f"{len(there)}")  # fmt: skip
         on = 1.0  # probability of what the image lacks on the map, relative to that off it
         if prediction is not None and not prediction.alternatives and prediction.reason != "no candidates":
-            on = max(1 / _MOST_REFUSALS, refusals[0] / refusals[1])
+            on = min(1.0, max(1 / _MOST_REFUSALS, refusals[0] / max(refusals[1], 1e-9)))  # never evidence of the map
         chance = self._filter.update(there, evidence, on)
         if self._other is not None:
             odds = self._other.update(there, evidence) - chance

@@ -101,8 +101,9 @@ class Sweep:
             InputError: the folder is neither new nor empty, nor one of a sweep.
         """
         folder = Path(folder)
-        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
-        if names and "blocks" not in names and not {runs.LAST, "summary.txt", "table.csv"} <= names:
+        names = {path.name for path in folder.iterdir()} if folder.is_dir() else {*filter(Path.exists, [folder])}
+        is_interrupted = "blocks" in names and runs.LAST not in names
+        if names and not is_interrupted and not _is_sweep(folder / runs.LAST):
             raise InputError(f"{folder}: expected a new or empty folder, or one of a sweep; name another")
         shutil.rmtree(folder / "figures", ignore_errors=True)
         for name, draw in sweep_figures(self.outcome):
@@ -111,6 +112,15 @@ class Sweep:
         heading = f"{self.dataset}: {sizes} of {self.scorer}"
         about = {"dataset": self.dataset, "scorer": {"method": self.scorer}, "versions": versions()}
         write_sweep(folder, self.outcome, heading, about | sweep_json(self.outcome))
+
+
+def _is_sweep(path: Path) -> bool:
+    """Whether a file holds the results of a sweep."""
+    try:
+        results = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(results, dict) and "axes" in results
 
 
 def write_sweep(folder: Path, outcome: Outcome, heading: str, results: Mapping[str, Any]) -> None:

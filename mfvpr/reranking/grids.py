@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Num
 from mfvpr.matching.nearest_neighbors import filter_matches
 from mfvpr.reranking.ranking import BIN_STEP, check_candidates, fit_to_sizes
 from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.parameters import numbers_by_name, whole_numbers, with_capacity, with_parameters
+from mfvpr.scoring.parameters import numbers_by_name, parameters_of, whole_numbers, with_capacity, with_parameters
 from mfvpr.scoring.scorer import check_host, on_host, require_real, score_pairs, with_static_functions
 from mfvpr.scoring.weight_registry import named_weight
 from mfvpr.scoring.weights import ChosenWeight, Weight, match_weights
@@ -251,4 +251,7 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
         points = points.astype(jnp.result_type(float))
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
+    parameters = parameters_of(scorer) if is_dataclass(scorer) else {}
+    if isinstance(points, np.ndarray) and name in parameters and not parameters[name].choices:
+        parameters[name].check(name, points)
     return points

@@ -65,6 +65,12 @@ class Parameter:
             return self.none
         return tuple(map(float, plain)) if self.length else plain
 
+    def check(self, name: str, value: Any) -> None:
+        """Raise an InputError if a concrete number, or one of several, is out of bounds."""
+        values, (low, high) = np.ravel(np.asarray(value, float)), self.bounds
+        if not ((values >= low) & (values <= high) | (values == self.none)).all():
+            raise InputError(f"{name}={value}: expected numbers from {low:g} to {high:g}")
+
 
 def number(
     default: float | None, unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE, **more: Any
@@ -134,14 +140,12 @@ def check_plain(method: Any) -> None:
 def check_bounds(method: Any, *, all_arrays: bool = True) -> None:
     """Raise an InputError if a field holds a number out of bounds; no number may be traced if `all_arrays` count."""
     for name, parameter in parameters_of(method).items():
-        value, (low, high) = getattr(method, name), parameter.bounds
+        value = getattr(method, name)
         parts = value if isinstance(value, tuple) else (value,)
         is_plain = not parameter.whole and all(isinstance(part, int | float) for part in parts)
         if parameter.choices or value is None or not (is_plain or all_arrays):
             continue
-        values = np.ravel(np.asarray(value, float))
-        if not ((values >= low) & (values <= high) | (values == parameter.none)).all():
-            raise InputError(f"{name}={value}: expected numbers from {low:g} to {high:g}")
+        parameter.check(name, value)
 
 
 def numbers_by_name(scorer: Any) -> dict[str, Any]:

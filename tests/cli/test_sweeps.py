@@ -1,6 +1,7 @@
 """`mfvpr.sweep` as users of the library call it."""
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 
@@ -112,6 +113,10 @@ def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, 
     with pytest.raises(mfvpr.InputError, match="thesis: expected a new or empty folder"):
         result.save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "figures").is_dir()
+    shutil.copytree(tmp_path / "saved", tmp_path / "learned")
+    (tmp_path / "learned" / "results.json").write_text("{}")  # the same files, as `mfvpr learn` writes them
+    with pytest.raises(mfvpr.InputError, match="learned: expected a new or empty folder"):
+        result.save(tmp_path / "learned")
     figure = result.plot("weight", "sigma")
     assert [figure.axes[0].get_ylabel(), figure.axes[0].get_xlabel()] == ["weight", "sigma"]
     assert result.plot("sigma").axes[0].get_xlabel() == "sigma"

@@ -158,3 +158,9 @@ def test_systems_that_agree_or_are_equally_often_ahead_do_not_differ(queries):
 def test_a_path_needs_the_same_queries():
     with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
         path_test(np.ones(5), np.ones(4))
+
+
+def test_a_level_is_a_share():
+    for level in (95, 0, -1):
+        with pytest.raises(InputError, match="level"):
+            recall_interval(np.ones(30, bool), level=level)

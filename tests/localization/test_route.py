@@ -127,7 +127,10 @@ def test_ten_refused_images_are_off_the_map_and_five_are_not():
     assert back[-1].p > 0.9
 
 
-@pytest.mark.parametrize(("refusals", "off"), [((0.5, 0.5), 0.5), ((0.4, 0.6), 0.6), ((0.01, 0.9), 2.5 / 3.5)])
+@pytest.mark.parametrize(
+    ("refusals", "off"),
+    [((0.5, 0.5), 0.5), ((0.4, 0.6), 0.6), ((0.01, 0.9), 2.5 / 3.5), ((0.9, 0.5), 0.5), ((0.0, 0.0), 2.5 / 3.5)],
+)
 def test_refused_images_are_evidence_as_far_as_the_calibration_says(refusals, off):
     there, drive_route = np.ones(30, bool), Route(Drive(leaves=1e-9, returns=1e-9))  # off with a probability of 0.5
     for prediction in (None, refusal("no candidates")):

@@ -163,3 +163,10 @@ def test_a_plain_function_may_close_over_traced_values(count):
     sigmas = jnp.array([10.0, 20.0])
     twice = jax.jit(lambda t: t * score_grid(scaled, pairs, sigma=sigmas))(2.0)
     np.testing.assert_allclose(jnp.sum(twice), 2 * expected, rtol=1e-5)
+
+
+def test_numbers_out_of_bounds_are_refused_in_a_grid_as_in_the_scorer():
+    pairs = stack([random_matches(np.random.default_rng(0), 5)])
+    for scorer, axes in ((HistogramOfShifts(), {"sigma": [-3.0, 10.0]}), (AnchorPoints(), {"tolerance": [np.nan]})):
+        with pytest.raises(ValueError, match="expected numbers from"):
+            score_grid(scorer, pairs, **axes)

@@ -38,7 +38,8 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         return path
     run = read_run(folder)
     sections = [_recall_section(run)] if run.gains else []
-    if run.gains and (table := run.tables.get("differences.csv")) and table.rows:
+    table = run.tables.get("differences.csv")
+    if run.gains and table and table.rows and table.header[-1] == "path_p":  # earlier runs have other tests
         words, tests = paired_tests("system", table.rows)
         sections.append(Section("differences", "Differences", words, tables={"Every two systems": tests}))
     sections += [
