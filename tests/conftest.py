@@ -155,7 +155,8 @@ def weights(tmp_path_factory) -> Path:
 def real_weights(tmp_path_factory) -> Path:
     """The same, but with the real weights of ALIKED and LightGlue."""
     skip_without(ALIKED, LIGHTGLUE)
-    real = {path.stem: read_checkpoint(path) for path in (ALIKED / "aliked-n16.pth", LIGHTGLUE)}
+    files = ALIKED / "aliked-n16.pth", ALIKED / "aliked-n32.pth", LIGHTGLUE
+    real = {path.stem: read_checkpoint(path) for path in files}
     return install_weights(tmp_path_factory.mktemp("real"), (dict(random_checkpoints.for_networks()) | real).items())
 
 

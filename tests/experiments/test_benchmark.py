@@ -122,7 +122,7 @@ def test_the_file_of_others_stays(tmp_path):
     """It is refused before the work."""
     (tmp_path / "precious.json").write_text("{}")
     with pytest.raises(InputError, match="expected a new file"):
-        run_benchmark("scores", 1, tmp_path / "precious.json")
+        run_benchmark("scores", [], 1, tmp_path / "precious.json", is_quick=False)
 
 
 def test_help_needs_no_jax():

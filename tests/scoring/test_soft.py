@@ -76,7 +76,7 @@ def test_points_outside_of_an_image_are_at_its_border():
 
 
 @pytest.mark.optimized
-@draws(HISTOGRAMS, [1e-30, 0.01, 0.3, 10.0, 1e3])
+@draws(HISTOGRAMS, [1e-6, 0.01, 0.3, 10.0, 1e3])
 def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
     points0, points1, weights, _ = oracle_inputs(scorer, matches)
     names = ("bin_size", "sigma", "sigma_is_variance", "truncate", "align", "shift_range")
