@@ -169,6 +169,7 @@ def small_street(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tools(tmp_path_factory) -> Path:
     """Files of matches by hloc, kapture, COLMAP and vismatch."""
+    skip_without("h5py")
     from tests.io.match_files import write_tool_files
 
     return write_tool_files(tmp_path_factory.mktemp("tools"))
