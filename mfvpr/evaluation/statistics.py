@@ -21,7 +21,7 @@ class McNemar(NamedTuple):
 class PathTest(NamedTuple):
     """Two systems on the same queries along a path, see `path_test`."""
 
-    design_effect: float  # number of queries that are worth one independent query
+    design_effect: float  # so many neighboring queries count as one; 1 = independent
     p_value: float  # probability of a difference at least this large if neither were better
 
 
@@ -71,7 +71,7 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
 
 
 def design_effect(hits: np.ndarray) -> float:
-    """Number of queries of a path, in 1 ... Q, that are worth one independent query, from hits `[Q]` bool.
+    """So many neighboring queries of a path count as one, in 1 ... Q (1 = independent), from hits `[Q]` bool.
 
     This is the variance of the mean divided by the variance for independent queries. It is estimated twice, as in a
     Markov chain with the autocorrelation of neighboring queries, and of neighboring blocks of sqrt(Q) queries, since
