@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float
 
 from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
+from mfvpr.core.metrics import reliability
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
-from mfvpr.evaluation.metrics import reliability
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.localization.calibration import data_of_drive
-from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer

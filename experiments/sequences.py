@@ -25,17 +25,17 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset
 from mfvpr.evaluation.calibration import CalibrationData, calibration_data
+from mfvpr.evaluation.drives import Drive
+from mfvpr.evaluation.fusion import FrameCorrelation
+from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.statistics import path_test
-from mfvpr.reranking.drives import Drive
-from mfvpr.reranking.fusion import FrameCorrelation
-from mfvpr.reranking.results import Ranked
-from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
-from mfvpr.types import Shortlist
 
 NEAR = 2  # frames
 STEADY, ANY = np.arange(0.8, 1.25, 0.1), np.arange(-8, 8.5, 0.5)  # rows from one image to the next
@@ -153,7 +153,7 @@ def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"])
 
 
 def fit(arguments: list[str]) -> Confidence:
-    """The confidence of all scores of `scorer=demo` with SIFT on some drives, see `mfvpr.reranking.drives.STREETS`."""
+    """The confidence of all scores of `scorer=demo` with SIFT on some drives, see `mfvpr.evaluation.drives.STREETS`."""
     system, cache, parts = load_system("mfvpr", features="sift", scorer="demo"), FeatureCache(), []
     for argument in arguments:
         dataset = folder(*argument.partition("=")[2].split(":"), ground_truth="order")

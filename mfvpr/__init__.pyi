@@ -2,20 +2,20 @@
 # Public names in the order of the stages. Each is imported when it is first used.
 
 # values that pass from stage to stage
-from .types import Features, Matches, Ranking, Shortlist
+from .core.types import Features, Matches, Ranking, Shortlist
 
 # shortlists from global descriptors
 from .retrieval.search import retrieve
 
 # matches of two images, and of a query with its candidates
-from .matching.host import HostMatcher
-from .matching.lightglue import LightGlueMatcher
-from .matching.matcher import Matcher, NearestNeighborMatcher, match_pairs
-from .matching.nearest_neighbors import compact, filter_matches, match, match_candidates
-from .matching.soft import soft_match
+from .matchers.host_matcher import HostMatcher
+from .matchers.lightglue_matcher import LightGlueMatcher
+from .matchers.matcher import Matcher, NearestNeighborMatcher, match_pairs
+from .core.nearest_neighbors import compact, filter_matches, match, match_candidates
+from .matchers.soft import soft_match
 
 # weights of matches
-from .scoring.weights import (
+from .core.weights import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     RatioWeight,
@@ -25,25 +25,25 @@ from .scoring.weights import (
 )
 
 # scores of one pair
-from .scoring.aggregate import AggregatedScore
-from .scoring.anchor import AnchorPoints
-from .scoring.counting import MatchCount
-from .scoring.grid import GridAnchors
-from .scoring.histogram import HistogramOfShifts, ShiftHistogram
-from .scoring.homography import Homography
-from .scoring.homography_opencv import OpenCvHomography
-from .scoring.lost import LostScore
-from .scoring.phrases import VisualPhrases
-from .scoring.rapid import RapidSpatialScore
+from .core.aggregate import AggregatedScore
+from .core.anchor import AnchorPoints
+from .core.counting import MatchCount
+from .baselines.grid_anchors import GridAnchors
+from .core.histogram import HistogramOfShifts, ShiftHistogram
+from .baselines.homography import Homography
+from .baselines.homography_opencv import OpenCvHomography
+from .baselines.lost import LostScore
+from .baselines.phrases import VisualPhrases
+from .baselines.rapid import RapidSpatialScore
 
 # scores of all candidates, whole grids of parameters, fusion and ranking
-from .reranking.grids import score_grid
-from .reranking.ranking import balancing_c, combine, rank, rerank, score_candidates
+from .core.grids import score_grid
+from .core.ranking import balancing_c, combine, rank, rerank, score_candidates
 
 # data sets, what is correct, and recall
 from . import datasets
 from .datasets.positives import frame_positives, radius_positives
-from .evaluation.metrics import recall_at_k
+from .core.metrics import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
 from .cli.systems import load_system
@@ -60,9 +60,9 @@ from .deployment.folders import export, load_exported
 from .deployment.programs import ExportShapes
 
 # tools for a scorer of your own; see mfvpr.testing.check_scorer
-from .scoring.scorer import Scorer
-from .types import value
-from .scoring.shifts import image_sizes, match_shifts
+from .core.scorer import Scorer
+from .core.types import value
+from .core.shifts import image_sizes, match_shifts
 from .utils.numerics import masked, masked_mean, masked_median, safe_sqrt
 
 # mistakes of a caller, in one line

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mfvpr.reranking.ranking import score_candidates
-from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, on_host
-from mfvpr.types import Array, Matches, per_match
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.ranking import score_candidates
+from mfvpr.core.scorer import Scorer, on_host
+from mfvpr.core.types import Array, Matches, per_match
 from mfvpr.utils.errors import NoGradientError
 from mfvpr.utils.numerics import holds_function
 

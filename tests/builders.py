@@ -9,10 +9,11 @@ import numpy as np
 from PIL import Image
 
 import mfvpr
-from mfvpr import Features, Matches, Pipeline, Shortlist, System, types
+from mfvpr import Features, Matches, Pipeline, Shortlist, System
+from mfvpr.core import types
 from mfvpr.evaluation import rank_dataset
 from mfvpr.features import Aggregated, Extractor, Sift
-from mfvpr.matching import MatchSet
+from mfvpr.matchers import MatchSet
 from mfvpr.retrieval import Retrieval
 
 SIZE = 336

@@ -6,7 +6,7 @@ import math
 import jax
 import numpy as np
 
-from mfvpr.scoring import planes
+from mfvpr.baselines import planes
 
 
 def estimate(points1, points0, *, threshold, max_iterations=2000, confidence=0.995, seed=0):

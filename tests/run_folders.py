@@ -6,13 +6,13 @@ import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.report import Table, write_json
 from mfvpr.report.evaluation_files import write_failures, write_predictions
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import write_csv
-from mfvpr.reranking.results import Ranked
 from mfvpr.utils.files import printable
 
 HOSTILE = (

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
+from mfvpr.baselines import weight_registry
+from mfvpr.baselines.learned_weight import LearnedWeight
+from mfvpr.baselines.weight_registry import read_weight, write_weight
 from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, images, truth_files
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
 from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
-from mfvpr.scoring import weight_registry
-from mfvpr.scoring.learned_weight import LearnedWeight
-from mfvpr.scoring.weight_registry import read_weight, write_weight
 from tests.builders import fill, random_matches
 from tests.io.other_programs import feature
 

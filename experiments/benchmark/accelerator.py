@@ -20,8 +20,8 @@ import mfvpr
 from experiments.benchmark import networks
 from experiments.benchmark.accelerator_checks import checks
 from experiments.benchmark.harness import duration, write_report
+from mfvpr.core.types import Features, Matches
 from mfvpr.report import Table
-from mfvpr.types import Features, Matches
 from mfvpr.utils.errors import InputError
 
 SIZE, BINS = 336, 45  # px; bins of the histogram per axis

@@ -13,11 +13,11 @@ from flax import nnx
 
 import mfvpr
 from experiments.benchmark import networks
-from mfvpr.matching.nearest_neighbors import products
+from mfvpr.baselines.scorers import SCORERS
+from mfvpr.core.nearest_neighbors import products
+from mfvpr.core.types import Features, Matches
 from mfvpr.networks.imagenet import preprocess
 from mfvpr.retrieval.search import ExactSearch
-from mfvpr.scoring.registry import SCORERS
-from mfvpr.types import Features, Matches
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.threads import ordered_map
 from tests import oracles

@@ -13,6 +13,8 @@ import numpy as np
 from experiments.benchmark.harness import duration, write_report
 from mfvpr.checkpoints import REGISTRY, is_installed, load_model
 from mfvpr.cli.console import Progress
+from mfvpr.core import HistogramOfShifts
+from mfvpr.core.types import Features
 from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import Pipeline, System
@@ -20,9 +22,7 @@ from mfvpr.features import Aggregated, AlikedFeatures, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.report import Table
 from mfvpr.retrieval import Retrieval
-from mfvpr.scoring import HistogramOfShifts
 from mfvpr.storage.maps import Entry
-from mfvpr.types import Features
 
 SIZES, CANDIDATES, ROUNDS = (1000, 10_000), 50, 3
 FRAMES = 100  # of the synthetic street; every image of a map is one of them with noise of its own

@@ -17,7 +17,7 @@ import numpy as np
 
 import mfvpr
 from experiments.benchmark.harness import Entry, Results, Seconds, compete
-from mfvpr.types import Features, Matches
+from mfvpr.core.types import Features, Matches
 
 CANDIDATES, KEYPOINTS, DIMENSION = 50, 700, 512
 COMMON = 300  # keypoints that a candidate shares with the query

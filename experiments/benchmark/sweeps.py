@@ -17,8 +17,8 @@ import numpy as np
 import mfvpr
 from experiments.benchmark.harness import Entry, Results, Seconds, compete
 from experiments.benchmark.scores import CANDIDATES, SIZE, make_data
-from mfvpr.scoring.weights import match_weights
-from mfvpr.types import Matches
+from mfvpr.core.types import Matches
+from mfvpr.core.weights import match_weights
 from mfvpr.utils.numerics import available_cpus
 
 SIGMAS, BIN_SIZES = (5.0, 10.0, 15.0, 22.5, 30.0, 45.0), (5.0, 10.0, 15.0, 20.0)  # px

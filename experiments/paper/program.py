@@ -16,10 +16,10 @@ from mfvpr.cli.console import tell
 from mfvpr.cli.inputs import dataset_of
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.runs import LAST
-from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError
 from mfvpr.utils.files import expand_user

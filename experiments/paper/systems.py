@@ -11,7 +11,7 @@ from mfvpr.checkpoints.registry import Entry
 from mfvpr.cli.build import expand_user
 from mfvpr.cli.overrides import quote
 from mfvpr.datasets.published import PUBLISHED
-from mfvpr.reranking.results import RETRIEVAL
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.systems.settings import RULES, SettingsError
 
 DRAWN = "streets_seasons"

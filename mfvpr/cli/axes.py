@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from mfvpr.matching import MatchSet, Scales
-from mfvpr.matching.match_set import block_bytes, scales
-from mfvpr.scoring import SCORERS
-from mfvpr.scoring.parameters import parameters_of
+from mfvpr.baselines import SCORERS
+from mfvpr.core.parameters import parameters_of
+from mfvpr.matchers import MatchSet, Scales
+from mfvpr.matchers.match_set import block_bytes, scales
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.models import can_learn

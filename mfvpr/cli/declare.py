@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from mfvpr.scoring import ALONE, PAPER, SCORERS
-from mfvpr.scoring.parameters import parameters_of, summary
+from mfvpr.baselines import ALONE, PAPER, SCORERS
+from mfvpr.core.parameters import parameters_of, summary
 from mfvpr.systems.settings import CONF
 from mfvpr.utils.files import write_text
 
-_FIRST = "# Made by `make conf` from mfvpr/scoring: change it there.\n"
+_FIRST = "# Made by `make conf` from mfvpr/core and mfvpr/baselines: change it there.\n"
 
 # Scorers with other values than their fields' defaults, by name.
 _VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {

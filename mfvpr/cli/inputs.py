@@ -6,17 +6,17 @@ from typing import Any
 
 from mfvpr.cli import build, notes, truth
 from mfvpr.cli.console import Progress, tell
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe
-from mfvpr.matching import MatchSet, Scales
+from mfvpr.matchers import MatchSet, Scales
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
-from mfvpr.types import Shortlist
 from mfvpr.utils import Stopwatch
 
 

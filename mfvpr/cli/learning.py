@@ -5,16 +5,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
 from mfvpr.cli.inputs import prepare, with_image_size
 from mfvpr.cli.overrides import compose_data_sets
+from mfvpr.core import Scorer
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
-from mfvpr.matching import Scales
+from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.report.run_files import matched_content
-from mfvpr.scoring import Scorer
-from mfvpr.scoring.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets

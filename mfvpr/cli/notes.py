@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from typing import Any, Literal
 
+from mfvpr.baselines.weight_registry import provenance
 from mfvpr.cli.console import tell
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, OwnRows, fingerprints, own_rows, readings
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.sequence_matching import num_candidates
-from mfvpr.scoring.weight_registry import provenance
 
 # A learned match weight depends on these settings.
 _LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}

@@ -8,9 +8,9 @@ from mfvpr.cli import run_folder, truth
 from mfvpr.cli.axes import require_memory, search_axes, with_final_axis
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets.contents import fingerprints, readings
+from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.report import sweeps
 from mfvpr.report.run_files import matched_content
-from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Outcome, SweepOptions
 from mfvpr.tuning.sweeps.drives import DriveRanking

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mfvpr.core import Scorer
+from mfvpr.core.parameters import numbers_by_name, static_names
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.protocol import Split
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.runs import LAST
 from mfvpr.report.sweeps import Sweep, axes_json
-from mfvpr.reranking.results import RETRIEVAL
 from mfvpr.retrieval import Retrieval
-from mfvpr.scoring import Scorer
-from mfvpr.scoring.parameters import numbers_by_name, static_names
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
 from mfvpr.tuning.sweeps.drives import DriveRanking

@@ -14,12 +14,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.types import Array
 from mfvpr.deployment import onnx_models, stablehlo
 from mfvpr.deployment.check_arrays import check_inputs, largest_difference
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
 from mfvpr.evaluation.system import System
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import path_inside, require_file
 from mfvpr.utils.fingerprints import recipe_of

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.ranking import BIN_STEP
+from mfvpr.core.scorer import Scorer, on_host, require_scores
+from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
-from mfvpr.matching.host import PairSource
-from mfvpr.matching.matcher import Matcher
-from mfvpr.reranking.ranking import BIN_STEP
-from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, on_host, require_scores
-from mfvpr.types import Array, Features, Matches
+from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.matchers.matcher import Matcher
 from mfvpr.utils.errors import InputError
 
 Form = Literal["vectorized", "loop"]

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import export as jax_export
 
+from mfvpr.core.types import Array
 from mfvpr.deployment.programs import Program, Tensor
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 PLATFORMS = ("cpu", "cuda")

@@ -1,8 +1,15 @@
 __all__ = [
     "Confidence",
+    "Drive",
+    "DriveFilter",
     "EvaluationProtocol",
+    "FinalScore",
+    "FrameCorrelation",
+    "Fusion",
     "Half",
+    "Matched",
     "Pipeline",
+    "Ranked",
     "RankedDataset",
     "Recall",
     "Shard",
@@ -16,15 +23,11 @@ __all__ = [
     "fill_shard",
     "fit_confidence",
     "halves",
-    "hits",
     "match_sequence",
     "mcnemar",
     "neighboring_settings",
-    "precision_recall",
     "rank_dataset",
     "read_confidences",
-    "recall_at_k",
-    "reliability",
     "separate",
     "write_confidences",
 ]
@@ -37,11 +40,14 @@ from .calibration import (
     read_confidences,
     write_confidences,
 )
+from .drives import Drive
 from .evaluation import RankedDataset, Recall, rank_dataset
-from .metrics import hits, precision_recall, recall_at_k, reliability
+from .fusion import FinalScore, FrameCorrelation, Fusion
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
+from .rankings import Matched, Ranked
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
+from .sequences import DriveFilter
 from .shards import Shard, fill_shard
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth
-from mfvpr.reranking.confidence import APART, INPUTS, REFUSALS, Confidence, Input, confidence_inputs
-from mfvpr.reranking.results import Ranked
+from mfvpr.evaluation.confidence import APART, INPUTS, REFUSALS, Confidence, Input, confidence_inputs
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
 

@@ -17,17 +17,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from mfvpr.core.metrics import count_correct
 from mfvpr.datasets.datasets import Dataset, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.cohort_normalization import cohort_sequence, hubness
+from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.image_sizes import folders_of
-from mfvpr.evaluation.metrics import count_correct
+from mfvpr.evaluation.rankings import COHORT, Matched, Ranked
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
 from mfvpr.evaluation.validation import score_warnings
-from mfvpr.reranking.cohort_normalization import cohort_sequence, hubness
-from mfvpr.reranking.fusion import rank_by_scores
-from mfvpr.reranking.results import COHORT, Matched, Ranked
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError

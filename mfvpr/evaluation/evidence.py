@@ -18,20 +18,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.ranking import score_candidates
+from mfvpr.core.types import Features, Matches
+from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.images import gray, resize, write_image
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.evaluation import RankedDataset, Reason
+from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import Pipeline, noise_image
 from mfvpr.features.extractor import Extractor, Source
-from mfvpr.reranking.ranking import score_candidates
-from mfvpr.reranking.results import Matched
 from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.weights import RatioWeight
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Features, Matches
 
 # Round numbers. The first two were chosen with two real sets in view, a park path and a corridor: results on those sets
 # are no independent test. The last was chosen on synthetic streets and the park path.

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.metrics import hits
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, threshold_words
-from mfvpr.evaluation.metrics import hits
 from mfvpr.evaluation.selection import Half, halves, places_along_path
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash
 

@@ -12,11 +12,11 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.image_sizes import folders_of
+from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.system import Pipeline
 from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
-from mfvpr.matching.host import Side
-from mfvpr.matching.match_set import MatchSet
-from mfvpr.reranking.results import Matched
+from mfvpr.matchers.host_matcher import Side
+from mfvpr.matchers.match_set import MatchSet
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.storage.feature_cache import FeatureCache

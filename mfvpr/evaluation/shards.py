@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.evaluation.cohort_normalization import cohort_sequence
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.sequence_matching import match_rows, matches_recipe
 from mfvpr.evaluation.system import Pipeline, System
 from mfvpr.features.extractor import Aggregated, Extractor, Source
-from mfvpr.reranking.cohort_normalization import cohort_sequence
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError

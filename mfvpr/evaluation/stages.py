@@ -1,4 +1,4 @@
-"""The stages of re-ranking a data set: match, score, explain. `mfvpr.reranking` fuses and ranks.
+"""The stages of re-ranking a data set: match, score, explain. `mfvpr.evaluation.fusion` fuses and ranks.
 
 Files and threads stay on the host; each computation is one compiled program per shape.
 """
@@ -13,18 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.ranking import BIN_STEP
+from mfvpr.core.types import Array, Matches, Shortlist
+from mfvpr.core.weights import match_weights
+from mfvpr.evaluation.batched_scoring import score
 from mfvpr.features.feature_set import FeatureSet, memory_budget
-from mfvpr.matching import batched, host
-from mfvpr.matching.host import PairSource, Side
-from mfvpr.matching.match_set import MatchSet, QueryMatches, Scales
-from mfvpr.matching.matcher import NEIGHBORS, Matcher
-from mfvpr.reranking.batched_scoring import score
-from mfvpr.reranking.ranking import BIN_STEP
-from mfvpr.scoring.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.weights import match_weights
+from mfvpr.matchers import batched_matching as batched
+from mfvpr.matchers import host_matcher as host
+from mfvpr.matchers.host_matcher import PairSource, Side
+from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales
+from mfvpr.matchers.matcher import NEIGHBORS, Matcher
 from mfvpr.storage.matches import MatchStore, StoredMatches
-from mfvpr.types import Array, Matches, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
 from mfvpr.utils.progress import Track, no_progress

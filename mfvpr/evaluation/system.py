@@ -8,26 +8,26 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
+from mfvpr.baselines.scorers import SCORERS
+from mfvpr.core.parameters import check_bounds
+from mfvpr.core.ranking import Ties
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.types import Shortlist, with_parts
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.evaluation.image_sizes import Note, size_for_images
+from mfvpr.evaluation.rankings import RETRIEVAL
+from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
-from mfvpr.matching.host import PairSource
-from mfvpr.matching.lightglue import LightGlueMatcher
-from mfvpr.matching.match_set import Scales
-from mfvpr.matching.matcher import NEIGHBORS, Matcher
-from mfvpr.reranking.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
-from mfvpr.reranking.ranking import Ties
-from mfvpr.reranking.results import RETRIEVAL
-from mfvpr.reranking.sequences import DriveFilter
+from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.matchers.lightglue_matcher import LightGlueMatcher
+from mfvpr.matchers.match_set import Scales
+from mfvpr.matchers.matcher import NEIGHBORS, Matcher
 from mfvpr.retrieval.retriever import Retriever
-from mfvpr.scoring.parameters import check_bounds
-from mfvpr.scoring.registry import SCORERS
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.types import Shortlist, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 
@@ -113,7 +113,7 @@ class System:
             other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
             before (`name + frames`).
-        cohort: rank with a cohort as well, see `mfvpr.reranking.cohort_normalization`: the number of frames on both
+        cohort: rank with a cohort as well, see `mfvpr.evaluation.cohort_normalization`: the number of frames on both
             sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
         final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.

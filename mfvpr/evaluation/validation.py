@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.evaluation.rankings import Matched, Ranked
 from mfvpr.features.feature_set import FeatureSet
-from mfvpr.reranking.results import Matched, Ranked
 from mfvpr.retrieval.retriever import RetrievalResult
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
 

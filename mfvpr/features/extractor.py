@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Num
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
-from mfvpr.types import Features
 
 
 class Scale(NamedTuple):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from mfvpr.types import Array, Features, per_keypoint
+from mfvpr.core.types import Array, Features, per_keypoint
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, compiled, free_bytes, round_up

@@ -7,12 +7,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, require_network
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 
 _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a half is dropped
@@ -26,7 +26,7 @@ class PatchNetVladFeatures(NetworkExtractor):
 
     Attributes, beside those of `Extractor`:
         patch_sizes: sides of the patches, in positions of the map; each size is a scale.
-        scale_weights: weight of each scale's score, see `mfvpr.reranking.fuse_scales`; None = equal weights.
+        scale_weights: weight of each scale's score, see `mfvpr.core.fuse_scales`; None = equal weights.
 
     Raises:
         InputError: another network; no patch sizes, duplicates, or a patch that is larger than the map; another number

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.images import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.types import Features
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 import scipy  # its subpackages are imported at their first use
 from jaxtyping import Float
 
+from mfvpr.core.types import Features
 from mfvpr.features.feature_set import FeatureSet
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 
 # Chosen so that R@1 hardly depends on the input's last bits, with SIFT and with ALIKED, summer against snow.

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from mfvpr.core.types import Array
 from mfvpr.features.extractor import Extractor
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.numerics import free_host_bytes

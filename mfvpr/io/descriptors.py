@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
+from mfvpr.core.types import Array
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
 from mfvpr.io.npz import parse_npy, read_npz, write_npz
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
 

@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from mfvpr.core.types import Features
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import Container, FileEntry, Shapes, choose_reader, shorten
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_paths, require_all, require_different
 from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError, require_word
 
 SCORES = ("scores", "keypoint_scores")

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Num
 
+from mfvpr.core.types import Features, Matches, Shortlist
 from mfvpr.io.checks import as_float32
 from mfvpr.io.containers import FileEntry, choose_reader, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
@@ -24,7 +25,6 @@ from mfvpr.io.formats.predictions import PredictionPairs
 from mfvpr.io.formats.result_files import ResultFiles
 from mfvpr.io.names import ImageOfEntry, match_paths, require_one_image
 from mfvpr.io.plain_matches import numbered_matches, point_matches
-from mfvpr.types import Features, Matches, Shortlist
 from mfvpr.utils.errors import InputError
 
 

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Num
 
+from mfvpr.core.types import Features, Matches
 from mfvpr.io.checks import as_float32
 from mfvpr.io.features import require_inside
 from mfvpr.io.formats.pairs import Size
-from mfvpr.types import Features, Matches
 from mfvpr.utils.errors import InputError
 
 _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1

@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from mfvpr.core.types import Ranking, Shortlist
 from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import FileEntry, reading, shorten
 from mfvpr.io.formats.predictions import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.io.names import adds_folders, match_names, require_different
 from mfvpr.io.npz import read_npz, write_npz
-from mfvpr.types import Ranking, Shortlist
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_file, require_replaceable, write_text
 

@@ -16,11 +16,11 @@ from mfvpr.evaluation.calibration import (
     read_confidences,
     write_confidences,
 )
+from mfvpr.evaluation.confidence import REFUSALS, Confidence
 from mfvpr.evaluation.evaluation import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
+from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.system import System
-from mfvpr.reranking.confidence import REFUSALS, Confidence
-from mfvpr.reranking.results import RETRIEVAL, Ranked
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of

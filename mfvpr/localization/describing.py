@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import ArrayLike
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.features.extraction import describe_folder, describe_images
 from mfvpr.features.extractor import Aggregation, Description, Extractor
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.features import round_as_stored
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import as_array

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.evaluation.system import System
 from mfvpr.features.extractor import Aggregation, Extractor
@@ -24,7 +25,6 @@ from mfvpr.localization.vocabulary import VocabularyFile
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.map_entries import Entry, check_entry
 from mfvpr.storage.maps import MapImage, MapRows, has_settings, lock_map, write_settings
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
 from mfvpr.utils.fingerprints import recipe_of

@@ -10,8 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.types import Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
+from mfvpr.evaluation.confidence import REFUSALS, Confidence
 from mfvpr.evaluation.evaluation import Reason
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
@@ -21,6 +24,8 @@ from mfvpr.evaluation.evidence import (
     reason_against_image,
     strength,
 )  # fmt: skip
+from mfvpr.evaluation.fusion import rank_by_scores
+from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
@@ -31,15 +36,10 @@ from mfvpr.localization.images import DescribedMap, MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, padded_size, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
-from mfvpr.matching.host import PairSource
-from mfvpr.reranking.confidence import REFUSALS, Confidence
-from mfvpr.reranking.fusion import rank_by_scores
-from mfvpr.reranking.results import RETRIEVAL, Ranked
+from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
-from mfvpr.scoring.scorer import Scorer
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Matches, Shortlist
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle

@@ -8,15 +8,15 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.ranking import BIN_STEP, score_candidates
+from mfvpr.core.scorer import Scorer, require_scores
+from mfvpr.core.types import Features, Matches
 from mfvpr.evaluation.stages import pair_shifts
 from mfvpr.evaluation.validation import require_finite
 from mfvpr.features.feature_set import STEP, stack_features
-from mfvpr.matching.matcher import Matcher, match_pairs
-from mfvpr.reranking.ranking import BIN_STEP, score_candidates
-from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.parameters import with_capacity
-from mfvpr.scoring.scorer import Scorer, require_scores
-from mfvpr.types import Features, Matches
+from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
 from mfvpr.utils.threads import ordered_map
 

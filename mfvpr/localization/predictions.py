@@ -4,9 +4,9 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
+from mfvpr.core.types import Matches
 from mfvpr.evaluation.evaluation import Reason
 from mfvpr.localization.describing import Described
-from mfvpr.types import Matches
 from mfvpr.utils.errors import InputError
 
 

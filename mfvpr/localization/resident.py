@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import jax
 
+from mfvpr.core.types import Features
 from mfvpr.features.feature_set import SHARE
 from mfvpr.storage.maps import MapRows
-from mfvpr.types import Features
 from mfvpr.utils.numerics import free_host_bytes
 
 

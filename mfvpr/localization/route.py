@@ -1,4 +1,4 @@
-"""Localization along a drive: the causal filter of `mfvpr.reranking.drives` over the rows of a map.
+"""Localization along a drive: the causal filter of `mfvpr.evaluation.drives` over the rows of a map.
 
 route = Route()
 for image in images:  # in their order
@@ -22,11 +22,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mfvpr.core.types import Array
+from mfvpr.evaluation.confidence import REFUSALS
+from mfvpr.evaluation.drives import DEFAULT_DRIVE, Drive, DriveModel, Evidence, off_the_map
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.localization.predictions import Located, Prediction
-from mfvpr.reranking.confidence import REFUSALS
-from mfvpr.reranking.drives import DEFAULT_DRIVE, Drive, DriveModel, Evidence, off_the_map
-from mfvpr.reranking.results import Ranked
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import compiled, round_up
 

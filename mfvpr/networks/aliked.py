@@ -11,11 +11,11 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.aliked_description import DescriptorHead, field
 from mfvpr.networks.aliked_detection import Detections, detect
 from mfvpr.networks.imagenet import Images
 from mfvpr.networks.sampling import sample, upsample
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import over_batch
 

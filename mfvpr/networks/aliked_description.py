@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float, Int
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import EPSILON, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors
-from mfvpr.types import Array
 
 _CHUNK = 256  # keypoints per step
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.types import Array
 from mfvpr.networks.sampling import sample
-from mfvpr.types import Array
 
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
 _TEMPERATURE = 0.1

@@ -14,7 +14,7 @@ from flax import nnx
 from jax import lax
 from jaxtyping import Bool, Float
 
-from mfvpr.types import Array
+from mfvpr.core.types import Array
 
 _WIDE = 128  # least input channels for which fewer products outweigh more memory traffic
 # The convolution is a product of polynomials: their values at 0, 1, -1, 2, -2 and infinity, and the inverse.

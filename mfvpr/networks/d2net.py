@@ -16,10 +16,10 @@ from flax import nnx
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, of_unit_length, preprocess
 from mfvpr.networks.sampling import between, neighbors
 from mfvpr.networks.vgg import Vgg16
-from mfvpr.types import Array
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order

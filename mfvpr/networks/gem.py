@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
-from mfvpr.types import Array
 
 Backbone = Literal["vgg16", "resnet50"]
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num
 
-from mfvpr.types import Array
+from mfvpr.core.types import Array
 
 Preprocessing = Literal["caffe", "torch"]
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.types import Array, Features
+from mfvpr.core.types import Array, Features
 from mfvpr.utils.numerics import masked
 
 _PRECISION = jax.lax.Precision.HIGHEST  # also on hardware with less than float32

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import DEVIATION, MEAN, Images, Pixels, of_unit_length
 from mfvpr.networks.resnet import ResNet50
-from mfvpr.types import Array
 
 IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps

@@ -10,10 +10,10 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import Images, Pixels, of_unit_length, preprocess
 from mfvpr.networks.resnet import PointwiseConv
 from mfvpr.networks.vgg import Vgg16, require_position
-from mfvpr.types import Array
 
 CHANNELS = 512  # of VGG16's conv5_3
 Order = Literal["clusters", "channels"]  # the outer axis of a descriptor

@@ -10,9 +10,9 @@ from flax import nnx
 from jax import lax
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.convolution import Conv3x3
 from mfvpr.networks.imagenet import Images
-from mfvpr.types import Array
 
 _EXPANSION = 4  # channels of a block's output per channel inside
 _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": (3, 512)}  # blocks, channels inside

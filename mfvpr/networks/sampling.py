@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from mfvpr.types import Array
+from mfvpr.core.types import Array
 
 
 class Neighbors(NamedTuple):

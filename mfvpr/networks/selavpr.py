@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.gem import GeneralizedMean
 from mfvpr.networks.imagenet import Images, of_unit_length
 from mfvpr.networks.vit import Block, VisionTransformer
-from mfvpr.types import Array
 
 _PARALLEL = 0.2  # weight of the parallel adapter
 _BOTTLENECK = 2  # width of a token over hidden values of an adapter

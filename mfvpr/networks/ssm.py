@@ -10,9 +10,9 @@ from typing import Literal
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.imagenet import Images, preprocess
 from mfvpr.networks.vgg import Vgg16
-from mfvpr.types import Array
 
 _LAYERS = {1: "conv5_2", 2: "conv4_2"}
 STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of the maps

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Bool, Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.convolution import Conv3x3
 from mfvpr.networks.imagenet import Images
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 STRIDE = 16  # px between positions of the last block's map

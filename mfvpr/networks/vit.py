@@ -8,9 +8,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Float
 
+from mfvpr.core.types import Array
 from mfvpr.networks.gem import GeneralizedMean
 from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 
 Pooling = Literal["cls", "gem"]

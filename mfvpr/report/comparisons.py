@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.baselines.learned_weight import LearnedWeight
+from mfvpr.baselines.weight_registry import write_weight
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import estimate, mcnemar, path_test, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_value
-from mfvpr.scoring.learned_weight import LearnedWeight
-from mfvpr.scoring.weight_registry import write_weight
 from mfvpr.tuning.learning.comparison import Comparison
 from mfvpr.tuning.learning.training import Fit
 from mfvpr.utils.numerics import compiled
@@ -101,7 +101,7 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
 
 
 def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str, Any]) -> None:
-    """Write every learned match weight by name, with how it was learned; see `mfvpr.scoring.weight_registry`."""
+    """Write every learned match weight by name, with how it was learned; see `mfvpr.baselines.weight_registry`."""
     for name, weight in _weights(comparison).items():
         write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
 

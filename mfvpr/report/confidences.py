@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.metrics import chance_calibration_error, reliability
 from mfvpr.evaluation.calibration import write_confidences
-from mfvpr.evaluation.metrics import chance_calibration_error, reliability
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_number, write_csv
-from mfvpr.reranking.results import RETRIEVAL
 
 _COUNTS = ("correct", "incorrect", "refused", "of these correct")
 TOP_PREDICTIONS = ("query", "prediction", "refused", "score", "confidence", "absent_confidence", "correct", "outcome",

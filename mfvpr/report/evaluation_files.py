@@ -10,13 +10,13 @@ from jaxtyping import Bool
 
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.evaluation.evaluation import RankedDataset
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.selection import places_along_path
+from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.statistics import McNemar, PathTest, mcnemar, path_test
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table, format_number, write_csv
-from mfvpr.reranking.results import Ranked
-from mfvpr.reranking.sequences import DriveFilter
 from mfvpr.utils.files import write_text
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.metrics import PrecisionRecall, precision_recall
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, middle, threshold_words
 from mfvpr.evaluation.calibration import CalibrationData, absent_rankings, calibration_data
+from mfvpr.evaluation.confidence import Confidence
 from mfvpr.evaluation.evaluation import KS, RankedDataset, Reason, Recall
-from mfvpr.evaluation.metrics import PrecisionRecall, precision_recall
+from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
-from mfvpr.reranking.confidence import Confidence
-from mfvpr.reranking.results import RETRIEVAL, Ranked
-from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 
 _THRESHOLD_NAMES: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # in results

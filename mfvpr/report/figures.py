@@ -11,11 +11,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
+from mfvpr.core.types import Matches
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.images import resize
 from mfvpr.evaluation.stages import Explanation
 from mfvpr.report.plots import panels, save_figure
-from mfvpr.types import Matches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, printable
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.positives import Positives
 from mfvpr.io.containers import reading, shorten
@@ -18,7 +19,6 @@ from mfvpr.io.stamps import SECOND
 from mfvpr.io.trajectories import read_poses, write_trajectory
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.tables import read_csv, write_csv
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
+from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.stages import explain
@@ -18,7 +19,6 @@ from mfvpr.localization.predictions import Localization
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.figures import ABOUT, Candidate, histogram_figure, pixel_aspect_of
 from mfvpr.report.runs import Figure, file_names
-from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, path_inside, printable
 

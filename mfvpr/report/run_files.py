@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.contents import Contents, fingerprints, readings
 from mfvpr.datasets.published import published_differences
 from mfvpr.datasets.truth import middle
+from mfvpr.evaluation.fusion import FinalScore, Fusion
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.features.extractor import Source
@@ -18,8 +20,6 @@ from mfvpr.report.evaluation_files import write_changes, write_gains, write_rank
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.runs import write_about, write_json, write_table, writing
 from mfvpr.report.tables import format_number, write_csv
-from mfvpr.reranking.fusion import FinalScore, Fusion
-from mfvpr.scoring.histogram import HistogramOfShifts
 from mfvpr.storage.extraction import open_sinks
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.versions import versions

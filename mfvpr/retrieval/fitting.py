@@ -8,12 +8,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mfvpr.core.types import with_parts
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.storage.disk import lock_store
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import with_parts
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.whitening import Whitening

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.images import Interpolation, read_size
 from mfvpr.features.extractor import Scale
@@ -22,7 +23,6 @@ from mfvpr.io.shortlists import read_with_entries as read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
 TYPICAL = 1000  # assumed keypoints of an image before the file is read
@@ -154,11 +154,11 @@ class MatchFiles:
 
     @property
     def inputs(self) -> Literal["images"]:
-        """See `mfvpr.matching.host.PairSource`."""
+        """See `mfvpr.matchers.host_matcher.PairSource`."""
         return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
-        """See `mfvpr.matching.host.PairSource`."""
+        """See `mfvpr.matchers.host_matcher.PairSource`."""
         file = _file_of(self.files, queries)
         known: ImageOfEntry = {}  # images of the entries of both folders
         sides = self._images(queries, file.prefix, known), self._images(database, self.database_prefix, known)

@@ -6,11 +6,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.features.extractor import Aggregated, Extractor
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Shortlist
 
 
 class RetrievalResult(NamedTuple):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.positives import Positives
-from mfvpr.types import Array, Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked
 from mfvpr.utils.ragged import repeat_last

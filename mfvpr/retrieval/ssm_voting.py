@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.ssm import SsmWindows
@@ -12,7 +13,6 @@ from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.types import Shortlist
 
 QUERIES = 64  # searched at a time
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.core.types import Features
 from mfvpr.storage.manifest import FEATURES, VECTORS, Kind
 from mfvpr.storage.rows import RowFormat, RowStore, row_bytes
-from mfvpr.types import Features
 
 FeatureStore = RowStore[Features]
 _NUM_ARRAYS = 5

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from mfvpr.core.types import Features
 from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
 from mfvpr.storage.features import FeatureStore, open_store
 from mfvpr.storage.manifest import (
@@ -43,7 +44,6 @@ from mfvpr.storage.manifest import (
     write_manifest,
 )
 from mfvpr.storage.map_entries import Entry, EntryStore, open_entry_store
-from mfvpr.types import Features
 from mfvpr.utils.errors import InputError
 
 SEGMENT = 4096  # rows

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.matching.match_set import QueryMatches
+from mfvpr.core.types import Matches
+from mfvpr.matchers.match_set import QueryMatches
 from mfvpr.storage.manifest import MATCHES
 from mfvpr.storage.rows import RowFormat, RowStore, row_bytes
-from mfvpr.types import Matches
 
 _OF_QUERY = ("counts", "indices", "filter_scores")
 _OF_MATCHES = tuple(part.name for part in fields(Matches) if part.name != "mask")  # there is no padding

@@ -7,13 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr import features
+from mfvpr.baselines import SCORERS
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
+from mfvpr.core import Scorer
+from mfvpr.core.parameters import from_values
+from mfvpr.core.weights import WEIGHTS
 from mfvpr.datasets import Dataset
-from mfvpr.evaluation import Pipeline, System
+from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System
+from mfvpr.evaluation.rankings import COHORT
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
-from mfvpr.matching import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
-from mfvpr.reranking.results import COHORT
+from mfvpr.matchers import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.retrieval import (
     DescriptorFiles,
     FeatureFiles,
@@ -25,10 +29,6 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
-from mfvpr.scoring import SCORERS, Scorer
-from mfvpr.scoring.parameters import from_values
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
-from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import recipe_of
 from mfvpr.utils.files import expand_user

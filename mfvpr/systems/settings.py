@@ -296,7 +296,7 @@ def scorer_rules(file: Path) -> dict[str, dict[str, Rule]]:
 
 
 def _limit_rule(*, length: int = 0, optional: bool = False, file: str = "", **limits: list[Any]) -> Rule:
-    """The rule of `mfvpr.scoring.parameters.Parameter.limits`."""
+    """The rule of `mfvpr.core.parameters.Parameter.limits`."""
     [(kind, values)] = limits.items()
     rule = {"choices": one_of, "whole": whole, "number": number}[kind](*values)
     if file:

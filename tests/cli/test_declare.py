@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
+from mfvpr.baselines import ALONE, SCORERS
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.cli import axes, command_line, declare, groups, help_text, overrides
-from mfvpr.scoring import ALONE, SCORERS, match_shifts
-from mfvpr.scoring.parameters import (
+from mfvpr.core import match_shifts
+from mfvpr.core.parameters import (
     check_plain,
     choice,
     flag,
@@ -21,12 +23,11 @@ from mfvpr.scoring.parameters import (
     parameters_of,
     table_value,
 )
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.scoring.weights import UnitWeight, Weight, match_weights
+from mfvpr.core.types import Array, Matches
+from mfvpr.core.weights import UnitWeight, Weight, match_weights
 from mfvpr.systems import assembly, settings
 from mfvpr.systems.settings import CONF
 from mfvpr.tuning.learning.models import can_learn, first_numbers
-from mfvpr.types import Array, Matches
 from tests.programs import composed
 
 pytestmark = pytest.mark.thorough
@@ -55,7 +56,7 @@ class Nearness:
 
 
 TEXT = """\
-# Made by `make conf` from mfvpr/scoring: change it there.
+# Made by `make conf` from mfvpr/core and mfvpr/baselines: change it there.
 # A scorer is declared once: settings, rules, help and axes follow from its class.
 method: near
 radius: 30.0  # px

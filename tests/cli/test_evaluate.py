@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
+from mfvpr.baselines import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from mfvpr.cli import evaluation
-from mfvpr.scoring import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from mfvpr.systems import assembly, settings
 from mfvpr.systems.settings import CONF, SettingsError
 from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mfvpr.baselines.weight_registry import read_weight
 from mfvpr.cli import evaluation, learning, sweeping
-from mfvpr.scoring.weight_registry import read_weight
 from mfvpr.tuning.learning import teaching, training
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.evaluation import statistics
+from mfvpr.evaluation import DriveFilter, Fusion, Ranked, statistics
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.reranking import DriveFilter, Fusion, Ranked
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import rankings

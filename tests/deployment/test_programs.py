@@ -9,13 +9,13 @@ import pytest
 
 import mfvpr
 from mfvpr import ExportShapes, Features, InputError, Matches
+from mfvpr.baselines import SCORERS
 from mfvpr.deployment import stablehlo
 from mfvpr.deployment.check_arrays import check_inputs, largest_difference
 from mfvpr.deployment.programs import make_program
+from mfvpr.evaluation import Fusion
 from mfvpr.features import Aggregated, Scale, Sift, VladFitting
-from mfvpr.reranking import Fusion
 from mfvpr.retrieval import Retrieval
-from mfvpr.scoring import SCORERS
 from tests.scorers import plain
 
 pytestmark = pytest.mark.thorough

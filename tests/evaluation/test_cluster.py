@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 import mfvpr
-from mfvpr.evaluation import Pipeline, System, rank_dataset
+from mfvpr.evaluation import Fusion, Pipeline, System, rank_dataset
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.reranking import Fusion
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import Cluster, InputError, Runtime

@@ -13,7 +13,7 @@ from PIL import Image
 import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile, Positives
-from mfvpr.evaluation import confidence_inputs, fit_confidence, halves, match_sequence
+from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, match_sequence
 from mfvpr.evaluation.evaluation import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
@@ -21,7 +21,6 @@ from mfvpr.features.extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.reranking import Fusion
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache, extraction

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.images import read_image, resize
 from mfvpr.evaluation.evidence import evidence_against, reason_against_image, strength
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import noise_image
-from mfvpr.reranking.results import Ranked
 from mfvpr.retrieval import FeatureFiles
-from mfvpr.types import Features, Shortlist
 from tests.builders import make_matches, match_set_of
 
 SIZES = [(320, 320), (160, 120), (512, 192)]

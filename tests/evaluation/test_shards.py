@@ -9,10 +9,9 @@ import pytest
 import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
-from mfvpr.evaluation import Pipeline, Shard, System, fill_shard, rank_dataset
+from mfvpr.evaluation import FrameCorrelation, Fusion, Pipeline, Shard, System, fill_shard, rank_dataset
 from mfvpr.evaluation.shards import shard_of
 from mfvpr.features import Aggregated, VladFitting
-from mfvpr.reranking import FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError

@@ -6,18 +6,18 @@ import pytest
 from PIL import Image
 
 import mfvpr
+from mfvpr.core import ranking
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import stages
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.matching import NearestNeighborMatcher
-from mfvpr.matching import match_set as match_sets
-from mfvpr.reranking import ranking
+from mfvpr.matchers import NearestNeighborMatcher
+from mfvpr.matchers import match_set as match_sets
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.matches import StoredMatches, open_match_store
 from mfvpr.tuning.sweeps import rank_settings
-from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, title

@@ -9,13 +9,12 @@ import pytest
 from PIL import Image
 
 import mfvpr
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets import FrameTruth, image_folder
-from mfvpr.evaluation import stages
+from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, stages
 from mfvpr.features import Aggregated, Description, Sift, VladFitting
-from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
-from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from tests.builders import evaluate_parts
 from tests.shapes import unchecked_shapes

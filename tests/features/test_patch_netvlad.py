@@ -10,9 +10,9 @@ import pytest
 import mfvpr
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.cli import inputs
+from mfvpr.core import fuse_scales
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
-from mfvpr.reranking import fuse_scales
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache, features
 from mfvpr.utils import InputError

@@ -10,6 +10,7 @@ import pytest
 
 import mfvpr
 from mfvpr import datasets
+from mfvpr.baselines import GridAnchors
 from mfvpr.datasets import ImageFolder
 from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
@@ -17,10 +18,9 @@ from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, V
 from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
-from mfvpr.matching import NearestNeighborMatcher
+from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
-from mfvpr.scoring import GridAnchors
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.features import forecast_bytes, pack_features
 from mfvpr.utils import InputError, progress

@@ -7,17 +7,17 @@ import pytest
 import mfvpr
 from mfvpr import GridAnchors, Shortlist
 from mfvpr.datasets import resize
+from mfvpr.evaluation import FrameCorrelation
 from mfvpr.features import WindowFitting
 from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
-from mfvpr.reranking import FrameCorrelation
 from mfvpr.retrieval.ssm_voting import vote
+from tests.baselines.test_grid_anchors import cells
+from tests.core.batches import score
 from tests.golden import make_ssm
 from tests.golden.make_ssm import CANDIDATES, DIMENSIONS, IMAGES, MAPS, made_up_map, picture
 from tests.networks.test_ssm_maps import published
-from tests.scoring.batches import score
-from tests.scoring.test_grid import cells
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 

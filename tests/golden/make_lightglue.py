@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.types import Features
+from mfvpr.core.types import Features
 from tests.builders import make_features
 from tests.random_checkpoints import lightglue_shapes, random_checkpoint
 

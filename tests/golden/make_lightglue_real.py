@@ -14,9 +14,9 @@ import numpy as np
 from experiments.paper.systems import REAL
 from mfvpr.checkpoints import load_model
 from mfvpr.checkpoints.checkpoint import read_checkpoint
+from mfvpr.core.types import Features
 from mfvpr.datasets import read_image, resize
 from mfvpr.features import AlikedFeatures
-from mfvpr.types import Features
 from tests.golden.make_lightglue import as_tensors, public
 
 SIZE, KEYPOINTS = (336, 336), 160

@@ -4,8 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
+from mfvpr.core.types import Shortlist
 from mfvpr.io import Images, open_features, open_matches
-from mfvpr.types import Shortlist
 from tests.io.checks import one_line_error
 from tests.io.match_files import DATABASE, GOLDEN, POINTS, QUERIES, SIZE, npz_folder, pair_of, side, write_hloc
 

@@ -12,9 +12,9 @@ import mfvpr
 from mfvpr import InputError, Map, Route
 from mfvpr.datasets import read_image
 from mfvpr.datasets.streets import streets_folder
+from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_image
 from mfvpr.features import VladFitting
-from mfvpr.reranking.drives import STREETS
 from mfvpr.storage import FeatureCache
 from tests.builders import map_system
 from tests.storage.extractors import SIFT, Counted

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 import mfvpr
+from mfvpr.core.types import Features
 from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
@@ -27,13 +28,12 @@ from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import maps as map_store
 from mfvpr.storage.map_entries import DEEPEST, check_entry
-from mfvpr.types import Features
 from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
+from tests.core.test_types import Tensor as TensorWithGradient
 from tests.programs import ROOT, snapshot
 from tests.shapes import unchecked_shapes
-from tests.test_types import Tensor as TensorWithGradient
 
 pytestmark = pytest.mark.thorough
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from mfvpr.evaluation.drives import Evidence
+from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.sequences import follow
 from mfvpr.localization import Alternative, Drive, Prediction, Route, route
-from mfvpr.reranking.drives import Evidence
-from mfvpr.reranking.results import Ranked
-from mfvpr.reranking.sequences import follow
 from mfvpr.utils import InputError
 
 

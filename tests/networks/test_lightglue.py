@@ -12,10 +12,10 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.checkpoints.tables import LIGHTGLUE
-from mfvpr.matching import LightGlueMatcher
+from mfvpr.core.types import per_keypoint
+from mfvpr.matchers import LightGlueMatcher
 from mfvpr.networks import LightGlue
 from mfvpr.networks.lightglue_assignment import assignment
-from mfvpr.types import per_keypoint
 from mfvpr.utils import InputError
 from tests.builders import double, read_golden, stack
 from tests.golden import make_lightglue_real

@@ -11,10 +11,10 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
 from mfvpr.datasets.truth import RADIUS, TOLERANCES
+from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.evaluation.evaluation import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
-from mfvpr.reranking import DriveFilter, FrameCorrelation, Fusion
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils import InputError
 from tests.programs import composed, csv_rows

@@ -10,7 +10,7 @@ from mfvpr import HistogramOfShifts
 from mfvpr.cli import evaluation
 from mfvpr.cli.inputs import prepare
 from mfvpr.evaluation.stages import SHIFT_FLOOR, dominant_shifts
-from mfvpr.matching import MatchSet
+from mfvpr.matchers import MatchSet
 from mfvpr.report.run_files import SHIFTS
 from mfvpr.utils import Stopwatch
 from tests.builders import make_matches, of_query

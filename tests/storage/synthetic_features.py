@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from mfvpr import Features, Matches
-from mfvpr.matching import MatchSet
+from mfvpr.matchers import MatchSet
 from mfvpr.storage import manifest as store_manifest
 from mfvpr.storage.features import open_store, round_as_stored
 from mfvpr.storage.matches import QueryMatches, open_match_store

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Matches
+from mfvpr.core.types import per_match, per_pair
 from mfvpr.storage.matches import forecast_bytes
-from mfvpr.types import per_match, per_pair
 from tests.storage.synthetic_features import MATCHES, assert_same, digests, matches_of, read_all
 
 

@@ -17,13 +17,13 @@ import pytest
 from flax import nnx
 
 from mfvpr import LightGlueMatcher, value
+from mfvpr.baselines.scorers import SCORERS
 from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.networks import blueprint
+from mfvpr.core.weights import WEIGHTS
 from mfvpr.features import Aggregated, AlikedFeatures, Sift, Vlad, VladFitting
-from mfvpr.matching import NearestNeighborMatcher
+from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import ExactSearch, Retrieval
-from mfvpr.scoring.registry import SCORERS
-from mfvpr.scoring.weights import WEIGHTS
 from mfvpr.utils import recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from mfvpr.core.metrics import PrecisionRecall
 from mfvpr.datasets.datasets import MEANS
-from mfvpr.evaluation.metrics import PrecisionRecall
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Gains, Run, errors_as_input_errors, read_results, read_run, read_table
 from mfvpr.report.pages.rendering import PAGE, Gallery, Section, pictures, values_table, write_page
 from mfvpr.report.run_files import matched_content
 from mfvpr.report.tables import Table
-from mfvpr.reranking.results import RETRIEVAL
 
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.evaluation.metrics import hits
+from mfvpr.core.metrics import hits
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.types import Shortlist
+from mfvpr.core.weights import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
-from mfvpr.matching.match_set import MatchSet
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.scoring.weights import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
+from mfvpr.matchers.match_set import MatchSet
 from mfvpr.tuning.learning.models import Model, can_learn
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.teaching import Options, of_matches, start, train
@@ -20,7 +21,6 @@ from mfvpr.tuning.learning.training import Checkpoints, Fit
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings
 from mfvpr.tuning.sweeps.settings import FUSION, Setting
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from mfvpr.core.types import Matches, Shortlist, per_pair
 from mfvpr.datasets.positives import join_positives
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half
-from mfvpr.matching.match_set import MatchSet
-from mfvpr.types import Matches, Shortlist, per_pair
+from mfvpr.matchers.match_set import MatchSet
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.ragged import repeat_last
 

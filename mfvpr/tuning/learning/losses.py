@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.types import Array
+from mfvpr.core.types import Array
 from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
 
 Loss = Callable[[Array, Array, Array], Array]

@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mfvpr.reranking.ranking import combine, score_candidates
-from mfvpr.scoring.histogram import HistogramOfShifts
-from mfvpr.scoring.learned_weight import LearnedWeight
-from mfvpr.scoring.parameters import SCORE, parameters_of
+from mfvpr.baselines.learned_weight import LearnedWeight
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.parameters import SCORE, parameters_of
+from mfvpr.core.ranking import combine, score_candidates
+from mfvpr.core.types import Array, Matches
 from mfvpr.tuning.learning import losses
 from mfvpr.tuning.learning.losses import Loss
 from mfvpr.tuning.learning.splits import Batch
-from mfvpr.types import Array, Matches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float, masked_mean
 

@@ -7,14 +7,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.ranking import RetrievalScore, retrieval_scores
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.types import Array, Matches, Shortlist, value
 from mfvpr.datasets.positives import Positives
+from mfvpr.evaluation.batched_scoring import score
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half, separate
-from mfvpr.matching.match_set import MatchSet
-from mfvpr.reranking.batched_scoring import score
-from mfvpr.reranking.ranking import RetrievalScore, retrieval_scores
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.types import Array, Matches, Shortlist, value
+from mfvpr.matchers.match_set import MatchSet
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import round_up
@@ -99,7 +99,7 @@ def training_splits(
 ) -> list[TrainingSplit]:
     """Split each half of a protocol into queries to train on and queries to validate on.
 
-    `retrieval_score` is the retrieval's part of a combined score, see `mfvpr.reranking.ranking.retrieval_scores`.
+    `retrieval_score` is the retrieval's part of a combined score, see `mfvpr.core.ranking.retrieval_scores`.
 
     Raises:
         InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.

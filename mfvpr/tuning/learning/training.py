@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from mfvpr.core.types import Array
 from mfvpr.tuning.learning.checkpoints import leaves_by_path, lock_checkpoints, newest, restore, save_checkpoint
-from mfvpr.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Track, no_progress
 

@@ -9,11 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.scoring import parameters
-from mfvpr.scoring.registry import SCORERS
-from mfvpr.scoring.scorer import Scorer
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS, named_weight
-from mfvpr.scoring.weights import WEIGHTS
+from mfvpr.baselines.scorers import SCORERS
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
+from mfvpr.core import parameters
+from mfvpr.core.scorer import Scorer
+from mfvpr.core.weights import WEIGHTS
 from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
 
@@ -31,7 +31,7 @@ class Axes:
         scorer: its other parameters stay.
         values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
-            (`mfvpr.scoring.parameters`: a weight is the word `fs`, no limit is None). Words stand for weights in every
+            (`mfvpr.core.parameters`: a weight is the word `fs`, no limit is None). Words stand for weights in every
             scorer.
         own: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
 

@@ -9,9 +9,9 @@ from jaxtyping import Int
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.protocol import EvaluationProtocol
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.selection import Half
-from mfvpr.reranking.results import Ranked
-from mfvpr.reranking.sequences import DriveFilter
+from mfvpr.evaluation.sequences import DriveFilter
 
 
 @dataclass(frozen=True)

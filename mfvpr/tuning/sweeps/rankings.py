@@ -19,16 +19,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core import grids, ranking
+from mfvpr.core.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
+from mfvpr.core.scorer import check_host, on_host
+from mfvpr.core.types import Array, Matches, Shortlist, per_match, per_pair
+from mfvpr.evaluation.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.validation import require_finite
-from mfvpr.matching.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
-from mfvpr.reranking import grids, ranking
-from mfvpr.reranking.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
-from mfvpr.reranking.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
-from mfvpr.reranking.results import Ranked
-from mfvpr.scoring.scorer import check_host, on_host
+from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
 from mfvpr.tuning.sweeps.drives import DriveRanking
 from mfvpr.tuning.sweeps.settings import FUSION, Group, Setting, distinct, group_by_program
-from mfvpr.types import Array, Matches, Shortlist, per_match, per_pair
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash
@@ -47,8 +47,8 @@ class SweepOptions:
 
     Attributes:
         ks: depths of the recall; the largest is the number of rows of a ranking.
-        ties: see `mfvpr.reranking.ranking.rank_shortlist`.
-        retrieval_score: see `mfvpr.reranking.ranking.retrieval_scores`.
+        ties: see `mfvpr.core.ranking.rank_shortlist`.
+        retrieval_score: see `mfvpr.core.ranking.retrieval_scores`.
         sequence: ranks the queries of a drive together, from their rankings by a setting; then blocks have all queries.
             None = each query alone.
         settings_per_block: None = 64.

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from mfvpr.core.types import Shortlist
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.evaluation.statistics import Estimate, McNemar, PathTest, estimate, mcnemar, path_test
-from mfvpr.matching.match_set import MatchSet, Scales
+from mfvpr.matchers.match_set import MatchSet, Scales
 from mfvpr.tuning.sweeps.axes import Axes
 from mfvpr.tuning.sweeps.rankings import DEFAULT_OPTIONS, SweepOptions, duration, rank_settings
-from mfvpr.types import Shortlist
 from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:

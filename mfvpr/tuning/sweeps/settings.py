@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from mfvpr.reranking import grids
-from mfvpr.reranking.grids import WEIGHTINGS
-from mfvpr.scoring import parameters
-from mfvpr.scoring.scorer import with_static_functions
-from mfvpr.scoring.weights import ChosenWeight
+from mfvpr.core import grids, parameters
+from mfvpr.core.grids import WEIGHTINGS
+from mfvpr.core.scorer import with_static_functions
+from mfvpr.core.weights import ChosenWeight
 
 Setting = Mapping[str, Any]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, MatchCount, Runtime, score_candidates
-from mfvpr.scoring.learned_weight import ABSOLUTE
+from mfvpr.baselines.learned_weight import ABSOLUTE
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.comparison import Options, start
 from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss

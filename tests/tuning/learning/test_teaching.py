@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, RatioWeight
-from mfvpr.scoring.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.tuning.learning.models import Model
 from mfvpr.tuning.learning.splits import Batch
 from mfvpr.tuning.learning.teaching import TEACHER_SIGMA, Options, of_matches

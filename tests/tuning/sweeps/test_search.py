@@ -8,10 +8,11 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import InputError
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
+from mfvpr.core import hits
 from mfvpr.datasets import FrameTruth
-from mfvpr.evaluation import best_setting, evaluation_protocol, hits, statistics
+from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
 from mfvpr.report import sweeps
-from mfvpr.scoring.weight_registry import NAMED_WEIGHTS
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, search
 from tests.needs import needs

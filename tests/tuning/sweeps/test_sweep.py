@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.matching import MatchSet, Scales
-from mfvpr.matching.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
-from mfvpr.reranking import ranking
-from mfvpr.scoring.parameters import with_parameters
+from mfvpr.core import ranking
+from mfvpr.core.parameters import with_parameters
+from mfvpr.core.types import Shortlist
+from mfvpr.matchers import MatchSet, Scales
+from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps.settings import group_by_program
-from mfvpr.types import Shortlist
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title

@@ -1,0 +1,121 @@
+"""Grid anchors of SSM-VPR (Camara & Preucil, RAS 2020): how many cells of a patch keep their place beside its middle.
+
+Both images are `side` x `side` cells, numbered row by row; these are the keypoint numbers of the matches. Every cell of
+the candidate is matched with a cell of the query, index[cell] (`cross_check="candidate"`). Every cell is the anchor of
+a patch of n x n cells around it. A cell of the patch agrees if index[anchor + offset] = index[anchor] + offset.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float, Int
+
+from mfvpr.core.parameters import check_plain, choice, flag, integer
+from mfvpr.core.types import Array, Matches, value
+from mfvpr.core.weights import match_confidence
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import masked
+
+LARGEST = 2**24  # float32 holds all integers up to it
+_OUTSIDE = {"unequal": -1000, "zero": 0}
+
+
+@value
+class GridAnchors:
+    """Number of pairs (anchor, cell of its patch) that agree, the anchors themselves included.
+
+        mfvpr.GridAnchors(side=26)(mfvpr.match(cells0, cells1, cross_check="candidate"))  # of 26 x 26 cells
+
+    The score counts as the public code does. That code compares flat cell numbers, so that an expected cell may lie at
+    the other end of a row (`wrap`), and the padding around the grid takes part (`outside`). With `wrap` False neither
+    happens. A cell without a match never agrees, not even with itself. If a cell has several matches, the match with
+    the lowest query cell counts.
+
+    Attributes:
+        side: cells per side of both images; every cell is a keypoint: 40 at 336 px, 26 at 224, 54 at 448.
+        patch: n, odd and up to the side (else an InputError); None = 3/4 of the side, rounded down to an odd number.
+        wrap: compare flat cell numbers, as published; False: displacements in rows and columns.
+        outside: value of the padding: "unequal" (-1000) as in the public code on a CPU, which equals no expected cell
+            up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
+    """
+
+    side: int = integer(40, "cells per side", "as the features have", bounds=(1, 74), swept=False)
+    patch: int | None = integer(None, "cells", "odd; None = 3/4 of the side", bounds=(1, 73))
+    wrap: bool = flag(True, "flat numbers are compared, as published")
+    outside: str = choice("unequal", "zero", note="beyond the grid, of the CPU and of the GPU path")
+
+    def __post_init__(self) -> None:
+        check_plain(self)
+        if self.side < 1 or not 1 <= self.size <= self.side or self.size % 2 == 0:
+            raise InputError(f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd "
+                             "patch up to it")  # fmt: skip
+        if self.side**2 * self.size**2 > LARGEST:
+            raise InputError(f"GridAnchors(side={self.side}, patch={self.patch}): expected scores up to 2^24, which "
+                             "float32 holds exactly; choose fewer cells")  # fmt: skip
+
+    @property
+    def size(self) -> int:
+        """n, cells per side of a patch."""
+        if self.patch is not None:
+            return self.patch
+        size = 3 * self.side // 4
+        return max(1, size - (size % 2 == 0))
+
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair `[K]`, float32; NaN if there are not side^2 keypoints, or an index is out of range.
+
+        Matches without `index0` or `index1` raise an `InputError`.
+        """
+        if matches.index0 is None or matches.index1 is None:
+            raise InputError("GridAnchors: expected matches that know their keypoints (index0, index1), got none")
+        real = match_confidence(matches) > 0
+        cells = jnp.arange(self.side**2, dtype=jnp.int32)
+        cell1, cell0 = (jnp.where(real, jnp.asarray(index, jnp.int32), 0) for index in (matches.index1, matches.index0))
+        target = jnp.where(real, cell1, len(cells))  # out of range, hence dropped, unless it is a match
+        index = jnp.full(len(cells), len(cells), jnp.int32).at[target].min(cell0, mode="drop")
+        matched = index < len(cells)
+        score = self._agreements(index, matched, cells)
+        if self.wrap:
+            score += self._agreements_outside(index, matched, cells)
+        usable = jnp.all((cell1 >= 0) & (cell1 < len(cells)) & (cell0 >= 0) & (cell0 < len(cells)))
+        for count in (matches.count0, matches.count1):
+            usable &= count is None or jnp.asarray(count) == len(cells)
+        return jnp.where(usable | ~jnp.any(real), score.astype(jnp.float32), jnp.nan)
+
+    def _agreements(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
+        """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
+
+        Agreement is symmetric: the offsets to the right and in the rows below suffice, shifts of the padded flat array.
+        """
+        side, half = self.side, self.size // 2
+        shift = index - cells
+        if not self.wrap:
+            (row0, column0), (row1, column1) = (jnp.divmod(number, side) for number in (index, cells))
+            shift = (row0 - row1) * 4 * side + column0 - column1
+        pitch, never = side + half, 8 * side**2  # no displacement is as large
+        anchors, neighbors = (
+            jnp.pad(masked(shift, matched, fill).reshape(side, side), ((0, 0), (0, half)), constant_values=fill)
+            for fill in (never, -never)
+        )
+        anchors, width = anchors.reshape(-1), side * pitch
+        neighbors = jnp.pad(neighbors.reshape(-1), (half, half * pitch + half), constant_values=-never)
+
+        def count_offsets(row: Array | int, columns: range) -> Array:
+            """`[width]` int32: number of offsets (row, column) that agree with each anchor."""
+            below = jax.lax.dynamic_slice_in_dim(neighbors, row * pitch, width + 2 * half)
+            return sum(
+                ((anchors == below[half + column : half + column + width]).astype(jnp.int32) for column in columns),
+                start=jnp.zeros(width, jnp.int32),
+            )
+
+        right, full_row = count_offsets(0, range(1, half + 1)), range(-half, half + 1)
+        counts = jax.lax.fori_loop(1, half + 1, lambda row, counts: counts + count_offsets(row, full_row), right)
+        return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)
+
+    def _agreements_outside(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
+        """Number of anchors that agree with the value of the padding around the grid."""
+        side, half = self.side, self.size // 2
+        row, column = jnp.divmod(cells, side)
+        down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset, as n <= side
+        right = right - half
+        outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
+        return jnp.sum(matched & (jnp.abs(down) <= half) & (right <= half) & outside, dtype=jnp.int32)

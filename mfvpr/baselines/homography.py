@@ -1,0 +1,208 @@
+"""Homography by RANSAC, SSM-RAN's re-ranking (paper, section IV): how many matches one plane's motion explains.
+
+The result is that of OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted
+at once, and samples after the one where OpenCV would stop do not count.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from mfvpr.baselines import planes
+from mfvpr.core.parameters import check_plain, choice, flag, integer, number
+from mfvpr.core.shifts import query_features, require_sizes
+from mfvpr.core.types import Array, Matches, value
+from mfvpr.core.weights import match_confidence
+from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
+
+_MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
+_ROUNDS = 8  # the search ends after so many times the rounds that samples without degenerate draws would need
+
+
+class Estimate(NamedTuple):
+    """Result of RANSAC for one pair, after a number of samples."""
+
+    matrix: Float[Array, "3 3"]  # (x, y, 1) of the candidate -> query, px, last entry 1; NaN = no homography
+    inliers: Bool[Array, " slots"]
+    score: Float[Array, ""]
+    samples: Int[Array, ""]
+
+
+@value
+class Homography:
+    """Number of inliers of the best homography that RANSAC finds.
+
+        mfvpr.Homography(threshold=24.0)(matches)
+
+    An inlier is a match with its candidate point mapped to within `threshold` of its query point. The samples of a pair
+    depend on its matches alone. Each match counts with its confidence. There is no gradient.
+
+    Attributes:
+        threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
+        max_iterations: maximum number of samples; an array less than 1 scores NaN. Degenerate draws do not count, but
+            the search ends early if almost all draws (49 of 50) are degenerate.
+        confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
+            as the best model has; an array of 1 never stops early, one not above 0 scores
+            NaN.
+        measure: `inliers` counts inliers; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
+        refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
+            paper's time, refines the homography after the count.
+        few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD); 4 matches score 4.
+        per_feature: divide by the number of the query's keypoints, matched or not, as Patch-NetVLAD does.
+        seed: of the samples.
+    """
+
+    threshold: float | Array = number(24.0, "px")
+    max_iterations: float | Array = number(2000.0, "samples", "at most", bounds=(1.0, 1e6))
+    confidence: float | Array = number(0.995, "", "that a sample was all inliers", bounds=(1e-6, 0.999999))
+    measure: str = choice("inliers", "msac")
+    refit: bool = flag(False, "count again after least squares")
+    few: str = choice("count", "zero", note="less than 4 matches")
+    per_feature: bool = flag(False)
+    seed: int = integer(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
+
+    __post_init__ = check_plain
+
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair `[K]`, float32."""
+        return self.estimate(matches).score
+
+    def estimate(self, matches: Matches) -> Estimate:
+        """Homography of one pair, with its inliers and its score."""
+        points = jnp.concatenate([at_least_single(matches.points1), at_least_single(matches.points0)], axis=-1)
+        points, confidence, *limits = without_gradient(
+            "homography: the number of inliers has no gradient; take a score that has one, such as HistogramOfShifts",
+            (points, match_confidence(matches), self.threshold, self.max_iterations, self.confidence),
+        )
+        threshold, max_iterations, probability = (jnp.asarray(limit, points.dtype) for limit in limits)
+        probability = jnp.minimum(probability, 1.0)  # as OpenCV
+        counts = confidence.astype(points.dtype)
+        real = counts > 0
+        if len(real) == 0:
+            return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
+        require_sizes(matches.image_size0, matches.image_size1)
+        frame = planes.Frame.of(
+            *(jnp.asarray(size, points.dtype) for size in (matches.image_size1, matches.image_size0))
+        )
+        normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
+        threshold = threshold / frame.scale[1]
+        order = planes.canonical_order(masked(points, real), real)
+        number = jnp.sum(real, dtype=jnp.int32)
+        search = _Search(
+            self.measure, matches.confidence is None, normalized[order], counts[order], number, threshold,
+            max_iterations, probability,
+        )  # fmt: skip
+        # The generator is named, because others draw different numbers in a batch.
+        model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
+        if self.refit:
+            model = planes.least_squares(
+                model, masked(normalized, real), masked(counts, planes.is_inlier(model, normalized, threshold))
+            )
+        inliers = jnp.where(number == 4, real, planes.is_inlier(model, normalized, threshold))
+        quality = jnp.ones_like(counts)
+        if self.measure == "msac":
+            quality = _closeness(*planes.miss(model, normalized, threshold))
+        score = jnp.sum(masked(quality, inliers) * counts)
+        few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
+        score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
+        score = score / query_features(matches) if self.per_feature else score
+        finite = where_finite(score, masked(points, real), counts)
+        usable = (threshold >= 0) & (max_iterations >= 1) & (probability > 0)
+        return Estimate(frame.to_pixels(model), inliers, jnp.where(usable, finite, jnp.nan), samples)
+
+
+class _Search(NamedTuple):
+    """RANSAC of one pair, with matches in canonical order and in the coordinates of a frame."""
+
+    measure: str
+    each_counts_one: bool
+    points: Float[Array, "slots 4"]
+    counts: Float[Array, " slots"]  # confidence of the matches
+    number: Int[Array, ""]  # of real matches
+    threshold: Float[Array, ""]
+    max_iterations: Float[Array, ""]
+    probability: Float[Array, ""]
+
+    def __call__(self, key: Array) -> tuple[Float[Array, "9"], Int[Array, ""]]:
+        """The best model, NaN if there is none, and the number of samples."""
+        dtype = self.points.dtype
+        rounds = _ROUNDS * jnp.ceil(self.max_iterations / planes.ROUND).astype(jnp.int32)
+
+        def is_searching(state: _State) -> Array:
+            return state.has_samples & (state.samples < self._count_samples(state.inliers)) & (state.round < rounds)
+
+        def search_round(state: _State) -> _State:
+            four, num_samples = planes.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
+            models, place = planes.through(four), jnp.arange(planes.ROUND, dtype=jnp.int32)
+            quality, inliers, number = self._compare(models)
+            quality = jnp.where((place < num_samples) & (number > 3), quality, 0.0)
+            # As if samples came one after the other: samples after the one where that search stops do not count.
+            leading = masked(inliers, quality > _maximum_before(quality, state.quality))  # of every new best model
+            most_before = _maximum_before(leading, state.inliers)
+            counted = (place < num_samples) & (state.samples + place < self._count_samples(most_before))
+            quality = masked(quality, counted)
+            best = jnp.argmax(quality)
+            return _State(
+                round=state.round + 1,
+                samples=state.samples + jnp.sum(counted, dtype=jnp.int32),
+                quality=jnp.maximum(quality[best], state.quality),
+                inliers=jnp.maximum(jnp.max(masked(leading, counted)), state.inliers),
+                model=jnp.where(quality[best] > state.quality, models[:, best], state.model),
+                has_samples=num_samples > 0,
+            )
+
+        zero, start = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+        state = _State(start, start, zero, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
+        state = jax.lax.while_loop(is_searching, search_round, state)
+        return state.model, state.samples
+
+    def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
+        """Quality, sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
+        padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
+        points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
+        counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)
+
+        def compare_step(step: Array, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            quality, inliers, number = sums
+            for point, count in zip(points[step], counts[step], strict=True):
+                error, limit = planes.miss(models, point, self.threshold)
+                inlier = error <= limit
+                inliers = inliers + jnp.where(inlier, count, 0.0)
+                if not self.each_counts_one:
+                    number = number + inlier.astype(number.dtype)
+                if self.measure == "msac":
+                    quality = quality + jnp.where(inlier, count * _closeness(error, limit), 0.0)
+            return quality, inliers, number
+
+        zeros = jnp.zeros_like(models[0])
+        quality, inliers, number = jax.lax.fori_loop(0, len(points), compare_step, (zeros, zeros, zeros))
+        return inliers if self.measure == "inliers" else quality, inliers, inliers if self.each_counts_one else number
+
+    def _count_samples(self, inliers: Array) -> Array:
+        """Samples needed to draw four inliers with `probability`, at most `max_iterations`."""
+        share = inliers / jnp.maximum(jnp.sum(self.counts), 1e-6)
+        log_outlier = jnp.log1p(-(jnp.minimum(share, 1.0) ** 4))  # log of the probability that a sample has an outlier
+        samples = jnp.round(jnp.log1p(-self.probability) / jnp.where(log_outlier < 0, log_outlier, -1.0))
+        samples = jnp.where(log_outlier < 0, jnp.minimum(samples, self.max_iterations), self.max_iterations)
+        return samples.astype(jnp.int32)
+
+
+def _closeness(error: Array, limit: Array) -> Array:
+    """1 - error / limit (squares, in the same unit): 1 without error, 0 at the threshold."""
+    return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
+
+
+class _State(NamedTuple):
+    round: Int[Array, ""]
+    samples: Int[Array, ""]
+    quality: Float[Array, ""]
+    inliers: Float[Array, ""]  # most inliers of any model that was the best at some time
+    model: Float[Array, "9"]
+    has_samples: Bool[Array, ""]  # whether the last round had a sample
+
+
+def _maximum_before(values: Float[Array, " samples"], start: Float[Array, ""]) -> Float[Array, " samples"]:
+    """Maximum of `start` and all values before each one."""
+    return jnp.maximum(jnp.concatenate([jnp.zeros_like(values[:1]), jax.lax.cummax(values)[:-1]]), start)

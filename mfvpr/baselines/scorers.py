@@ -1,0 +1,32 @@
+"""Scorers by name."""
+
+from mfvpr.baselines.grid_anchors import GridAnchors
+from mfvpr.baselines.homography import Homography
+from mfvpr.baselines.homography_opencv import OpenCvHomography
+from mfvpr.baselines.lost import LostScore
+from mfvpr.baselines.phrases import VisualPhrases
+from mfvpr.baselines.rapid import RapidSpatialScore
+from mfvpr.core.aggregate import AggregatedScore
+from mfvpr.core.anchor import AnchorPoints
+from mfvpr.core.counting import MatchCount
+from mfvpr.core.histogram import HistogramOfShifts
+
+SCORERS: dict[str, type] = {
+    "count": MatchCount,
+    "rapid": RapidSpatialScore,
+    "phrases": VisualPhrases,
+    "lost": LostScore,
+    "sum": AggregatedScore,
+    "anchor": AnchorPoints,
+    "histogram": HistogramOfShifts,
+    "grid": GridAnchors,
+    "homography": Homography,
+    "homography_opencv": OpenCvHomography,
+}
+"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.core.parameters`)."""
+
+PAPER = ("count", "sum", "anchor", "histogram")
+"""Scorers that are compared by default."""
+
+ALONE = ("homography_opencv", "grid")
+"""Scorers that `scorer=all` leaves out: OpenCV takes a second per query, and not all features are cells of a grid."""

@@ -1,0 +1,64 @@
+"""Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.core.parameters import check_plain, choice, flag, number, table_value
+from mfvpr.core.shifts import image_sizes, match_shifts
+from mfvpr.core.types import Array, Matches, value
+from mfvpr.core.weights import Weight, match_confidence, match_weights
+from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
+
+
+@value
+class AggregatedScore:
+    """Weighted sum over matches of the closeness of their shift to the mean shift, equation 3.
+
+        mfvpr.AggregatedScore(mean="median", clamp=True)(matches)
+
+    The score, in units of the weight times px^2, is
+
+        s = sum_k w_k ((W - |x_k - mean x|)^2 + (H - |y_k - mean y|)^2),
+
+    where (x_k, y_k) is the shift of match k, w_k its weight, and (W, H) the image size, the paper's (x_im, y_im).
+
+    Attributes:
+        weight: match weight, DMF by default as in the paper.
+        mean: center of the shifts: `unweighted` mean (as printed), `weighted` mean or `median`. A mean counts every
+            match with its confidence.
+        clamp: a shift that is further from the center than the image is wide counts 0 instead of growing again.
+        temperature: px; T > 0 replaces |x| by the hyperbola sqrt(x^2 + T^2) - T, and the clamp of z by
+            T log(1 + e^(z / T)), so that the score is smooth in the points (except for `median`). None is the paper's;
+            an array not above 0 scores NaN.
+    """
+
+    weight: Weight = table_value(NAMED_WEIGHTS, "dmf", file=SUFFIX)
+    mean: str = choice("unweighted", "weighted", "median")
+    clamp: bool = flag(False)
+    temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
+
+    __post_init__ = check_plain
+
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair `[K]`, float32."""
+        weights = match_weights(self.weight, matches)
+        shifts = match_shifts(matches)
+        confidence = match_confidence(matches)
+        if self.mean == "median":
+            center = masked_median(shifts, confidence > 0)
+        else:
+            center = masked_mean(shifts, matches.mask, weights if self.mean == "weighted" else confidence)
+        closeness = self._closeness(shifts - center[None], image_sizes(matches)[0][None])
+        score = jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
+        return where_finite(score, weights, shifts)
+
+    def _closeness(self, offsets: Float[Array, "slots 2"], size: Float[Array, "1 2"]) -> Float[Array, "slots 2"]:
+        """Image size minus the distance of the shift from the center, px."""
+        if self.temperature is None:
+            closeness = size - jnp.abs(offsets)
+            return jnp.maximum(closeness, 0.0) if self.clamp else closeness
+        temperature = positive(self.temperature, offsets.dtype)
+        closeness = size - (safe_sqrt(offsets**2 + temperature**2) - temperature)
+        return temperature * jax.nn.softplus(closeness / temperature) if self.clamp else closeness

@@ -1,0 +1,224 @@
+"""Mutual nearest neighbors by products of bfloat16, checked where rounding could matter.
+
+Let x, y be descriptors of D dimensions, and x', y' what bfloat16 makes of them. With u = 2^-24, a float32 sum of D
+products in any order is off by at most g |x'| |y'|, g = D u / (1 - D u) (Higham, Accuracy and Stability of Numerical
+Algorithms, 2002, section 3.1), and by Cauchy and Schwarz
+
+    |x'.y' - x.y| <= |x - x'| |y| + |x'| |y - y'|.
+
+A checked product is a float32 product in a fixed order (`checked_product`), off by less than 32 u |x| |y|. The sum e of
+these bounds, with the largest |y| and |y - y'| of the other image, holds for all products of x. Let m be the largest
+rounded product of x, and c the largest checked one, of the neighbor y:
+
+    x'.y' >= c - e >= (checked product of the keypoint with m) - e >= m - 2 e.
+
+So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
+checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
+differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair, and
+at once if `tells_apart` says so.
+
+The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
+2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
+
+All of this is for a CPU. Other processors may add products of bfloat16 with fewer bits than float32 has (Fasi et al.,
+Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 2021), so that g is no bound there.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import BFloat16, Bool, Float, Int
+
+from mfvpr.core.similarity import Lines, Nearest, count_from, entries_from, even_size, lines_of, nearest, without
+from mfvpr.core.types import Array, Features
+
+MOST_CHECKS = 16  # of a keypoint
+GROUP = 64  # keypoints that are checked at the same time
+_SAMPLE = 16  # keypoints of the query by which `tells_apart` guesses
+_WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
+_PARTS = 8  # into which the dimensions of a checked product are split
+_SMALL, _LARGE = 2.0**-126, 2.0**126
+
+
+class Rounded(NamedTuple):
+    """Features of an image, and their descriptors in bfloat16, padded to whole blocks of products."""
+
+    features: Features
+    descriptors: BFloat16[Array, "*_"]  # `[N, D]`, or `[D, N]` of a query
+    norm: Float[Array, "*_"]  # of the float32 descriptors; 0 for padding, NaN and infinity
+    residual: Float[Array, "*_"]  # norm of what rounding takes away
+
+
+class Neighbors(NamedTuple):
+    """Neighbors of the query's keypoints, of use where `real`."""
+
+    match: Int[Array, " keypoints0"]
+    real: Bool[Array, " keypoints0"]
+    nearest: Int[Array, " keypoints0"]
+    second: Int[Array, " keypoints0"]  # the nearest of the others
+    has_second: Bool[Array, " keypoints0"]
+
+    def of(self, features: Features) -> "Neighbors":
+        """Neighbors of the slots of these features, without those that fill up the last block of products."""
+        return Neighbors(*(values[: features.mask.shape[-1]] for values in self))
+
+
+class _Direction(NamedTuple):
+    """Products of every keypoint of an image with all of the other image."""
+
+    descriptors: Float[Array, "own _"]
+    other_descriptors: Float[Array, "_ _"]
+    lines: Lines
+    nearest: Nearest
+    window: Float[Array, " own"]  # 2 e
+
+    @property
+    def threshold(self) -> Float[Array, " own"]:
+        return self.nearest.similarity - self.window
+
+    @property
+    def is_close(self) -> Bool[Array, " own"]:
+        """Whether several keypoints may be the nearest."""
+        several = count_from(self.lines, self.nearest, self.threshold) > 1
+        return several & (self.nearest.similarity > -jnp.inf)
+
+
+def round_query(features: Features) -> Rounded:
+    """Round a query, best once for all of its candidates: transposed, the product is fast."""
+    rounded = round_candidate(features)
+    return rounded._replace(descriptors=rounded.descriptors.T)
+
+
+def round_candidate(features: Features) -> Rounded:
+    """Round a candidate."""
+    rounded = features.descriptors.astype(jnp.bfloat16)
+    # Converted back, `rounded` could be the descriptors again: XLA may leave out a pair of conversions.
+    lost = features.descriptors - jax.lax.reduce_precision(features.descriptors, 8, 7)
+    missing = even_size(len(rounded)) - len(rounded)
+    norms = [_norm(rows) for rows in (features.descriptors, lost)]
+    is_number = features.mask & ~jnp.isnan(norms[0]) & ~jnp.isnan(norms[1])  # rounding takes NaN away from infinity
+    norm, residual = (jnp.pad(jnp.where(is_number, norm, 0.0), (0, missing)) for norm in norms)
+    return Rounded(features, jnp.pad(rounded, ((0, missing), (0, 0))), norm, residual)
+
+
+def _norm(rows: Float[Array, "rows _"]) -> Float[Array, " rows"]:
+    """Norms above 0, infinite beyond the range of float32."""
+    return jnp.sqrt(jnp.sum(rows * rows, axis=1) + rows.shape[1] * _SMALL)
+
+
+def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -> tuple[Neighbors, Bool[Array, ""]]:
+    """Mutual nearest neighbors, and whether all that could matter was checked."""
+    products = _products(query, candidate)
+    columns = jnp.arange(products.shape[1], dtype=jnp.int32)
+    to1, to0 = _direction(products, 0, query, candidate), _direction(products, 1, candidate, query)
+    # A keypoint without a product that is close to both largest ones has no match.
+    close_to_both = products >= jnp.maximum(to1.threshold[None], to0.threshold[:, None])
+    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0))
+    has_neighbor = to1.nearest.similarity > -jnp.inf
+    may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
+    is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
+    index0, settled0 = _settle(to0, to0.is_close & is_chosen)
+    longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
+    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
+    settled &= longest0 * longest1 < _LARGE  # False for NaN
+    if not with_second:
+        return Neighbors(index1, is_match, index1, index1, is_match).of(query.features), settled
+    lines = without(to1.lines, index1)
+    rest = to1._replace(lines=lines, nearest=nearest(lines))
+    second, settled2 = _settle(rest, rest.is_close & is_match)
+    neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
+    return neighbors.of(query.features), settled & settled2
+
+
+def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
+    """Whether products differ enough for `mutual_neighbors`: a guess by a few keypoints, which saves time.
+
+    Without it, images whose descriptors are equal or nearly equal would cost both kinds of products.
+    """
+    step = max(1, len(query.norm) // _SAMPLE)
+    sample = query._replace(
+        descriptors=query.descriptors[:, ::step], norm=query.norm[::step], residual=query.residual[::step]
+    )
+    products = _products(sample, candidate)
+    largest = jnp.max(products, axis=0)
+    possible = jnp.sum(products >= (largest - _window(sample, candidate))[None], axis=0)
+    checks = jnp.minimum(possible, MOST_CHECKS + 1).astype(jnp.float32)
+    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _WORTHWHILE_CHECKS, 0.0)) <= 0
+
+
+def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 keypoints0"]:
+    """Rounded products, -inf for padding and for descriptors that are not finite."""
+    products = jnp.matmul(candidate.descriptors, query.descriptors, preferred_element_type=jnp.float32)
+    real = (candidate.norm > 0)[:, None] & (query.norm > 0)[None] & jnp.isfinite(products)
+    return jnp.where(real, products, -jnp.inf)
+
+
+def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
+    lines, window = lines_of(products, axis), _window(image, other)
+    return _Direction(image.features.descriptors, other.features.descriptors, lines, nearest(lines), window)
+
+
+def _window(image: Rounded, other: Rounded) -> Float[Array, " own"]:
+    """2 e for each keypoint of `image`."""
+    dimensions = image.features.descriptors.shape[1]
+    rounding = (dimensions + 32) * 2.0**-24
+    norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
+    rounded = image.norm + image.residual
+    bound = image.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
+    return 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
+
+
+def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Array, " own"], Bool[Array, ""]]:
+    """Nearest neighbors, by checked products where `wanted`, and whether none has too many of them."""
+    count = len(wanted)
+    size = min(GROUP, count)
+    slots = jnp.nonzero(wanted, size=count + size, fill_value=count)[0].astype(jnp.int32)
+
+    def settle_group(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        start, index, _ = state
+        places = jax.lax.dynamic_slice_in_dim(slots, start, size)
+        keypoints = jnp.minimum(places, count - 1)
+        threshold = jnp.where(places < count, direction.threshold[keypoints], jnp.inf)
+        next_after, end = entries_from(direction.lines, keypoints, threshold)
+        descriptors = direction.descriptors[keypoints]
+
+        def check(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+            number, largest, best, checks = state
+            product = checked_product(descriptors, direction.other_descriptors[number])
+            is_larger = (number < end) & (product > largest)
+            best = jnp.where(is_larger, number, best)
+            return next_after(number), jnp.where(is_larger, product, largest), best, checks + 1
+
+        first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
+        number, _, best, _ = jax.lax.while_loop(
+            lambda state: (state[0] < end).any() & (state[3] < MOST_CHECKS),
+            check, (first, lowest, index[keypoints], jnp.int32(0)),
+        )  # fmt: skip
+        return start + size, index.at[places].set(best, mode="drop"), (number == end).all()
+
+    _, index, settled = jax.lax.while_loop(
+        lambda state: (state[0] < jnp.sum(wanted)) & state[2],
+        settle_group, (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
+    )  # fmt: skip
+    return index, settled
+
+
+def checked_product(rows0: Float[Array, "rows _"], rows1: Float[Array, "rows _"]) -> Float[Array, " rows"]:
+    """Products of rows in float32, summed in an order that is the same everywhere.
+
+    The products of the dimensions, padded with zeros to 8 * 2^n, are split into 8 equal parts. These are added one
+    after the other, then the first half of the sums to the second until one is left.
+    """
+    length = _PARTS * (1 << max(0, -(-rows0.shape[1] // _PARTS) - 1).bit_length())
+    products = jnp.pad(rows0 * rows1, ((0, 0), (0, length - rows0.shape[1])))
+    # Without the barriers, a product and a sum could become one operation that rounds once.
+    parts = jax.lax.optimization_barrier(products).reshape(len(products), _PARTS, -1)
+    sums = parts[:, 0]
+    for part in range(1, _PARTS):
+        sums = sums + parts[:, part]
+    sums = jax.lax.optimization_barrier(sums)
+    while sums.shape[1] > 1:
+        half = sums.shape[1] // 2
+        sums = sums[:, :half] + sums[:, half:]
+    return sums[:, 0]

@@ -1,0 +1,253 @@
+"""Rankings along a drive: a hidden Markov model over the rows of the database, which are in the order of a drive.
+
+The state is a row and a speed. From one image to the next the speed may change, and the robot moves by it. A small part
+of the probability spreads over all rows and speeds, as the robot may have been carried away; so does what moves beyond
+an end of the map. The likelihood of an image at a row, relative to an image that shows nothing of the map, is
+
+    correct * odds * share + 1 - correct,
+
+where `correct` is the probability of a correct top prediction on the map, `share` the row's part of the candidates'
+scores, relative to equal parts, and `odds` says how much more likely the scores are if the top prediction is correct.
+Each candidate also speaks for the rows next to it.
+
+Whether the robot is on the map at all is a second model of two states: an image is as likely as the first model says,
+or shows nothing of the map.
+"""
+
+import math
+import sys
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mfvpr.core.types import Array, value
+from mfvpr.evaluation.confidence import Confidence
+from mfvpr.evaluation.rankings import Ranked
+from mfvpr.utils.errors import InputError
+
+# Chosen on synthetic streets (`dataset=streets_seasons`), as the defaults of `Drive`.
+SPEEDS = tuple(range(-8, 9))  # rows from one image to the next that are learned
+_SHARPNESS = 2  # a candidate's part is its score above the mean to this power
+_ANY = 0.02  # probability that the speed becomes any other
+_STEADY = 0.95  # otherwise, probability that it stays; else it changes by a few rows
+_BESIDE = 1.0  # rows, standard deviation: candidates speak for the rows next to them
+_MOST_ODDS = 50.0  # of a correct prediction: images may look like those of another place
+_REACH = 4  # standard deviations of the motion
+_MOST_ROWS, _MOST_SPREAD = 10_000, 100  # rows from one image to the next
+
+# Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
+# on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
+# `python -m experiments.sequences --fit`.
+STREETS = Confidence(("margin", "height"), 5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Motion of a robot along the rows of a map.
+
+        drive = mfvpr.Drive(advance=1.0, spread=0.5)  # as fast as the drive of the map
+
+    Attributes:
+        advance: mean motion from one image to the next, rows; below 0 = against the order of the map. None = learned
+            from the images, between -8 and 8, and it may change on the way.
+        spread: standard deviation of the motion, rows.
+        kidnapped: probability, for each image, that the robot may be anywhere on the map.
+        leaves: probability, for each image, that the robot leaves the map.
+        returns: probability, for each image, that a robot that left the map is on it again.
+        correct: probability that the top prediction is correct while the robot is on the map.
+
+    Raises:
+        InputError: a field is no number, or out of its range.
+    """
+
+    advance: float | None = None
+    spread: float = 0.7
+    kidnapped: float = 0.03
+    leaves: float = 0.02
+    returns: float = 0.1
+    correct: float = 0.75
+
+    def __post_init__(self) -> None:
+        advance = self.advance or 0.0
+        if wrong := [each for each in vars(self).values() if not isinstance(each, int | float | None)]:
+            raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
+        if not (abs(advance) <= _MOST_ROWS and 1 / _MOST_ROWS <= self.spread <= _MOST_SPREAD):
+            raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected at most {_MOST_ROWS} "
+                             f"rows, and a spread from {1 / _MOST_ROWS:g} to {_MOST_SPREAD}")  # fmt: skip
+        if not all(0 <= p <= 1 for p in (self.kidnapped, self.leaves, self.correct)) or not 0 < self.returns <= 1:
+            raise InputError(f"Drive(kidnapped={self.kidnapped}, leaves={self.leaves}, returns={self.returns}, "
+                             f"correct={self.correct}): expected from 0 to 1, and returns above 0")  # fmt: skip
+
+    @property
+    def off(self) -> float:
+        """Probability that the robot is not on the map, before any image."""
+        return self.leaves / (self.leaves + self.returns)
+
+
+DEFAULT_DRIVE = Drive()
+
+
+class Evidence(NamedTuple):
+    """Evidence of an image: its candidates' rows (-1 = none), their shares of sum 1 (all 0 = none), and the odds."""
+
+    rows: Int[Array, "*images candidates"]
+    shares: Float[Array, "*images candidates"]
+    odds: Float[Array, "*images"]
+
+    @classmethod
+    def of(cls, ranked: Ranked, confidence: Float[np.ndarray, " images"] | None = None) -> "Evidence":
+        """Evidence of a ranking's images; `confidence` is that of `STREETS` by default."""
+        p = STREETS(ranked, ranked) if confidence is None else confidence
+        p = np.nan_to_num(p, nan=0.0)
+        odds = np.clip(p / np.maximum(1 - p, 1e-9), 1 / _MOST_ODDS, _MOST_ODDS)
+        scores = np.where(ranked.rows >= 0, ranked.scores, np.nan)
+        return cls(ranked.rows.astype(np.int32), _shares(scores), odds.astype(np.float32))
+
+
+@value
+class DriveModel:
+    """A drive along the rows of a map, as arrays. A belief has the probabilities of all speeds and rows.
+
+    From one image to the next, the row changes by the shift of the speed and by -R .. R rows.
+    """
+
+    there: Bool[Array, " rows"]  # others are gaps, or beyond the end of the map
+    speeds: Float[Array, " speeds"]
+    shifts: Int[Array, " speeds"]  # rows
+    steps: Float[Array, "speeds steps"]  # probabilities of -R .. R rows
+    changes: Float[Array, "speeds speeds"]  # probabilities of each next speed (columns) after each speed (rows)
+    kidnapped: Float[Array, ""]
+    correct: Float[Array, ""]
+    reach: int = field(metadata={"static": True})  # rows; at least the largest change of the row
+
+    @classmethod
+    def of(cls, drive: Drive, there: Bool[np.ndarray, " rows"]) -> "DriveModel":
+        """The model of a drive along the rows that are there."""
+        speeds = np.array(SPEEDS if drive.advance is None else [drive.advance], np.float32)
+        shifts = np.round(speeds).astype(np.int32)
+        steps = np.stack([_gaussian(part, drive.spread) for part in (speeds - shifts).tolist()])
+        changes, kidnapped, correct = _speed_changes(speeds), np.float32(drive.kidnapped), np.float32(drive.correct)
+        reach = 16 * math.ceil((np.abs(shifts).max() + steps.shape[1] // 2) / 16)  # few sizes, so few programs
+        return cls(there, speeds, shifts, steps, changes, kidnapped, correct, reach)
+
+    @property
+    def anywhere(self) -> Float[Array, "speeds rows"]:
+        """The belief before the first image."""
+        there = jnp.asarray(self.there, self.steps.dtype)
+        states = len(self.speeds) * jnp.maximum(there.sum(), 1)
+        return jnp.broadcast_to(there / states, (len(self.speeds), len(there)))
+
+    def after(
+        self, belief: Float[Array, "speeds rows"], here: Float[Array, " rows"]
+    ) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
+        """The belief after the next image, of total 1, and the image's probability, from its likelihood."""
+        return self.normalize(self._moved(belief) * here[None])
+
+    def before(self, later: Float[Array, "speeds rows"], here: Float[Array, " rows"]) -> Float[Array, "speeds rows"]:
+        """Relative probabilities of an image and those after it, by the state at the image before."""
+        seen = self._seen_from_before(later * here[None])
+        return jnp.where(seen.max() > 0, seen / jnp.where(seen.max() > 0, seen.max(), 1.0), 1.0)
+
+    def likelihood(self, evidence: Evidence) -> Float[Array, " rows"]:
+        """Likelihood of an image at each row, relative to that of an image that shows nothing of the map."""
+        size, beside = len(self.there), _gaussian(0.0, _BESIDE)
+        places = jnp.where(evidence.rows < 0, size, evidence.rows)  # beyond the end: dropped
+        shares = jnp.zeros(size).at[places].add(evidence.shares, mode="drop")
+        shares = jnp.convolve(shares, beside, precision=jax.lax.Precision.HIGHEST)[len(beside) // 2 :][:size]
+        near = jnp.where(self.there, shares, 0.0)
+        total = near.sum()
+        relative = near * jnp.sum(self.there, dtype=near.dtype) / jnp.where(total > 0, total, 1.0)
+        return jnp.where(self.there & (total > 0), self.correct * evidence.odds * relative + 1 - self.correct, 1.0)
+
+    def normalize(self, belief: Float[Array, "speeds rows"]) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
+        """A belief of total 1, and its total before; if images and motion exclude each other, nothing is known."""
+        total = belief.sum()
+        return jnp.where(total > 0, belief / jnp.where(total > 0, total, 1.0), self.anywhere), total
+
+    def by_row(self, belief: Float[Array, "speeds rows"]) -> Float[Array, " rows"]:
+        """Probabilities of the rows at any speed."""
+        return belief.sum(axis=0)
+
+    @property
+    def _is_inside(self) -> Bool[Array, "1 wide"]:
+        """Whether rows from -reach to size + reach are on the map or in a gap."""
+        rows = jnp.arange(-self.reach, len(self.there) + self.reach)
+        return ((rows >= 0) & (rows < len(self.there) - jnp.argmax(self.there[::-1])))[None]
+
+    def _moved(self, belief: Array) -> Array:
+        """The belief when the next image is taken; who moves beyond an end of the map may be anywhere on it."""
+        reach, size = self.reach, len(self.there)
+        wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
+        starts = reach - self.shifts - self.steps.shape[1] // 2
+        moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
+        outside = jnp.where(self._is_inside, 0.0, moved).sum()
+        carried = self.kidnapped * belief.sum() + outside
+        inside = jnp.where(self._is_inside, moved, 0.0)[:, reach : reach + size]
+        return inside + carried * self.anywhere
+
+    def _seen_from_before(self, later: Array) -> Array:
+        """Probabilities of `later` by the state before a motion: the transpose of `_moved`."""
+        anywhere = (later * self.anywhere).sum()
+        wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
+        starts = self.reach + self.shifts - self.steps.shape[1] // 2
+        moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
+        return (1 - self.kidnapped) * moved + self.kidnapped * anywhere
+
+    def _changed(self, changes: Array, values: Array) -> Array:
+        """Products of changes `[speeds, speeds]` and values `[speeds, rows]`."""
+        return jnp.matmul(changes, values, precision=jax.lax.Precision.HIGHEST)
+
+    def _convolve(self, values: Array, steps: Array, starts: Array, size: int) -> Array:
+        """Totals over k of steps[v, k] * values[v, starts[v] + k + row], for `size` rows."""
+        number = steps.shape[1]
+        cut = lambda row, start: jax.lax.dynamic_slice(row, (start,), (size + number - 1,))  # noqa: E731
+        aligned = jax.vmap(cut)(values, starts)
+
+        def add_step(k: int, total: Array) -> Array:
+            return total + steps[:, k, None] * jax.lax.dynamic_slice_in_dim(aligned, k, size, axis=1)
+
+        return jax.lax.fori_loop(0, number, add_step, jnp.zeros((len(values), size)))
+
+
+def _gaussian(mean: float, spread: float) -> Float[np.ndarray, " steps"]:
+    """Probabilities of -R .. R rows, up to four standard deviations around the mean."""
+    reach = math.ceil(_REACH * spread + 0.5)
+    steps = np.arange(-reach, reach + 1)
+    exponents = -((steps - mean) ** 2) / (2 * spread**2)
+    near = np.abs(steps - mean) <= max(_REACH * spread, 0.5)
+    weights = np.where(near, np.exp(exponents - exponents.max(where=near, initial=-np.inf)), 0)
+    return (weights / weights.sum()).astype(np.float32)
+
+
+def _speed_changes(speeds: Float[np.ndarray, " speeds"]) -> Float[np.ndarray, "speeds speeds"]:
+    """Probabilities of each next speed (columns) after each speed (rows)."""
+    if len(speeds) == 1:
+        return np.ones((1, 1), np.float32)
+    few = np.exp(-((speeds[:, None] - speeds) ** 2) / 2) * (speeds[:, None] != speeds)
+    few /= few.sum(axis=1, keepdims=True)
+    changes = (1 - _ANY) * (_STEADY * np.eye(len(speeds)) + (1 - _STEADY) * few) + _ANY / len(speeds)
+    return changes.astype(np.float32)
+
+
+def _shares(scores: Float[np.ndarray, "images candidates"]) -> Float[np.ndarray, "images candidates"]:
+    """Shares of each image's candidates, of sum 1: the square of the score above the mean; 0 if it is not finite."""
+    finite = np.isfinite(scores)
+    values = np.where(finite, scores, 0.0).astype(np.float64)
+    above = np.where(finite, values - values.sum(axis=1, keepdims=True) / np.maximum(finite.sum(axis=1), 1)[:, None], 0)
+    above = np.maximum(above, 0)
+    powers = (above / np.maximum(above.max(axis=1, keepdims=True), np.finfo(np.float64).tiny)) ** _SHARPNESS
+    powers = np.where(powers.any(axis=1, keepdims=True), powers, finite)  # all scores are equal
+    return (powers / np.maximum(powers.sum(axis=1, keepdims=True), 1e-300)).astype(np.float32)
+
+
+def off_the_map(drive: Drive, off: float, chance: float) -> float:
+    """Probability that the robot is not on the map after an image, from that before it.
+
+    `chance` is the probability of the image on the map, relative to an image that shows nothing of it.
+    """
+    moved = off * (1 - drive.returns) + (1 - off) * drive.leaves
+    return moved / max(moved + (1 - moved) * chance, sys.float_info.min)

@@ -1,0 +1,228 @@
+"""Final scores of a system, which candidates are ranked by: of retrieval, of each scorer, and combined ones."""
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mfvpr.core.parameters import POSITIVE
+from mfvpr.core.ranking import (
+    RetrievalScore,
+    Scores,
+    Ties,
+    fuse_scales,
+    fuse_shortlist,
+    rank_shortlist,
+    retrieval_scores,
+)  # fmt: skip
+from mfvpr.core.types import Shortlist
+from mfvpr.evaluation.cohort_normalization import by_hubness
+from mfvpr.evaluation.rankings import COHORT, FRAMES, RETRIEVAL, Ranked
+from mfvpr.evaluation.sequences import DriveFilter
+from mfvpr.utils.errors import InputError, require_word
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Sum of a main score, the retrieval score, and the scores of further scorers.
+
+    Attributes:
+        c: the combined score is main score + c * retrieval score; None = `balancing_c` of each query. "zscore" = the
+            sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
+            equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
+            the same unit for every query. A score that is not finite affects only its own candidate.
+        retrieval_score: kind of retrieval score, see `mfvpr.core.ranking.retrieval_scores`.
+        weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
+            and of further scorers, which take part only if they are named here.
+    """
+
+    c: float | Literal["zscore"] | None = None
+    retrieval_score: RetrievalScore = "cosine"
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    def members(self, main: str) -> list[str]:
+        """Names of the scorers that take part, the main scorer first."""
+        return [main, *(name for name in self.weights if name not in (main, RETRIEVAL))]
+
+    def rename_main(self, main: str, name: str) -> "Fusion":
+        """This fusion for a main scorer with another name, such as one with a cohort."""
+        return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
+
+    def system(self, main: str) -> str:
+        """Name of the fused system, such as `histogram + retrieval`."""
+        return " + ".join([*self.members(main), RETRIEVAL])
+
+    def check(self, main: str, scorers: Collection[str]) -> None:
+        """Raise an InputError if a setting is out of bounds, or a name is not among those of all `scorers`."""
+        require_word("retrieval_score", self.retrieval_score, RetrievalScore)
+        known = ", ".join(scorers) or "there are none"
+        if main not in scorers:
+            raise InputError(f"fused: expected names of scorers ({known}), got {main}")
+        if self.c not in (None, "zscore") and not _between(self.c, 0, POSITIVE[1]):
+            raise InputError(f"c={self.c!r}: expected a number from 0 to {POSITIVE[1]:g}, 'zscore', or None")
+        if self.weights and self.c != "zscore":
+            raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
+        for name, weight in self.weights.items():
+            if name not in {RETRIEVAL, *scorers}:
+                raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it "
+                                 "as well")  # fmt: skip
+            if not _between(weight, *POSITIVE):
+                raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
+                                 f"{weight!r}")  # fmt: skip
+
+    def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
+        """Combined scores, from scores by name of the scorer."""
+        if self.c != "zscore":
+            return fuse_shortlist(candidates, scores[main], self.c, retrieval_score=self.retrieval_score)
+        parts = {RETRIEVAL: retrieval_scores(candidates, self.retrieval_score)}
+        parts |= {name: scores[name] for name in self.members(main)}
+        weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
+        return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
+
+
+@dataclass(frozen=True)
+class FrameCorrelation:
+    """Increase the scores of candidates near the places of the previous queries (Camara & Preucil, RAS 2020).
+
+    The place of a query is its best candidate. A candidate d database rows from the place of a previous query gains
+    strength * gain * (1 - d / reach) of its score; the largest gain over the previous queries counts. The strength is
+    the score of that place over the best score of the previous places, and 1 if `previous` is 1 or all scores are 0.
+    Queries and database images must be in the order of the drive.
+
+    The public code differs in two details: it rounds the scores of places to two digits, and it assigns row 0 to a
+    query without a score above 0, which has no place here.
+
+    Attributes:
+        previous: number of previous queries, from 1; the first `previous` queries keep their scores.
+        reach: database rows.
+        gain: largest relative increase of a score.
+    """
+
+    previous: int = 2
+    reach: float = 15.0
+    gain: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
+            raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
+                             "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
+
+    def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
+        """Correlated scores of a sequence, float32.
+
+        Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
+        """
+        mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
+        before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
+        for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
+            positive = usable & (row_scores > 0)
+            if len(before) == self.previous:
+                row_scores[positive] *= 1 + self._gains(rows[positive], np.array(before))
+            best = row_scores.max(where=positive, initial=0)
+            before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
+        return correlated.astype(np.float32)
+
+    def _gains(self, rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
+        """Largest relative gains of rows; `before` are places and scores."""
+        places, scores = before.T
+        best = scores.max()
+        strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
+        nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
+        return self.gain * np.max(strength * nearness, axis=1, initial=0)
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Normalization of a score with a cohort; `cohort` is that of `mfvpr.System`."""
+
+    cohort: int
+
+
+@dataclass(frozen=True)
+class FinalScore:
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores."""
+
+    name: str
+    scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
+    base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
+    step: Cohort | Fusion | FrameCorrelation | DriveFilter | None = None
+
+
+def final_scores(
+    scorers: Iterable[str], cohort: int | None, fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation], sequences: Mapping[str, Sequence[DriveFilter]],
+) -> dict[str, FinalScore]:  # fmt: skip
+    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
+    known = {RETRIEVAL: FinalScore(RETRIEVAL)}
+
+    def add(name: str, *of: Any) -> None:
+        if name in known:
+            raise InputError(f"scorers: {name} is the name of another system; choose another one")
+        known[name] = FinalScore(name, *of)
+
+    for name in scorers:
+        add(name, (name,))
+    if cohort is not None:
+        for name in scorers:
+            add(f"{name} + {COHORT}", (name,), name, Cohort(cohort))
+    alone = [*known][1:]
+    for name, fusion in fused.items():
+        fusion.check(name, alone)
+        members = [scorer for member in fusion.members(name) for scorer in known[member].scorers]
+        add(fusion.system(name), tuple(members), name, fusion)
+    several = [*known][1:]
+
+    def add_step(field: str, name: str, words: str, step: FrameCorrelation | DriveFilter) -> None:
+        if name not in several:
+            raise InputError(f"{field}: expected names of scorers ({', '.join(several) or 'there are none'}), got "
+                             f"{name}")  # fmt: skip
+        add(f"{name} + {words}", known[name].scorers, name, step)
+
+    for name, correlation in correlated.items():
+        add_step("correlated", name, FRAMES, correlation)
+    for name, filters in sequences.items():
+        if not isinstance(filters, list | tuple) or not all(isinstance(each, DriveFilter) for each in filters):
+            raise InputError(f"sequences: expected a list of DriveFilter(...) for {name}, got {filters!r}")
+        for each in filters:
+            add_step("sequences", name, each.name, each)
+    return known
+
+
+def rank_by_scores(
+    candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
+    hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None, num_rows: int = 0,
+    excluded: Bool[np.ndarray, "queries database"] | None = None,
+) -> dict[str, Ranked]:  # fmt: skip
+    """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
+
+    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. Sequences need
+    `num_rows`, the number of images in the database, and the images of it that are `excluded` for each query.
+    """
+    known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
+    rankings: dict[str, Ranked] = {}
+    for score in final_scores:
+        base = score.base
+        match score.step:
+            case Cohort():
+                known[score.name] = by_hubness(candidates, known[base], hubness[base], name=base)
+            case Fusion() as fusion:
+                known[score.name] = fusion(base, candidates, known)
+            case FrameCorrelation() as correlation:
+                known[score.name] = correlation(candidates, known[base])
+            case DriveFilter() as drive_filter:
+                rankings[score.name] = drive_filter(rankings[base], num_rows, excluded)
+        if score.name not in rankings:
+            rankings[score.name] = _rank(candidates, known[score.name], ties)
+    return rankings
+
+
+def _between(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, int | float | np.number) and bool(low <= value <= high)
+
+
+def _rank(candidates: Shortlist, scores: Scores, ties: Ties) -> Ranked:
+    order = rank_shortlist(candidates, scores, ties=ties)
+    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))

@@ -1,0 +1,9 @@
+"""Matchers as values, and matches of many queries with their candidates.
+
+Read first: matcher (nearest neighbors as a value), soft, lightglue_matcher, host_matcher; then batched_matching (whole
+shortlists) and match_set (matches of many queries).
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

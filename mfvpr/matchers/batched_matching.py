@@ -1,0 +1,172 @@
+"""Shortlists -> matches of all pairs, in batches of queries on all devices."""
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int, Num
+
+from mfvpr.core.types import Features, Matches, Shortlist, per_match
+from mfvpr.features.feature_set import FeatureSet, Slots, Staged, memory_budget
+from mfvpr.matchers.match_set import QueryMatches, split_pairs
+from mfvpr.matchers.matcher import Matcher, match_pairs
+from mfvpr.utils import ragged
+from mfvpr.utils.numerics import Device, holds_function
+from mfvpr.utils.ragged import Row
+from mfvpr.utils.threads import ordered_map
+
+QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
+PAIRS = 128  # per call
+
+Calls = list[tuple[Int[np.ndarray, " pairs"], Matches]]  # (positions in the pairs of a part, their matches)
+
+
+class Part(NamedTuple):
+    """Pairs of a batch of queries with candidates that fit on the device at the same time."""
+
+    pairs: Int[np.ndarray, "pairs 3"]  # row of the query, position of the candidate in its shortlist, database row
+    device: Device
+    ends: Int[np.ndarray, " queries"]  # rows of the queries without further pairs
+
+
+class Pair(NamedTuple):
+    """Real matches of one pair, and the sizes of its images."""
+
+    matches: Row
+    image_size0: Num[np.ndarray, "2"]
+    image_size1: Num[np.ndarray, "2"]
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Features of queries and of the database on one device."""
+
+    queries: Slots
+    database: Slots
+
+    def stage(self, part: Part) -> tuple[Staged, Staged]:
+        """Read the features that are not on the device."""
+        return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
+
+    def begin(self, staged: tuple[Staged, Staged], match: Callable[..., Matches]) -> Calls:
+        """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
+        arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
+        capacities, slots = (
+            np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot")
+        )
+        calls = []
+        for shape in np.unique(capacities, axis=0):
+            members = np.flatnonzero((capacities == shape).all(axis=1))
+            sides = arrays0[int(shape[0])], arrays1[int(shape[1])]
+            for start in range(0, len(members), PAIRS):
+                positions = members[start : start + PAIRS]
+                pairs = ragged.repeat_last(slots[positions], PAIRS)
+                calls.append((positions, match(*sides, pairs, np.int32(len(positions)))))
+        return calls
+
+
+def match_queries(
+    queries: FeatureSet,
+    database: FeatureSet,
+    candidates: Shortlist,
+    todo: Sequence[int],
+    matcher: Matcher,
+    *,
+    memory: float | None,
+    devices: Sequence[Device],
+) -> Iterator[tuple[int, QueryMatches]]:
+    """Match queries with their candidates: (row, matches) in the order of `todo`, NumPy.
+
+    A thread reads features while the devices work. `memory` is `mfvpr.Runtime.memory`.
+    """
+    indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
+    counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
+    match = partial(match_pairs, matcher=matcher)
+    if holds_function(matcher):  # or it would be compiled for every call; the program goes with the last query
+        match = jax.jit(match)
+    # Shapes follow from all queries, not from `todo`: a run that is continued must have the bits of a single run.
+    database_rows, budget = np.unique(indices), memory_budget(memory, devices)
+    database_rows = database_rows[database_rows >= 0]
+    sides = {
+        device: Sides(
+            Slots(queries, np.arange(len(queries)), 0, device), Slots(database, database_rows, budget, device)
+        )
+        for device in devices
+    }
+    no_matches = _no_matches(queries, database, matcher)
+    pairs: dict[tuple[int, int], Pair] = {}  # by (query, place), until the last pair of the query
+    begun: deque[tuple[Part, Calls]] = deque()
+    parts = _parts(counts0, counts1, indices, rows, sides)
+    staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
+    for step in itertools.chain(staged, [None]):
+        if step is not None:
+            begun.append((step[0], sides[step[0].device].begin(step[1], match)))
+        while len(begun) > (0 if step is None else len(devices)):
+            part, calls = begun.popleft()
+            for call in calls:
+                pairs.update(_collect(part, *call))
+            for query in part.ends.tolist():
+                of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
+                keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
+                matches, counts = join_candidates(of_query, no_matches, counts0[query].astype(np.int32), keypoints)
+                yield query, QueryMatches(matches, counts, indices[query], scores[query])
+
+
+def _parts(
+    counts0: Int[np.ndarray, " queries"],
+    counts1: Int[np.ndarray, " database"],
+    indices: Int[np.ndarray, "queries candidates"],
+    todo: Int[np.ndarray, " rows"],
+    sides: dict[Device, Sides],
+) -> Iterator[Part]:
+    """Parts of all batches, each batch on the next device; without pairs that lack keypoints."""
+    for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):
+        batch = todo[start : start + QUERIES]
+        rows = indices[batch]
+        number, place = np.nonzero((rows >= 0) & (counts1[rows] > 0) & (counts0[batch] > 0)[:, None])
+        pairs = np.stack([batch[number], place, rows[number, place]], axis=1)
+        groups = list(sides[device].database.parts(np.unique(pairs[:, 2])))  # database rows that fit at the same time
+        for group in groups[:-1]:
+            yield Part(pairs[np.isin(pairs[:, 2], group)], device, batch[:0])
+        yield Part(pairs[np.isin(pairs[:, 2], groups[-1:])], device, batch)
+
+
+def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tuple[tuple[int, int], Pair]]:
+    """((row of the query, place of the candidate), pair) of every pair of a call."""
+    real = jax.tree.map(lambda values: np.asarray(values)[: len(positions)], matches)
+    places = part.pairs[positions, :2].tolist()
+    return zip(map(tuple, places), map(Pair, split_pairs(real), real.image_size0, real.image_size1), strict=True)
+
+
+def join_candidates(
+    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"] | None
+) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
+    """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
+    matched_pairs = [pair for pair in pairs if pair is not None]
+    rows = ragged.join_rows([pair.matches for pair in matched_pairs] or [no_matches])
+    unknown = np.ones(2, np.float32)
+    matches = Matches(
+        **rows,
+        mask=np.ones(len(rows["points0"]), bool),
+        image_size0=matched_pairs[0].image_size0 if matched_pairs else unknown,
+        image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
+        count0=count0,
+        count1=count1,
+    )
+    return matches, np.array([0 if pair is None else len(pair.matches["points0"]) for pair in pairs], np.int32)
+
+
+def _no_matches(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:
+    """Empty row with the fields that the matcher returns."""
+    dimensions = [side.dimension for side in (queries, database) if (side.counts > 0).any()]
+    dimension = dimensions[0] if dimensions else getattr(matcher, "dimension", 1)
+    shapes = {"keypoints": (1, 2), "descriptors": (1, dimension), "scores": (1,), "image_size": (2,)}
+    arrays = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
+    image = Features(**arrays, mask=np.ones(1, bool))
+    fields = per_match(jax.eval_shape(matcher, image, image))
+    return {name: np.zeros((0, *leaf.shape[1:]), leaf.dtype) for name, leaf in fields.items()}

@@ -1,0 +1,218 @@
+"""Matches of many queries with their candidates: ragged sets, and padded batches of pairs for scoring."""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+
+from mfvpr.core.types import Matches, per_match, per_pair
+from mfvpr.utils import ragged
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.numerics import available_cpus, round_up
+from mfvpr.utils.threads import ordered_map
+
+BATCH_SLOTS = 2**14  # slots of a batch of pairs: its votes stay in the cache
+PAIRS_STEP = 8
+SLOTS_STEP = 32
+PROGRAM_SLOTS = 2**21  # slots that one setting scores in the time that another shape takes to compile
+QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
+BYTES_PER_SLOT = 41
+BLOCK_BYTES = 2**28
+
+Normalize = Literal["zscore", "none"]
+
+
+@dataclass(frozen=True)
+class QueryMatches:
+    """Candidates of one query, best first, and their n real matches one after the other. NumPy.
+
+    In the matches, `image_size0` `[2]` and `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the
+    candidates'.
+    """
+
+    matches: Matches
+    counts: Int[np.ndarray, " candidates"]  # matches of each candidate, int32; their sum is n
+    indices: Int[np.ndarray, " candidates"]  # database rows, int32, -1 = none
+    filter_scores: Float[np.ndarray, " candidates"]  # float32
+
+
+@dataclass(frozen=True)
+class MatchSet:
+    """Matches of every query with its candidates, of one scale, without padding.
+
+    Attributes:
+        matches: per query, as in QueryMatches; a store may read them on access.
+        counts: matches of each candidate.
+        capacity: slots that suffice for every pair.
+    """
+
+    matches: Sequence[Matches]
+    counts: Int[np.ndarray, "queries candidates"]
+    capacity: int
+
+    @classmethod
+    def of(cls, matches: Sequence[Matches], counts: Int[np.ndarray, "queries candidates"]) -> "MatchSet":
+        """Match set with a rounded capacity, so that sets of similar size share programs."""
+        return cls(matches, counts, round_up(int(counts.max(initial=0)), 64))
+
+    def __getitem__(self, query: int) -> Matches:
+        """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
+        return self.pairs(np.full(self.counts.shape[1], query), np.arange(self.counts.shape[1]), self.capacity)
+
+    def __len__(self) -> int:
+        return len(self.matches)
+
+    def take(self, queries: Sequence[int] | np.ndarray) -> "MatchSet":
+        """Match set of the given queries, in memory."""
+        matches = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
+        return MatchSet(list(matches), self.counts[queries], self.capacity)
+
+    def pairs(
+        self,
+        queries: Int[np.ndarray, " pairs"],
+        places: Int[np.ndarray, " pairs"],
+        capacity: int,
+        *,
+        total: int | None = None,
+    ) -> Matches:
+        """Matches `[P, K, ...]` of pairs, padded with zeros to K = `capacity` slots, for `places` in the shortlists.
+
+        There are `total` pairs with padding, which has no matches, and the images of the last pair.
+        """
+        by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
+        pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
+        rows = [self._row(by_query[query], query, place) for query, place in pairs]
+        entries, mask = ragged.pad_rows(rows, capacity, total=total)
+        for name in per_pair(by_query[pairs[0][0]]):
+            values = [getattr(by_query[query], name) for query, _ in pairs]
+            if name.endswith("1"):  # of all candidates
+                values = [of_query[place] for of_query, (_, place) in zip(values, pairs, strict=True)]
+            entries[name] = ragged.repeat_last(np.stack(values), len(mask))
+        return Matches(**entries, mask=mask)
+
+    @cached_property
+    def _ends(self) -> Int[np.ndarray, "queries candidates"]:
+        """End of each candidate's matches among the matches of its query."""
+        return np.cumsum(self.counts, axis=1)
+
+    def _row(self, matches: Matches, query: int, place: int) -> ragged.Row:
+        """Views of the matches of one pair, out of the matches of its query."""
+        end = self._ends[query, place]
+        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(matches).items()}
+
+    @cached_property
+    def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
+        """Sizes of query and database images, in all combinations."""
+        sizes = [
+            [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
+        ]
+        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
+        return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Matches of every pair at several scales, such as patch sizes: one match set per scale.
+
+    Functions that score a MatchSet accept Scales, too, and fuse the scores of the scales, see `fuse_scales`.
+
+    Attributes:
+        match_sets: S match sets of the same queries and candidates.
+        weights: of the scales; None = 1 each.
+        normalize: normalization of the scores of a scale before fusion.
+    """
+
+    match_sets: Sequence[MatchSet]
+    weights: Sequence[float] | None = None
+    normalize: Normalize = "zscore"
+
+    def __post_init__(self) -> None:
+        shapes = {match_set.counts.shape for match_set in self.match_sets}
+        if len(shapes) != 1:
+            raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
+        if self.weights is not None and len(self.weights) != len(self.match_sets):
+            raise InputError(
+                f"scales: expected a weight for each of {len(self.match_sets)} scales, got {len(self.weights)}"
+            )
+
+    @property
+    def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
+        """Image sizes of all scales, see `MatchSet.image_sizes`."""
+        sizes0, sizes1 = zip(*(match_set.image_sizes for match_set in self.match_sets), strict=True)
+        return np.concatenate(sizes0), np.concatenate(sizes1)
+
+
+def scales(match_set: MatchSet | Scales) -> Sequence[MatchSet]:
+    """The match set of each scale; a MatchSet is a single scale."""
+    return match_set.match_sets if isinstance(match_set, Scales) else [match_set]
+
+
+def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray, "queries candidates"]:
+    """Slots of the batch of each pair: few sizes to compile, with little padding.
+
+    Few settings or a small set have fewer sizes: padding then costs less time than compiling for another size.
+    """
+    sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
+    sizes[-1] = max(sizes[-1], match_set.capacity)
+    sizes = ragged.prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
+    return ragged.smallest_capacities(sizes, match_set.counts)
+
+
+def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
+    """Pairs per batch, by slots, for any number of pairs: larger sets have scores with the same bits."""
+    sizes = np.unique(slots(match_set, settings=settings)).tolist()
+    return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
+
+
+def partition(
+    match_set: MatchSet, queries: range, *, settings: float = math.inf
+) -> list[tuple[Int[np.ndarray, " _"], int, int]]:
+    """Batches of all pairs of some queries that have matches; the first of each shape comes first.
+
+    A batch has positions of pairs in the flattened `[queries, candidates]`, slots of a pair, and pairs with padding.
+    """
+    part = slice(queries.start, queries.stop)
+    counts = match_set.counts[part].reshape(-1)
+    sizes = slots(match_set, settings=settings)[part].reshape(-1)
+    by_shape = []
+    for size, pairs in shapes(match_set, settings=settings).items():
+        places = np.flatnonzero((sizes == size) & (counts > 0))
+        by_shape.append([(places[start : start + pairs], size, pairs) for start in range(0, len(places), pairs)])
+    interleaved = itertools.chain.from_iterable(itertools.zip_longest(*by_shape))
+    return [batch for batch in interleaved if batch is not None]
+
+
+def batches(
+    match_set: MatchSet, queries: range, *, settings: float = math.inf
+) -> Iterator[tuple[Int[np.ndarray, " pairs"], Matches]]:
+    """Padded Matches `[P, K, ...]` of all batches of `partition`, with their places `[n]`, n <= P."""
+    part = match_set.take(queries)
+    for places, size, pairs in partition(match_set, queries, settings=settings):
+        query, place = np.divmod(places, match_set.counts.shape[1])
+        yield places, part.pairs(query, place, size, total=pairs)
+
+
+def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
+    """Number of queries, at least 1, with matches and scores that fit into BLOCK_BYTES."""
+    bytes_of_query = block_bytes(match_set, num_settings, 1)
+    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
+
+
+def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
+    """Approximate bytes to score some queries at the same time: matches, scores and rankings."""
+    padded = sum(slots(scale, settings=num_settings).sum(1) for scale in scales(match_set))
+    largest, num_candidates = np.sort(padded)[::-1][:num_queries].sum(), scales(match_set)[0].counts.shape[1]
+    score_bytes = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
+    return int(2 * BYTES_PER_SLOT * largest) + score_bytes
+
+
+def split_pairs(matches: Matches) -> list[dict[str, np.ndarray]]:
+    """Real matches of each of the pairs `[P, K, ...]`, by field. NumPy."""
+    mask = np.asarray(matches.mask)
+    flat = {name: np.asarray(values)[mask] for name, values in per_match(matches).items()}
+    return ragged.split(flat, mask.sum(axis=1))

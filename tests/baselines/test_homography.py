@@ -1,0 +1,233 @@
+"""RANSAC in one batch: against loops in double precision, OpenCV, and what no sampling may change."""
+
+from dataclasses import replace
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from mfvpr import Homography, score_candidates
+from mfvpr.baselines import planes
+from mfvpr.utils import NoGradientError
+from mfvpr.utils.numerics import masked
+from tests import ransac_oracle
+from tests.builders import SIZE, make_matches, per_match, stack
+
+pytestmark = pytest.mark.thorough
+
+CAPACITY = 320  # of all pairs of matches, because each shape compiles for seconds
+
+PLANE = np.array([[1.05, 0.05, 8.0], [-0.03, 0.97, -5.0], [1e-4, -5e-5, 1.0]])  # candidate -> query
+estimate = jax.jit(lambda scorer, matches: scorer.estimate(matches))
+
+
+def score(matches, *numbers, **options):
+    return float(estimate(Homography(*numbers, **options), matches).score)
+
+
+def plane_points(seed, count, share, *, noise=2.0):
+    """(points of the candidate, points of the query) `[n, 2]`, a share of which one plane explains up to noise."""
+    rng = np.random.default_rng(seed)
+    points1 = rng.uniform(0, SIZE, (count, 2))
+    points0 = ransac_oracle.mapped(PLANE, points1) + rng.normal(0, noise, (count, 2))
+    wrong = rng.permutation(count)[round(share * count) :]
+    points0[wrong] = rng.uniform(0, SIZE, (len(wrong), 2))
+    return points1.astype(np.float32), points0.astype(np.float32)
+
+
+def pair(seed, count, share, *, capacity=CAPACITY, **options):
+    points1, points0 = plane_points(seed, count, share, **options)
+    return make_matches(points0, points1, capacity=capacity)
+
+
+def misses(matrix, matches):
+    """Pixels between the real matches' points of the query and those that the matrix maps there."""
+    real = matches.mask
+    return np.linalg.norm(ransac_oracle.mapped(matrix, matches.points1[real]) - matches.points0[real], axis=1)
+
+
+@pytest.mark.optimized
+@pytest.mark.parametrize(("count", "share"), [(5, 0.9), (8, 0.6), (40, 0.3), (120, 0.1), (120, 0.5), (300, 0.9)])
+@pytest.mark.parametrize("threshold", [8.0, 24.0])
+def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, threshold):
+    for seed in range(3):
+        matches = pair([seed, count], count, share)
+        got = estimate(Homography(threshold, 500.0, seed=seed), matches)
+        points = np.where(matches.mask[:, None], np.concatenate([matches.points1, matches.points0], axis=-1), 0)
+        order = np.asarray(planes.canonical_order(points, matches.mask))[:count]
+        inliers, samples, errors = ransac_oracle.estimate(
+            points[order, :2], points[order, 2:], threshold=threshold, max_iterations=500, seed=seed
+        )
+        sure = np.abs(errors - threshold) > 1e-3 * threshold
+        assert (np.asarray(got.inliers)[order][sure] == inliers[sure]).all()
+        assert abs(int(got.score) - inliers.sum()) <= (~sure).sum()
+        assert int(got.samples) == samples
+
+
+def test_draws_are_distinct_and_every_set_is_as_likely():
+    drawn = np.sort(np.asarray(planes.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
+    assert (np.diff(drawn, axis=0) > 0).all()
+    assert (drawn.min(), drawn.max()) == (0, 5)
+    _, counts = np.unique(drawn, axis=1, return_counts=True)
+    expected = drawn.shape[1] / 15
+    assert len(counts) == 15
+    assert ((counts - expected) ** 2 / expected).sum() < 36  # chi-square of 14 degrees: p = 0.001
+
+
+def test_samples_are_the_first_draws_that_a_camera_can_see():
+    points = np.concatenate(plane_points(5, 30, 0.5), axis=1) / 168 - 1
+    points[5:10] = np.linspace(0, 0.75, 5, dtype=np.float32)[:, None]  # on a line in both images
+    key = jax.random.key(7)
+    samples, count = planes.draw_samples(jnp.asarray(points), key, 3, np.int32(30))
+    drawn = np.asarray(planes.draw_four(key, 3, np.int32(30))).T
+    visible = [four for four in drawn if ransac_oracle.keeps_orientation(points[four, :2], points[four, 2:])]
+    assert int(count) == min(len(visible), planes.ROUND)
+    expected = points[np.array(visible[: int(count)])]
+    np.testing.assert_array_equal(np.moveaxis(np.asarray(samples), 0, 2)[:, : int(count)].swapaxes(0, 1), expected)
+
+
+@pytest.mark.slow
+def test_company_order_and_padding_change_no_bit():
+    cases = (100, 0.1), (3, 1.0), (0, 1.0), (60, 0.9), (128, 0.3)
+    pairs = [pair(seed, *case, capacity=128) for seed, case in enumerate(cases)]
+    together = np.asarray(score_candidates(Homography(), stack(pairs)))
+    shuffle = np.random.default_rng(0).permutation(128)
+    for matches, score in zip(pairs, together, strict=True):
+        shuffled = per_match(matches, lambda rows: rows[shuffle])
+        wider = make_matches(matches.points0[matches.mask], matches.points1[matches.mask], capacity=205)
+        for same in (matches, shuffled, wider):
+            assert float(estimate(Homography(), same).score) == score
+        assert score_candidates(Homography(), stack([matches] * 3)).tolist() == [score] * 3
+
+
+def test_a_plane_without_noise_is_estimated_to_a_hundredth_of_a_pixel():
+    matches = pair(3, 50, 1.0, noise=0.0)
+    got = estimate(Homography(1.0, refit=True), matches)
+    assert int(got.score) == 50
+    np.testing.assert_allclose(got.matrix, PLANE / PLANE[2, 2], rtol=2e-3, atol=2e-5)
+    assert misses(got.matrix, matches).max() < 1e-2
+
+
+@pytest.mark.slow
+def test_least_squares_are_those_of_scipy():
+    matches = pair(4, 200, 0.6)
+    plain, refit = (estimate(Homography(8.0, refit=again), matches) for again in (False, True))
+    inliers = np.asarray(plain.inliers)
+    points1, points0 = matches.points1[inliers].astype(float), matches.points0[inliers].astype(float)
+
+    def differences(free):
+        return (ransac_oracle.mapped(np.append(free, 1).reshape(3, 3), points1) - points0).ravel()
+
+    start = np.asarray(plain.matrix, float).ravel()[:8]
+    best = least_squares(differences, start, x_scale="jac", xtol=1e-15, ftol=1e-15)
+    cost = np.sum(differences(np.asarray(refit.matrix, float).ravel()[:8] / float(refit.matrix[2, 2])) ** 2)
+    assert cost <= 2 * best.cost * (1 + 1e-4)
+    errors = misses(np.append(best.x, 1).reshape(3, 3), matches)
+    assert abs(int(refit.score) - (errors <= 8).sum()) <= 1
+    assert int(refit.score) > int(plain.score)
+
+
+def test_msac_prefers_the_closer_of_two_models_with_as_many_inliers():
+    matches = pair(6, 200, 0.5)
+    estimates = [estimate(Homography(24.0, measure=measure), matches) for measure in ("inliers", "msac")]
+    errors = (misses(model.matrix, matches) for model in estimates)
+    quality_of_inliers, quality = (np.sum(1 - (error[error <= 24] / 24) ** 2) for error in errors)
+    np.testing.assert_allclose(estimates[1].score, quality, rtol=1e-3)
+    assert float(estimates[1].score) >= quality_of_inliers - 1e-2
+
+
+@pytest.mark.optimized
+def test_as_many_inliers_as_opencv():
+    pairs = [plane_points(seed, 200, 0.4, noise=1.0) for seed in range(30)]
+    expected = [
+        cv2.findHomography(*points, cv2.RANSAC, 24.0, maxIters=2000, confidence=0.995)[1].sum() for points in pairs
+    ]
+    batch = stack([make_matches(points0, points1) for points1, points0 in pairs])
+    difference = np.asarray(score_candidates(Homography(24.0, refit=True), batch)) - expected
+    assert np.median(difference) == 0
+    assert np.mean(np.abs(difference) <= 2) >= 0.95
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+def test_few_matches(count):
+    matches = pair(8, count, 1.0)
+    assert score(matches) == count
+    assert score(matches, few="zero") == (4 if count == 4 else 0)
+    assert np.isnan(estimate(Homography(), matches).matrix).all() == (count < 4)
+
+
+LINE = np.stack([np.linspace(0, 300, 20), np.linspace(10, 200, 20)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("points1", "points0"),
+    [(LINE, LINE), (LINE, LINE[::-1]), (np.full((20, 2), 7.0), LINE), (np.full((20, 2), 7.0), np.full((20, 2), 9.0))],
+)
+def test_no_homography_explains_a_line_or_a_point(points1, points0):
+    estimated = estimate(Homography(), make_matches(points0, points1, capacity=CAPACITY))
+    assert (float(estimated.score), int(estimated.samples)) == (0, 0)
+    assert np.isnan(estimated.matrix).all()
+    assert not np.asarray(estimated.inliers).any()
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e-6, 1e12, np.inf])
+def test_any_threshold_scores(threshold):
+    assert 0 <= score(pair(9, 40, 0.5), np.float32(threshold)) <= (40 if threshold > 1 else 8)
+    assert np.isnan(score(pair(9, 40, 0.5), np.float32(-threshold or np.nan)))
+
+
+@pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
+def test_far_points_do_not_make_inliers_of_the_others(far):
+    rng = np.random.default_rng(0)
+    points1, points0 = rng.uniform(0, SIZE, (2, 60, 2))
+    points0[:30] = points1[:30] + 5
+    points1[-1], points0[-1] = far, (far, -far)
+    assert float(estimate(Homography(8.0), make_matches(points0, points1, capacity=CAPACITY)).score) <= 34
+
+
+def test_a_match_counts_with_its_confidence():
+    matches = pair(10, 60, 1.0, noise=0.5)
+    confidence = np.zeros(CAPACITY, np.float32)
+    confidence[:60] = np.random.default_rng(0).choice([0.0, 0.25, 1.0], 60)
+    assert score(replace(matches, confidence=confidence)) == confidence.sum()
+    without = replace(matches, mask=confidence > 0, confidence=np.where(confidence > 0, 1, np.nan).astype(np.float32))
+    assert score(without) == (confidence > 0).sum()
+    assert score(replace(matches, confidence=np.full(CAPACITY, 2.0**-6, np.float32))) == 60 / 64
+
+
+@pytest.mark.slow
+def test_no_generator_of_jax_draws_otherwise_in_a_batch():
+    pairs = [pair(seed, 60, 0.2, capacity=64) for seed in range(3)]
+    expected = [score(matches, 8.0) for matches in pairs]
+    with jax.default_prng_impl("rbg"):
+        assert [score(matches, 8.0) for matches in pairs] == expected
+        assert score_candidates(Homography(8.0), stack(pairs)).tolist() == expected
+
+
+@pytest.mark.parametrize(("limit", "numbers"), [("max_iterations", (np.nan, 0.0)), ("confidence", (np.nan, -1.0, 0.0))])
+def test_limits_without_meaning_score_nan(limit, numbers):
+    assert np.isnan([score(pair(9, 40, 0.5), **{limit: np.float32(number)}) for number in numbers]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", ["inliers", "msac"])
+def test_distances_in_double_precision_change_no_score(measure):
+    matches = pair(9, 40, 0.5)
+    expected = score(matches, 8.0, measure=measure)
+    with jax.enable_x64(True):
+        got = score(replace(matches, distance=matches.distance.astype(np.float64)), 8.0, measure=measure)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_gradients_raise_but_not_those_of_other_scores():
+    matches = pair(11, 20, 0.8)
+    with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
+        jax.grad(lambda threshold: Homography(threshold)(matches))(8.0)
+    with pytest.raises(NoGradientError, match=r"homography: .*gradient"):
+        jax.grad(lambda points: Homography()(replace(matches, points0=points)))(matches.points0)
+    beside = jax.grad(lambda scores: Homography()(matches) + jnp.sum(masked(scores, matches.mask)))(matches.scores0)
+    np.testing.assert_array_equal(beside, matches.mask)

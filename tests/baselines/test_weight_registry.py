@@ -1,0 +1,132 @@
+"""Match weights by name: words, files of the package, files of users; in programs as in the library."""
+
+import json
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import HistogramOfShifts
+from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, provenance, read_weight, write_weight
+from mfvpr.core.parameters import from_values
+from mfvpr.core.weights import WEIGHTS
+from tests.builders import random_matches
+from tests.programs import results, shared, small, typed
+
+pytestmark = pytest.mark.thorough
+
+MATCHES = random_matches(np.random.default_rng(0), 30)
+LEARNED = [name for name in NAMED_WEIGHTS if name not in WEIGHTS]
+
+
+WEIGHT = replace(LearnedWeight.create(jax.random.key(1), MATCHES, 3), output=np.float32([1, -2, 0.5]))
+
+
+@pytest.fixture
+def file(tmp_path):
+    write_weight(tmp_path / "mine.json", WEIGHT, {"command": "by hand"})
+    return tmp_path / "mine.json"
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path_factory):
+    """Run a program on small data: its exit code, stdout and stderr."""
+    settings = small(shared(tmp_path_factory))
+    return lambda program, *options: typed(monkeypatch, capsys, program, *settings, *options)
+
+
+def weighted_histogram(weight, out):
+    return "figures=0", "scorer=histogram", f"scorer.weight={weight}", f"out={out}"
+
+
+def test_names():
+    assert len(NAMED_WEIGHTS) == len([*NAMED_WEIGHTS])
+    assert {name: NAMED_WEIGHTS[name] for name in [*NAMED_WEIGHTS][: len(WEIGHTS)]} == WEIGHTS
+    for name in ("heavy", "../weighting", None, ("fs",), 1):
+        assert name not in NAMED_WEIGHTS
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_weights_of_the_package_have_a_provenance(name):
+    weight = NAMED_WEIGHTS[name]
+    assert weight is NAMED_WEIGHTS[name]
+    assert weight.names == RELATIVE
+    weights = np.asarray(weight(MATCHES))[np.asarray(MATCHES.mask)]
+    assert (weights > 0).all()
+    assert weights.std() > 0.01
+    path = Path(mfvpr.__file__).parent / "scoring" / "learned" / f"{name}.json"
+    assert provenance(name) == read_weight(path)[1]
+    assert provenance(name)["command"].startswith("python -m experiments.learn dataset=streets:seed=")
+    assert not re.search(r"/(home|root|work|tmp|Users)/", path.read_text())
+
+
+def test_the_file_of_a_user(file, monkeypatch):
+    scorer = from_values(HistogramOfShifts, {"weight": str(file)})
+    jax.tree.map(np.testing.assert_array_equal, scorer.weight, WEIGHT)
+    assert float(scorer(MATCHES)) == float(HistogramOfShifts(weight=WEIGHT)(MATCHES)) > 0
+    assert NAMED_WEIGHTS[str(file)] is scorer.weight
+    monkeypatch.setenv("HOME", str(file.parent))
+    jax.tree.map(np.testing.assert_array_equal, NAMED_WEIGHTS["~/mine.json"], WEIGHT)
+
+
+def test_a_file_that_changed_is_read_again(file):
+    before = NAMED_WEIGHTS[str(file)]
+    write_weight(file, replace(WEIGHT, output_bias=np.float32(7)), {})
+    os.utime(file, ns=(1, 1))
+    assert float(NAMED_WEIGHTS[str(file)].output_bias) == 7 != float(before.output_bias)
+
+
+@pytest.mark.slow
+def test_programs_rank_by_a_file_as_by_the_equal_word(run, file, tmp_path):
+    constant = tmp_path / "constant.json"
+    write_weight(constant, replace(WEIGHT, output=np.zeros(3, np.float32)), {})  # 1 for every match
+    axis = f"grid.weight=[unit,{constant},{file}]"
+    code, _, stderr = run("sweep", "scorer=sum", axis, f"out={tmp_path}/sweep")
+    assert code == 0, stderr
+    unit, same = (json.dumps(row["recall_at"]) for row in results(tmp_path / "sweep")["settings"][:2])
+    assert unit == same
+    rankings = []
+    for number, name in enumerate(("unit", constant, file)):
+        code, _, stderr = run("evaluate", *weighted_histogram(name, tmp_path / str(number)))
+        assert code == 0, stderr
+        lines = (tmp_path / str(number) / "predictions" / "histogram.csv").read_text().splitlines()
+        rankings.append([line.split(",")[:3] for line in lines])
+    assert rankings[0] == rankings[1] != rankings[2]
+
+
+def test_a_file_of_other_content_is_another_setting_of_a_confidence(run, tmp_path):
+    warnings = []
+    for number, weight in enumerate((WEIGHT, WEIGHT, replace(WEIGHT, output=np.float32([3, 0, 1])))):
+        file = tmp_path / f"{number}.json"
+        write_weight(file, weight, {})
+        confidence = [f"confidence={tmp_path}/0/confidence.json"] if number else []
+        code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / str(number)), *confidence)
+        assert code == 0, stderr
+        warnings.append("other settings of scorer" in stderr)
+    assert warnings == [False, False, True]
+
+
+def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):
+    expected = {"none.json": "none.json: expected a match weight", "mine.txt": "expected one of fs, dmf, ratio, unit"}
+    for name, words in expected.items():
+        code, stdout, stderr = run("evaluate", "scorer=histogram", f"scorer.weight={tmp_path}/{name}")
+        assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+        assert words in stderr
+
+
+@pytest.mark.parametrize("provenance", [
+    {"data_sets": ["a", "b"]}, {"data_sets": 5}, {"data_fingerprint": ["x"]}, {"data_fingerprint": {"database": ["x"]}},
+    {"settings": None}, {"settings": {"features": "sift"}}, {"data_sets": [{"data_fingerprint": {"query": None}}]},
+])  # fmt: skip
+def test_any_provenance_is_allowed(run, file, tmp_path, provenance):
+    write_weight(file, WEIGHT, provenance)
+    code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / "out"))
+    assert code == 0, stderr
+    assert "other features (unknown instead of sift" in stderr
+    assert "other matching (unknown instead of neighbors" in stderr

@@ -1,0 +1,357 @@
+"""Products of bfloat16 that are checked, against checked products of all pairs in NumPy."""
+
+import re
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr.core import checked, nearest_neighbors
+from mfvpr.core.nearest_neighbors import match_rounded, prepare_query
+from mfvpr.core.types import per_match
+from mfvpr.features import Sift
+from mfvpr.matchers.matcher import match_pairs
+from mfvpr.utils import recipe_of
+from tests.builders import make_features, stack, unit
+
+pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
+
+DIMENSIONS = 96
+KINDS = ("random", "positive", "twins", "near twins", "not unit", "tiny", "huge", "broken", "half")
+rounded_once = jax.jit(
+    lambda query, candidates, with_ratio: mfvpr.match_candidates(
+        query, candidates, with_ratio=with_ratio, product="bfloat16"
+    ),
+    static_argnames="with_ratio",
+)
+
+
+@pytest.fixture(autouse=True)
+def check_every_pair(monkeypatch):
+    """Pairs that the guess would leave to float32 are checked as well."""
+    monkeypatch.setattr(nearest_neighbors, "tells_apart", lambda *_: True)
+
+
+def numpy_products(rows0, rows1):
+    """Float32 products of all rows, in the order that `checked_product` documents."""
+    length = 8
+    while length < rows0.shape[1]:
+        length *= 2
+    products = np.zeros((len(rows0), len(rows1), length), np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        products[..., : rows0.shape[1]] = rows0[:, None] * rows1[None]
+        parts = products.reshape(len(rows0), len(rows1), 8, -1)
+        sums = parts[:, :, 0]
+        for part in range(1, 8):
+            sums = sums + parts[:, :, part]
+        while sums.shape[-1] > 1:
+            half = sums.shape[-1] // 2
+            sums = sums[..., :half] + sums[..., half:]
+    return sums[..., 0]
+
+
+def make_pair(kind, seed=0, counts=(70, 90)):
+    rng = np.random.default_rng(seed)
+    pair = [make_features(rng, count, capacity=count + 6, dimension=DIMENSIONS) for count in counts]
+    for features in pair:
+        rows = features.descriptors[features.mask]
+        if kind == "positive":
+            rows = unit(np.abs(rows))
+        if kind == "twins":
+            rows = rows[rng.integers(0, len(rows) // 3, len(rows))]
+        if kind == "near twins":
+            rows = unit(pair[0].descriptors[rng.integers(0, 30, len(rows))] + 1e-7 * rows)
+        if kind == "not unit":
+            rows = rows * rng.uniform(0.01, 100, (len(rows), 1)).astype(np.float32)
+        if kind in ("tiny", "huge"):
+            rows = rows * np.float32(1e-12 if kind == "tiny" else 1e18)
+        if kind == "broken":
+            rows[[3, 8], [0, 5]] = np.nan, np.inf
+        features.descriptors[features.mask] = rows.astype(np.float16) if kind == "half" else rows
+    if kind == "half":
+        pair = [replace(features, descriptors=features.descriptors.astype(np.float16)) for features in pair]
+    return pair
+
+
+def neighbors_in_numpy(query, candidate):
+    """Mutual neighbors i -> (j, second) by the products above; the first index wins a tie."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        products = numpy_products(*(side.descriptors.astype(np.float32) for side in (query, candidate)))
+    usable = query.mask[:, None] & candidate.mask[None] & np.isfinite(products)
+    products = np.where(usable, products, -np.inf)
+    order = np.argsort(-products, axis=1, kind="stable")
+    back = np.argmax(products, axis=0)
+    return {i: (j, second) for i, (j, second) in enumerate(order[:, :2].tolist())
+            if products[i, j] > -np.inf and back[j] == i}  # fmt: skip
+
+
+@pytest.mark.parametrize("dimensions", [1, 7, 8, 100, 512])
+def test_checked_products_have_the_bits_of_numpy(dimensions):
+    rng = np.random.default_rng(dimensions)
+    rows0, rows1 = (rng.normal(size=(20, dimensions)).astype(np.float32) for _ in range(2))
+    expected = np.diag(numpy_products(rows0, rows1))
+    for call in (checked.checked_product, jax.jit(checked.checked_product)):
+        np.testing.assert_array_equal(call(rows0, rows1), expected)
+    np.testing.assert_allclose(expected, np.einsum("nd,nd->n", rows0.astype(float), rows1), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("with_ratio", [False, True])
+def test_neighbors_are_those_of_checked_products(kind, with_ratio):
+    for seed in range(4):
+        query, candidate = make_pair(kind, seed)
+        matches = jax.tree.map(lambda leaf: leaf[0], rounded_once(query, stack([candidate]), with_ratio))
+        expected = neighbors_in_numpy(query, candidate)
+        places = np.flatnonzero(matches.mask)
+        assert dict(zip(places.tolist(), matches.index1[places].tolist(), strict=True)) == {
+            i: j for i, (j, _) in expected.items()
+        }
+        if with_ratio:
+            rows0, rows1 = (side.descriptors.astype(np.float64) for side in (query, candidate))
+            for i, (j, second) in expected.items():
+                closest, further = (np.linalg.norm(rows0[i] - rows1[index]) for index in (j, second))
+                ratio = closest / further if closest < further else 1.0
+                np.testing.assert_allclose(matches.ratio[i], ratio, rtol=2e-3 if kind == "near twins" else 1e-5)
+
+
+@pytest.mark.parametrize("kind", ["random", "positive"])
+def test_neighbors_of_bfloat16_alone_are_wrong(kind):
+    """The data of these tests need the check."""
+    wrong = 0
+    for seed in range(4):
+        query, candidate = make_pair(kind, seed, (400, 500))
+        rounded = [
+            replace(side, descriptors=np.asarray(jnp.asarray(side.descriptors, jnp.bfloat16), np.float32))
+            for side in (query, candidate)
+        ]
+        expected, of_rounded = (
+            {(i, *places) for i, places in neighbors_in_numpy(*pair).items()} for pair in ((query, candidate), rounded)
+        )
+        wrong += len(of_rounded - expected)
+    assert wrong > 0
+
+
+def test_the_bound_holds_and_is_needed(monkeypatch):
+    """With no room for rounding, neighbors are wrong."""
+    monkeypatch.setattr(checked, "_norm", lambda rows: jnp.full(len(rows), 1e-6))
+    wrong = 0
+    for seed in range(4):
+        query, candidate = make_pair("positive", seed, (400, 500))
+        matches = jax.jit(lambda *pair: match_rounded(prepare_query(pair[0]), pair[1], with_ratio=True))(
+            query, candidate
+        )
+        places = np.flatnonzero(matches.mask)
+        expected = {(i, j) for i, (j, _) in neighbors_in_numpy(query, candidate).items()}
+        wrong += expected != {*zip(places.tolist(), np.asarray(matches.index1)[places].tolist(), strict=True)}
+    assert wrong > 0
+
+
+@pytest.mark.parametrize("dimensions", [16, 512])
+def test_rounded_products_stay_within_the_bound(dimensions):
+    rng = np.random.default_rng(dimensions)
+    query, candidate = (make_features(rng, 60, dimension=dimensions, garbage=0) for _ in range(2))
+    sides = checked.round_query(query), checked.round_candidate(candidate)
+    products = np.asarray(sides[1].descriptors, np.float64) @ np.asarray(sides[0].descriptors, np.float64)
+    exact = candidate.descriptors.astype(np.float64) @ query.descriptors.T.astype(np.float64)
+    direction = checked._direction(jnp.asarray(products, jnp.float32), 0, *sides)
+    error = np.abs(products - exact).max(axis=0)
+    assert (error <= direction.window / 2).all()
+    assert (direction.window / 2 < 0.01).all()  # or it would hold whatever the products are
+
+
+mutual_neighbors = jax.jit(
+    lambda query, candidate, with_second: checked.mutual_neighbors(
+        checked.round_query(query), checked.round_candidate(candidate), with_second=with_second
+    ),
+    static_argnames="with_second",
+)
+
+
+def features_of(rows):
+    return mfvpr.Features.of(np.zeros((len(rows), 2), np.float32), np.asarray(rows, np.float32), image_size=(9, 9))
+
+
+def test_sums_are_checked_where_bfloat16_loses_nothing():
+    """All products of a query are exactly equal, so only the order of sums tells the candidates apart."""
+    rng = np.random.default_rng(0)
+    values = np.asarray(jnp.asarray(rng.lognormal(sigma=3, size=700), jnp.bfloat16), np.float32)
+    queries = np.asarray(jnp.asarray(rng.uniform(0.1, 1, 8), jnp.bfloat16), np.float32)
+    wrong = 0
+    for query in queries:
+        rows0, rows1 = np.full((1, 700), query), np.stack([rng.permutation(values) for _ in range(12)])
+        pair = features_of(rows0), features_of(rows1)
+        neighbors, settled = mutual_neighbors(*pair, with_second=False)
+        assert settled
+        products = numpy_products(rows0, rows1)[0]
+        assert int(neighbors.match[0]) == int(products.argmax())
+        summed = checked._products(checked.round_query(pair[0]), checked.round_candidate(pair[1]))
+        wrong += int(np.argmax(summed[:12, 0]) != products.argmax())
+    assert wrong > 0  # or no sum had to be checked
+
+
+def test_too_many_second_neighbors_are_not_settled():
+    rng = np.random.default_rng(0)
+    query, near = unit(rng.normal(size=(2, DIMENSIONS)))
+    crowd = unit(near + 1e-6 * rng.normal(size=(checked.MOST_CHECKS + 4, DIMENSIONS)))
+    pair = features_of(query[None]), features_of([query, *crowd])
+    for with_second in (False, True):
+        assert mutual_neighbors(*pair, with_second=with_second)[1] == (not with_second)
+
+
+@pytest.mark.parametrize("with_ratio", [False, True])
+@pytest.mark.parametrize("noise", [0, 1e-4])
+def test_too_many_close_products_are_left_to_float32(noise, with_ratio):
+    """Equal descriptors, where the first index wins, and nearly equal ones."""
+    query, candidate = make_pair("random")
+    for side in (query, candidate):
+        side.descriptors[side.mask] = unit(query.descriptors[:1] + noise * side.descriptors[side.mask])
+    matches = rounded_once(query, stack([candidate]), with_ratio)
+    in_single = mfvpr.match_candidates(query, stack([candidate]), with_ratio=with_ratio, product="float32")
+    mask = np.asarray(in_single.mask)
+    assert (mask.sum() > 5) if noise else (np.flatnonzero(mask[0]).tolist() == [0])
+    np.testing.assert_array_equal(matches.mask, mask)
+    for name, values in per_match(in_single).items():
+        np.testing.assert_array_equal(np.asarray(getattr(matches, name))[mask], np.asarray(values)[mask])
+
+
+def assert_as_in_float32(query, candidate, monkeypatch):
+    """Whatever the guess says, matches are those of float32."""
+    in_single = nearest_neighbors.match(query, candidate, with_ratio=True)
+    mask = np.asarray(in_single.mask)
+    with monkeypatch.context() as patch:
+        for guess in (checked.tells_apart, lambda *_: jnp.bool_(False)):
+            patch.setattr(nearest_neighbors, "tells_apart", guess)
+            rounded = match_rounded(prepare_query(query), candidate, with_ratio=True)
+            np.testing.assert_array_equal(rounded.mask, mask)
+            np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
+def test_a_guess_leaves_equal_and_nearly_equal_images_to_float32(kind, monkeypatch):
+    query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))
+    if kind == "equal":
+        query.descriptors[:], candidate.descriptors[:] = query.descriptors[0], query.descriptors[0]
+    if kind == "three times":
+        for side in (query, candidate):
+            side.descriptors[:] = side.descriptors[np.arange(len(side.mask)) // 3 * 3]
+    if kind == "all padding":
+        query.mask[:] = False
+    assert_as_in_float32(query, candidate, monkeypatch)
+    tells_apart = checked.tells_apart(prepare_query(query), checked.round_candidate(nearest_neighbors.ready(candidate)))
+    assert tells_apart == (kind not in ("twins", "near twins", "equal", "three times"))
+
+
+@pytest.mark.parametrize("kind", ["infinite", "far too long", "rounded to infinity", "overflow"])
+def test_numbers_out_of_range_match_as_in_float32(kind):
+    rng = np.random.default_rng(1)
+    # So few that all can be checked.
+    query, candidate = make_features(rng, 14, dimension=256), make_features(rng, 12, capacity=15, dimension=256)
+    candidate.descriptors[:12] = unit(query.descriptors[:12] + 0.03 * rng.normal(size=(12, 256)))
+    candidate.descriptors[12:] = 5 * query.descriptors.sum(axis=0)  # padding
+    if kind == "infinite":
+        candidate.descriptors[11, 5] = np.inf
+    elif kind == "far too long":
+        query.descriptors[3] *= 1e20
+    elif kind == "rounded to infinity":
+        query.descriptors[3, 0] = 3.4e38
+    else:
+        query.descriptors[3], candidate.descriptors[:2] = 1.1513e18, np.array([[1.1513e18], [0.5757e18]])
+    batch = stack([candidate])
+    rounded = rounded_once(query, batch, True)
+    in_single = mfvpr.match_candidates(query, batch, with_ratio=True, product="float32")
+    mask = np.asarray(in_single.mask)
+    assert mask.sum() >= 2
+    np.testing.assert_array_equal(rounded.mask, mask)
+    for name, values in per_match(in_single).items():
+        np.testing.assert_array_equal(np.asarray(getattr(rounded, name))[mask], np.asarray(values)[mask])
+
+
+def test_features_of_images_match_as_in_float32_by_candidates_and_by_pairs():
+    sift = Sift(image_size=(160, 160), max_keypoints=150)
+    images = np.random.default_rng(0).integers(0, 256, (2, 20, 20, 3), np.uint8).repeat(8, axis=1).repeat(8, axis=2)
+    shifted = np.roll(images, (3, 5), axis=(1, 2))
+    query, *candidates = (description.features for description in sift(np.concatenate([images[:1], shifted])))
+    batch = stack(candidates)
+    queries, pairs = jax.tree.map(lambda leaf: leaf[None], query), np.array([[0, 0], [0, 1]], np.int32)
+    results = []
+    for product in ("float32", "bfloat16"):
+        matcher = mfvpr.NearestNeighborMatcher(product=product, chunk_size=1)
+        results += [mfvpr.match_candidates(query, batch, with_ratio=True, product=product)]
+        results += [match_pairs(queries, batch, pairs, 2, matcher)]
+    first = results[0]
+    assert first.mask.sum() > 50
+    for matches in results[1:]:
+        np.testing.assert_array_equal(matches.mask, first.mask)
+        for name, values in per_match(first).items():
+            np.testing.assert_array_equal(getattr(matches, name)[first.mask], values[first.mask])
+
+
+def test_the_product_is_no_part_of_a_matcher_s_recipe():
+    recipes = [recipe_of(mfvpr.NearestNeighborMatcher(product=product)) for product in (None, "bfloat16")]
+    assert recipes[0] == recipes[1]
+
+
+def test_no_pair_of_conversions_hides_what_rounding_takes_away():
+    query, _ = make_pair("random")
+    program = str(jax.make_jaxpr(checked.round_candidate)(query))
+    conversions = re.findall(r"(f32|bf16)\[[\d,]+\] = convert_element_type", program)
+    assert set(conversions) == {"bf16"}  # XLA may leave out a conversion to bfloat16 and back
+
+
+def test_other_devices_than_a_cpu_take_float32(monkeypatch):
+    query, candidate = make_pair("random")
+    batch = stack([candidate])
+    monkeypatch.setattr(nearest_neighbors, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    choose = partial(nearest_neighbors.choose_product, queries=query, candidates=batch, cross_check="mutual")
+    assert {choose(product, chunk_size=8) for product in (None, "bfloat16", "float32")} == {"float32"}
+    # A program that was traced for a CPU and is compiled for a GPU has no products of bfloat16.
+    function = jax.jit(partial(match_rounded, with_ratio=False)).trace(prepare_query(query), candidate)
+    products = {platform: "xbf16>) -> tensor" in function.lower(lowering_platforms=(platform,)).as_text()
+                for platform in ("cpu", "cuda")}  # fmt: skip
+    assert products == {"cpu": True, "cuda": False}
+
+
+def test_gradients_are_those_of_float32():
+    query, candidate = make_pair("random")
+
+    def total(descriptors, product):
+        features = replace(query, descriptors=descriptors)
+        matches = mfvpr.match_candidates(features, stack([candidate]), with_ratio=True, product=product)
+        return jnp.sum(mfvpr.masked(matches.distance * matches.ratio, matches.mask))
+
+    descriptors = np.where(query.mask[:, None], query.descriptors, 0)
+    in_single, rounded = (jax.grad(total)(descriptors, product) for product in ("float32", "bfloat16"))
+    assert np.abs(in_single).max() > 0
+    np.testing.assert_array_equal(rounded, in_single)
+
+
+def test_bfloat16_is_taken_for_long_descriptors_where_it_is_faster(monkeypatch):
+    rng = np.random.default_rng(0)
+    long, short = (make_features(rng, 4, dimension=dimension) for dimension in (256, 128))
+
+    def choose(features, cross_check="mutual", chunk_size=1):
+        return nearest_neighbors.choose_product(None, features, features, cross_check, chunk_size)
+
+    monkeypatch.setattr(nearest_neighbors, "has_bfloat16", lambda: True)
+    assert choose(long) == "bfloat16"
+    assert {choose(short), choose(long, "none"), choose(long, chunk_size=2)} == {"float32"}
+    monkeypatch.setattr(nearest_neighbors, "has_bfloat16", lambda: False)
+    assert choose(long) == "float32"
+    with pytest.raises(ValueError, match="expected cross_check=mutual"):
+        mfvpr.match_candidates(long, stack([long]), cross_check="none", product="bfloat16")
+    with pytest.raises(ValueError, match="expected cross_check=mutual and chunk_size=1; leave product out"):
+        nearest_neighbors.choose_product("bfloat16", long, long, "none", 2)
+    with pytest.raises(ValueError, match="product='half': expected one of bfloat16, float32"):
+        mfvpr.NearestNeighborMatcher(product="half")
+    with pytest.raises(ValueError, match="cross_check='x': expected one of"):
+        mfvpr.NearestNeighborMatcher(cross_check="x")
+    with pytest.raises(ValueError, match="expected one of bfloat16, float32"):
+        mfvpr.match_candidates(long, stack([long]), product="half")
+    pairs = np.zeros((2, 2), np.int32)
+    with pytest.raises(ValueError, match="chunk_size=1"):
+        match_pairs(*[stack([long])] * 2, pairs, 2, mfvpr.NearestNeighborMatcher(product="bfloat16", chunk_size=2))

@@ -1,0 +1,288 @@
+"""Contract of all scorers, beside what `mfvpr.testing` checks (test_testing.py)."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mfvpr
+from mfvpr import (
+    AggregatedScore,
+    AnchorPoints,
+    DescriptorDistanceWeight,
+    FeatureScoreWeight,
+    GridAnchors,
+    HistogramOfShifts,
+    Homography,
+    LostScore,
+    MatchCount,
+    RapidSpatialScore,
+    RatioWeight,
+    UnitWeight,
+    VisualPhrases,
+    score_candidates,
+    score_grid,
+)
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.scorer import with_static_functions
+from mfvpr.utils import InputError
+from tests.builders import SIZE, per_match, random_matches, stack
+from tests.core import batches
+from tests.core.batches import pair_of
+from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
+from tests.shapes import unchecked_shapes
+
+pytestmark = pytest.mark.thorough
+
+every_scorer = pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
+library_scorer = pytest.mark.parametrize("scorer", one_of_each_class(OWN), ids=title)
+_score_all = jax.jit(score_candidates)  # compiled once per shape: hence 60 slots, 5 pairs
+SIZES = np.array([SIZE, SIZE], np.float32)
+
+
+def fit(scorer):
+    """The scorer with the capacity that the tests' images need."""
+    return with_static_functions(with_capacity(scorer, SIZES, SIZES))
+
+
+def score(scorer, matches):
+    return batches.score(fit(scorer), matches)
+
+
+def score_all(scorer, pairs):
+    return _score_all(fit(scorer), stack(pairs))
+
+
+@every_scorer
+def test_neither_company_nor_order_nor_padding_matters(scorer):
+    """Each score within rounding of itself, however small beside those of others."""
+    order = np.random.default_rng(3).permutation(60)
+
+    def pairs(**padding):
+        counts = (0, 1, 60, 13, 37)
+        return [random_matches(np.random.default_rng(count), count, capacity=60, **padding) for count in counts]
+
+    expected = [score(scorer, pair) for pair in pairs()]
+    np.testing.assert_allclose(score_all(scorer, pairs()), expected, rtol=2e-6, atol=0)
+    for garbage in (np.inf, -1e30, 7.0):
+        shuffled = [per_match(pair, lambda rows: rows[order]) for pair in pairs(garbage=garbage)]
+        np.testing.assert_allclose(score_all(scorer, shuffled), expected, rtol=2e-6, atol=0)
+
+
+@every_scorer
+def test_a_masked_pair_may_have_any_size(scorer):
+    rng = np.random.default_rng(9)
+    pair, empty = random_matches(rng, 60), random_matches(rng, 0, capacity=60)
+    empty = replace(empty, image_size0=np.full(2, np.nan, np.float32), image_size1=np.zeros(2, np.float32))
+    scores = score_all(scorer, [pair, *[empty] * 4])
+    np.testing.assert_allclose(scores[0], score(scorer, pair), rtol=2e-6)
+    assert (scores[1:] == 0.0).all()
+    numbers = [leaf for leaf in jax.tree.leaves(scorer) if isinstance(leaf, float)]
+    if len(numbers) == len(jax.tree.leaves(scorer)) and not isinstance(scorer, Homography):  # which has no gradient
+        for gradient in jax.tree.leaves(jax.jit(jax.grad(score))(fit(scorer), empty)):
+            assert np.isfinite(gradient).all()
+
+
+@every_scorer
+@pytest.mark.parametrize(("candidates", "slots"), [(0, 60), (3, 0)])
+def test_no_slots_and_no_candidates(scorer, candidates, slots):
+    pair = per_match(random_matches(np.random.default_rng(0), 60), lambda rows: rows[:slots])
+    batch = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (candidates, *leaf.shape)), pair)
+    np.testing.assert_array_equal(_score_all(fit(scorer), batch), np.zeros(candidates))
+
+
+@every_scorer
+def test_integers_and_double_precision_mode_are_welcome(scorer):
+    matches = random_matches(np.random.default_rng(10), 60)
+    matches = replace(matches, points0=matches.points0.round(), points1=matches.points1.round())
+    integers = replace(matches, **{n: getattr(matches, n).astype(np.int32) for n in ("points0", "image_size0")})
+    expected = score(scorer, matches)
+    np.testing.assert_allclose(score(scorer, integers), expected, rtol=2e-6)
+    with jax.enable_x64(True):
+        got = score(scorer, jax.tree.map(jnp.asarray, matches))
+        assert got.dtype == jnp.float32
+        np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("scorer", "field", "word"),
+    [
+        (HistogramOfShifts, "align", "zero_centre"), (HistogramOfShifts, "direction", "x"),
+        (AnchorPoints, "window_mode", "x"), (AnchorPoints, "first", "reference"), (AnchorPoints, "cell_weight", "x"),
+        (AggregatedScore, "mean", "medain"), (RapidSpatialScore, "reach", "largest"), (LostScore, "form", "cosine"),
+        (VisualPhrases, "align", "min_edge"), (GridAnchors, "outside", "one"), (Homography, "measure", "most"),
+    ],
+)  # fmt: skip
+def test_misspelled_choices_raise(scorer, field, word):
+    with pytest.raises(ValueError, match=rf"{scorer.__name__}\({field}='{word}'\): expected one of"):
+        scorer(**{field: word})
+
+
+@pytest.mark.parametrize(
+    ("scorer", "values"),
+    [
+        (HistogramOfShifts, {"sigma": -3}), (HistogramOfShifts, {"temperature": np.nan}),
+        (HistogramOfShifts, {"shift_range": (10.0, -1.0)}), (AnchorPoints, {"tolerance": 0.0}),
+        (Homography, {"confidence": 1.5}), (VisualPhrases, {"cell_size": np.float64(-1)}),
+        (RapidSpatialScore, {"size": (0.0, 10.0)}), (AggregatedScore, {"temperature": -1}),
+    ],
+)  # fmt: skip
+def test_python_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
+    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected numbers from"):
+        scorer(**values)
+    scorer(**jax.tree.map(jnp.asarray, values))
+
+
+@pytest.mark.parametrize("name", ["points1", "scores0"])
+@pytest.mark.parametrize("scorer", [HistogramOfShifts(), AggregatedScore(), AnchorPoints()])
+def test_arrays_of_unequal_length_are_not_broadcast(scorer, name):
+    """`jax.tree.map` can make them, and checks nothing."""
+    matches = random_matches(np.random.default_rng(0), 5)
+    whole = getattr(matches, name)
+    with unchecked_shapes(), pytest.raises(InputError, match=f"Matches.{name}: expected shape"):
+        scorer(jax.tree.map(lambda leaf: leaf[:1] if leaf is whole else leaf, matches))
+    with (
+        unchecked_shapes(),
+        pytest.raises(InputError, match=r"weight: expected a weight for each of \[5\] matches, got an array \[1\]"),
+    ):
+        replace(scorer, weight=lambda matches: matches.distance[:1])(matches)
+
+
+def test_positions_of_the_arguments_are_the_papers_order():
+    unit = UnitWeight()
+    assert HistogramOfShifts(10.0, 5.0, unit) == HistogramOfShifts(bin_size=10.0, sigma=5.0, weight=unit)
+    assert AnchorPoints(12, 8, 2.0, unit) == AnchorPoints(num_bins=12, window=8, tolerance=2.0, weight=unit)
+
+
+def test_images_of_other_sizes_are_never_scored_with_too_few_bins():
+    """The first thing that users of JAX do; 64 bins would not hold these images."""
+    matches = stack([random_matches(np.random.default_rng(11), 30, sizes=((640, 480), (800, 600))) for _ in range(2)])
+    expected = score_candidates(HistogramOfShifts(), matches)
+    assert (expected > 0).all()
+    for scorer in (HistogramOfShifts(), Wrapped()):
+        for trace in (lambda scorer: _score_all(scorer, matches), lambda scorer: jax.jit(jax.vmap(scorer))(matches)):
+            with pytest.raises(ValueError, match=r"bin_size .*traced; .*max_bins="):
+                trace(scorer)
+    roomy = HistogramOfShifts().with_capacity(matches.image_size0, matches.image_size1)
+    np.testing.assert_allclose(_score_all(roomy, matches), expected, rtol=2e-6)
+    inner = score_candidates(HistogramOfShifts(sigma=18.0), matches)
+    np.testing.assert_allclose(
+        score_candidates(Wrapped(), matches), inner + 0.25 * score_candidates(MatchCount(), matches), rtol=2e-6
+    )
+
+
+def test_a_capacity_that_is_too_small_raises_unless_traced():
+    matches = stack([random_matches(np.random.default_rng(13), 30)])
+    with pytest.raises(InputError, match="max_bins=44: expected at least 45"):
+        score_candidates(HistogramOfShifts(max_bins=44), matches)
+    with pytest.raises(InputError, match=r"bin_size=0.5: .*1024.*1344"):
+        score_candidates(HistogramOfShifts(bin_size=0.5), matches)
+    assert np.isnan(_score_all(HistogramOfShifts(max_bins=44), matches)).all()
+    for refine in (False, True):
+        shift = jax.jit(lambda pair: HistogramOfShifts(max_bins=44).dominant_shift(pair, refine=refine))  # noqa: B023
+        assert np.isnan(shift(pair_of(matches))).all()
+
+
+def test_calls_with_other_numbers_compile_nothing(compilations):
+    matches = stack([random_matches(np.random.default_rng(count), 40 + count, capacity=64) for count in range(3)])
+    scorers = [HistogramOfShifts(), AnchorPoints(), AggregatedScore(temperature=3.0), Wrapped(), HistogramOfShifts()]
+
+    def score_everywhere(factor, pair):
+        for scorer in scorers:
+            score_candidates(jax.tree.map(lambda number: number * factor, scorer), matches)
+        HistogramOfShifts(sigma=20 * factor).dominant_shift(pair_of(matches, pair), refine=True)
+        axes = {"sigma": [5 * factor, 30.0], "bin_size": [4.9 + factor / 10, 15.0], "max_distance": [0.5, factor]}
+        jax.block_until_ready(score_grid(HistogramOfShifts(), matches, **axes))
+
+    score_everywhere(1.0, 0)
+    compilations.reset()
+    for factor in (0.99, 1.0, 1.01):
+        score_everywhere(factor, 1)
+    assert compilations.count == 0
+
+
+def test_a_function_that_changes_is_not_taken_for_what_it_was():
+    matches = stack([random_matches(np.random.default_rng(14), 30)])
+    closure = {"factor": 1.0}
+    weighted = HistogramOfShifts(weight=lambda matches: closure["factor"] * matches.scores0)
+    for scorer in (lambda matches: closure["factor"] * plain(matches), weighted):
+        closure["factor"] = 1.0
+        before = score_candidates(scorer, matches)
+        closure["factor"] = 2.0
+        np.testing.assert_allclose(score_candidates(scorer, matches), 2 * before, rtol=2e-6)
+
+
+@pytest.mark.first_case
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+@pytest.mark.parametrize("field", ["points0", "points1", "scores0", "distance", "ratio"])
+def test_one_match_that_is_no_number_leaves_no_score(field, broken):
+    """For one pair, in a batch, and in a grid; else such a pair would rank somewhere."""
+    pair = random_matches(np.random.default_rng(15), 20, capacity=24)
+    getattr(pair, field)[3] = broken
+    batch = stack([pair, random_matches(np.random.default_rng(16), 20, capacity=24)])
+    weight = {"distance": DescriptorDistanceWeight(), "ratio": RatioWeight()}.get(field, FeatureScoreWeight())
+    anchors = [(AnchorPoints(num_bins=num_bins, weight=weight), {"tolerance": [3.0]}) for num_bins in (15, 3)]
+    for scorer, axis in ((HistogramOfShifts(weight=weight), {"sigma": [22.5]}), *anchors):
+        assert np.isnan(score(scorer, pair))
+        for scores in (score_candidates(scorer, batch), score_grid(scorer, batch, **axis)[0]):
+            assert np.isnan(scores[0])
+            assert np.isfinite(scores[1])
+    assert np.isnan(score(AggregatedScore(weight=weight), pair))
+    assert np.isnan(HistogramOfShifts(weight=weight).dominant_shift(pair)).all()
+    rapid = RapidSpatialScore(), RapidSpatialScore(reach="largest_shift")
+    relatives = *rapid, VisualPhrases(), LostScore(), LostScore("described"), Homography(max_iterations=100.0)
+    for scorer in relatives if "points" in field else ():
+        assert np.isnan(score(scorer, pair))
+
+
+@library_scorer
+def test_small_types_score_as_the_same_values_in_single_precision(scorer):
+    """Half precision overflows at 65504, and bytes at 255."""
+    matches = random_matches(np.random.default_rng(17), 60)
+    halves = jax.tree.map(lambda leaf: leaf.astype(np.float16) if leaf.dtype == np.float32 else leaf, matches)
+    single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float16 else leaf, halves)
+    halves, single = (
+        replace(values, scores0=np.full(60, 200, dtype), scores1=np.full(60, 100, dtype))
+        for values, dtype in ((halves, np.uint8), (single, np.float32))
+    )
+    got = score(scorer, halves)
+    assert got.dtype == jnp.float32
+    np.testing.assert_allclose(got, score(scorer, single), rtol=2e-6)
+
+
+def test_ambiguous_names_too_many_cells_and_single_pairs_raise():
+    @mfvpr.value
+    class Near:
+        max_distance: float = 20.0
+        fitted: float = 1.0
+
+        def __call__(self, matches):
+            return self.max_distance * self.fitted * jnp.any(matches.mask).astype(jnp.float32)
+
+    batch = stack([random_matches(np.random.default_rng(18), 20)])
+    np.testing.assert_allclose(score_candidates(Near(), batch), 20.0)
+    with pytest.raises(ValueError, match=r"Near.max_distance: .*grid .*rename"):
+        score_grid(Near(), batch, max_distance=[1.0])
+    with pytest.raises(ValueError, match="num_bins=216"):
+        AnchorPoints(num_bins=216)
+    for wrong in (lambda pair: score_candidates(plain, pair), lambda pair: score_grid(plain, pair, max_distance=[1.0])):
+        with pytest.raises(ValueError, match=r"expected matches \[C, K, ...\] of candidates"):
+            wrong(pair_of(batch))
+
+
+def test_threads_of_a_grid_know_the_callers_context():
+    @mfvpr.value
+    class Random:
+        seed: int = 3
+
+        def __call__(self, matches):
+            drawn = jax.random.uniform(jax.random.key(self.seed), matches.mask.shape)
+            return jnp.sum(mfvpr.masked(drawn, matches.mask))
+
+    batch = stack([random_matches(np.random.default_rng(count), 20) for count in range(16)])
+    with jax.threefry_partitionable(False):
+        expected = score_candidates(Random(), batch)
+        np.testing.assert_allclose(score_grid(Random(), batch, max_distance=[3.0])[0], expected, rtol=1e-6)
+    assert (expected != score_candidates(Random(), batch)).any()
