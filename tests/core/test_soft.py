@@ -130,8 +130,9 @@ def test_soft_becomes_hard(scorer, seed):
 
 @each_scorer([HISTOGRAMS[0], ANCHORS[0], SUMS[1]])
 def test_a_grid_of_temperatures_equals_the_loop_and_is_nan_unless_above_zero(scorer):
-    matches, temperatures = random_matches(np.random.default_rng(6), 16), [-1.0, 0.0, 0.1, 0.3, 1.0]
-    grid = score_grid(replace(scorer, temperature=1), stack([matches]), temperature=temperatures)
+    matches, temperatures = random_matches(np.random.default_rng(6), 16), np.array([-1.0, 0.0, 0.1, 0.3, 1.0])
+    traced = jax.jit(lambda values: score_grid(replace(scorer, temperature=1), stack([matches]), temperature=values))
+    grid = traced(temperatures)
     loop = [score(replace(scorer, temperature=np.float32(t)), matches) for t in temperatures]
     np.testing.assert_allclose(grid[:, 0], loop, rtol=1e-5)
     assert np.isnan(loop).tolist() == [True, True, False, False, False]

@@ -204,7 +204,8 @@ def test_what_does_not_fit_is_nan(matches):
 
 @pytest.mark.parametrize("sigma", [0.0, -1.0, np.nan])
 def test_no_width_no_score(matches, sigma):
-    got = score_grid(HistogramOfShifts(bin_size=5.0), matches, sigma=[sigma, 9.0])
+    scorer = HistogramOfShifts(bin_size=5.0, max_bins=136)
+    got = jax.jit(lambda sigmas: score_grid(scorer, matches, sigma=sigmas))(np.array([sigma, 9.0]))
     np.testing.assert_array_equal(np.isnan(got[0]), matches.mask.any(1))
     assert np.isfinite(got[1]).all()
 

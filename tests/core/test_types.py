@@ -107,13 +107,13 @@ def test_the_program_of_a_sweep_is_that_of_its_class():
 
 PROGRAMS_OF_THEIR_OWN = {
     "features/network.py",  # of a new function, which has one model
-    "scoring/learned_weight.py",  # of matches alone
+    "baselines/learned_weight.py",  # of matches alone
     "tuning/learning/teaching.py",  # of a new function, which has one model
     "tuning/learning/training.py",  # of a new function, which has one kind of parameters
     "deployment/folders.py",  # of programs that were read from files
     "deployment/stablehlo.py",  # of a new function, which has one scorer
-    "matching/batched.py",  # of a new function, which has one matcher
-    "matching/lightglue.py",  # of networks of Flax, whose classes jit compares
+    "matchers/batched_matching.py",  # of a new function, which has one matcher
+    "matchers/lightglue_matcher.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",
     "tuning/sweeps/rankings.py",  # of a new function
     "testing.py",  # of new functions, each of which has one scorer

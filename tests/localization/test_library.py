@@ -218,5 +218,5 @@ def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
     settings = json.loads((tmp_path / "settings.json").read_text())
     settings["scorer"]["sigma"] = 30.0
     (tmp_path / "settings.json").write_text(json.dumps(settings))
-    with pytest.raises(InputError, match="got that of another one"):
+    with pytest.raises(InputError, match="got that of another system"):
         Map.open(tmp_path)
