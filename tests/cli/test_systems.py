@@ -100,7 +100,8 @@ def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path)
         assert (tmp_path / "saved" / file).read_bytes() == (tmp_path / "run" / file).read_bytes()
     street = mfvpr.Map(tmp_path / "map", system)
     street.build(data.database)
-    assert [street.localize(path).place for path in data.queries.paths] == names.tolist()
+    predictions = [street.localize(path) for path in data.queries.paths]  # also of images that are refused
+    assert [prediction.alternatives[0].name for prediction in predictions] == names.tolist()
 
 
 def test_the_command_runs_programs_and_refuses_others(monkeypatch, capsys):
