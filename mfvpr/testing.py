@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.core.batch import score_candidates
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import score_candidates
 from mfvpr.core.scorer import Scorer, on_host
 from mfvpr.core.types import Array, Matches, per_match
 from mfvpr.utils.errors import NoGradientError

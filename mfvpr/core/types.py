@@ -7,7 +7,7 @@ Matches also take lists, arrays of torch and other libraries (DLPack) on any dev
 """
 
 from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
@@ -71,15 +71,6 @@ def value(cls: Class) -> Class:
     return data
 
 
-def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
-    """Apply a function to the fields of a dataclass; the same object if none changes, or if it is no dataclass."""
-    if not is_dataclass(whole) or isinstance(whole, type):
-        return whole
-    parts = {part.name: getattr(whole, part.name) for part in fields(whole) if part.init}
-    changed = {name: new for name, part in parts.items() if (new := change(part)) is not part}
-    return replace(whole, **changed) if changed else whole
-
-
 def short_repr(self: Any) -> str:
     """`__repr__` of a dataclass with types and shapes in place of arrays, without None."""
     contents = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -103,8 +94,10 @@ def _check_arrays(self: Any) -> None:
         if name.startswith("image_size"):
             expected = (*(mask.shape[:-1] if name == "image_size" else np.shape(values)[:-1]), 2)
         if np.shape(values) != expected:
-            raise InputError(f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask "
-                             f"{list(mask.shape)}, got {list(np.shape(values))}")  # fmt: skip
+            raise InputError(
+                f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask {list(mask.shape)}, "
+                f"got {list(np.shape(values))}"
+            )
 
 
 @value

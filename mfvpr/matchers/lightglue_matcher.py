@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mfvpr.core.nearest_neighbors import at_least_one, distance_ratio, make_matches, ready, slot_numbers
-from mfvpr.core.similarity import lines_of, nearest
+from mfvpr.core.matching import at_least_one, distance_ratio, make_matches, slot_numbers
+from mfvpr.core.nearest import lines_of, nearest, ready
 from mfvpr.core.types import Features, Matches, short_repr, value
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError
