@@ -92,9 +92,15 @@ class Homography:
         order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         search = _Search(
-            self.measure, matches.confidence is None, normalized[order], counts[order], number, threshold,
-            max_iterations, probability,
-        )  # fmt: skip
+            self.measure,
+            matches.confidence is None,
+            normalized[order],
+            counts[order],
+            number,
+            threshold,
+            max_iterations,
+            probability,
+        )
         # The generator is named, because others draw different numbers in a batch.
         model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:

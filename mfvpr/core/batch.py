@@ -126,8 +126,7 @@ def score_settings(
             ]
         )
     else:
-        on_cpu = device_of(matches).platform == "cpu"
-        scores = _score_settings(scorer, matches, settings, weightings, on_cpu=on_cpu)
+        scores = _score_settings(scorer, matches, dict(settings), dict(weightings))
     require_real("scorer", scores)
     return scores
 
@@ -137,44 +136,35 @@ def _rows(values: Mapping[str, Array]) -> list[dict[str, Any]]:
     return [dict(zip(values, row, strict=True)) for row in zip(*columns, strict=True)] if columns else [{}]
 
 
-@partial(compiled, static_argnames="on_cpu")
+@compiled
 def _score_settings(
-    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array], *, on_cpu: bool
+    scorer: Any, matches: Matches, settings: Mapping[str, Array], weightings: Mapping[str, Array]
 ) -> Array:
-    if not shares_weightings(scorer):
+    at_once, is_shared = 1, shares_weightings(scorer)
+    if is_shared:
+        weigh = lambda varied, near: match_weights(varied.weight, near)  # noqa: E731
+        weights = jax.vmap(partial(_each_weighting, weigh, scorer, weightings))(matches)  # [C, W, K]
+        at_once = max(1, scorer.pairs_at_once(matches, weights.shape[1]) // max(1, len(weights)))
 
-        def score_pair(varied: Any, pair: Matches) -> Array:
-            def score(row: Mapping[str, Array]) -> Array:
-                weighted, near = _weigh(varied, pair, row)
-                return weighted(near)
-
-            return _map(score, weightings)
-
-        def score_setting(setting: Mapping[str, Array]) -> Array:
-            return jax.vmap(partial(score_pair, with_parameters(scorer, setting)), out_axes=-1)(matches)
-
-        return _map(score_setting, settings)
-
-    def weights_of(pair: Matches) -> Array:
-        def weigh(row: Mapping[str, Array]) -> Array:
-            weighted, near = _weigh(scorer, pair, row)
-            return match_weights(weighted.weight, near)
-
-        return jax.vmap(weigh)(dict(weightings)) if weightings else weigh({})[None]
-
-    weights = jax.vmap(weights_of)(matches)  # [C, W, K]
-    size = scorer.pairs_at_once(matches, weights.shape[1], on_cpu=on_cpu)
-
-    def score_shared(setting: Mapping[str, Array]) -> Array:
+    def score_setting(setting: Mapping[str, Array]) -> Float[Array, "weightings candidates"]:
         varied = with_parameters(scorer, setting)
-        pairs = matches, weights
-        return jax.lax.map(lambda pair: varied.score_weightings(*pair), pairs, batch_size=size).T
+        if is_shared:
+            return varied.score_weightings(matches, weights).T
+        score = lambda weighted, near: weighted(near)  # noqa: E731
+        return jax.vmap(partial(_each_weighting, score, varied, weightings), out_axes=-1)(matches)
 
-    return _map(score_shared, settings, at_once=1 if on_cpu else max(1, size // max(1, len(weights))))
+    return _map(score_setting, settings, at_once=at_once)
+
+
+def _each_weighting(
+    function: Callable[[Any, Matches], Array], scorer: Any, weightings: Mapping[str, Array], matches: Matches
+) -> Array:
+    """`function` of the scorer and the matches of one pair, by weighting."""
+    return _map(lambda weighting: function(*_weigh(scorer, matches, weighting)), weightings)
 
 
 def _weigh(scorer: Any, matches: Matches, weighting: Mapping[str, Array]) -> tuple[Any, Matches]:
-    """The scorer and the matches with one weighting."""
+    """The scorer and the matches of one pair with one weighting."""
     near = filter_matches(matches, max_distance=weighting.get("max_distance"))
     if "weight" not in weighting:
         return scorer, near

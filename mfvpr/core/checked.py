@@ -14,8 +14,8 @@ rounded product of x, and c the largest checked one, of the neighbor y:
 
 So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
 checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
-differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair, and
-at once if `tells_apart` says so.
+differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, or all together have many, as in
+images whose descriptors are nearly equal, float32 matches the pair.
 
 The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
 2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
@@ -47,13 +47,12 @@ from mfvpr.core.nearest import (
 )
 from mfvpr.core.types import Array, Features, value
 from mfvpr.utils.errors import require_word
-from mfvpr.utils.numerics import at_least_single, device_of, has_bfloat16
+from mfvpr.utils.numerics import at_least_single, device_of, has_bfloat16, masked
 
 LEAST_DIMENSIONS = 256  # with fewer, products of bfloat16 gain little
 MOST_CHECKS = 16  # of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
-_SAMPLE = 16  # keypoints of the query by which `tells_apart` guesses
-_WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
+WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
 _PARTS = 8  # into which the dimensions of a checked product are split
 _SMALL, _LARGE = 2.0**-126, 2.0**126
 
@@ -85,11 +84,8 @@ class RoundedQuery(Query):
             neighbors, settled = mutual_neighbors(rounded0, rounded1, with_second=with_second)
             return jax.lax.cond(settled, lambda: neighbors.of(query.features), in_single)
 
-        def on_cpu() -> Neighbors:
-            return jax.lax.cond(tells_apart(rounded0, rounded1), in_bfloat16, in_single)
-
         # Traced arrays do not say where they are: the program may be compiled for another device than the default.
-        return jax.lax.platform_dependent(cpu=on_cpu, default=in_single)
+        return jax.lax.platform_dependent(cpu=in_bfloat16, default=in_single)
 
 
 def prepare_query(
@@ -148,10 +144,15 @@ class _Direction(NamedTuple):
         return self.nearest.similarity - self.window
 
     @property
+    def count(self) -> Int[Array, " own"]:
+        """Number of keypoints that may be the nearest, at least if it is 0 or 1."""
+        count = count_from(self.lines, self.nearest, self.threshold)
+        return jnp.where(self.nearest.similarity > -jnp.inf, count, 0)
+
+    @property
     def is_close(self) -> Bool[Array, " own"]:
         """Whether several keypoints may be the nearest."""
-        several = count_from(self.lines, self.nearest, self.threshold) > 1
-        return several & (self.nearest.similarity > -jnp.inf)
+        return self.count > 1
 
 
 def round_query(features: Features) -> Rounded:
@@ -184,37 +185,23 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     to1, to0 = _direction(products, 0, query, candidate), _direction(products, 1, candidate, query)
     # A keypoint without a product that is close to both largest ones has no match.
     close_to_both = products >= jnp.maximum(to1.threshold[None], to0.threshold[:, None])
-    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0))
     has_neighbor = to1.nearest.similarity > -jnp.inf
+    excess = masked(to1.count.astype(jnp.float32) - WORTHWHILE_CHECKS, has_neighbor)
+    is_worthwhile = jnp.sum(excess) <= 0
+    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0) & is_worthwhile)
     may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
     is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
-    index0, settled0 = _settle(to0, to0.is_close & is_chosen)
+    index0, settled0 = _settle(to0, to0.is_close & is_chosen & is_worthwhile)
     longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
-    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
+    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0 & is_worthwhile
     settled &= longest0 * longest1 < _LARGE  # False for NaN
     if not with_second:
         return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
     rest = to1._replace(lines=lines, nearest=nearest(lines))
-    second, settled2 = _settle(rest, rest.is_close & is_match)
+    second, settled2 = _settle(rest, rest.is_close & is_match & is_worthwhile)
     neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
     return neighbors, settled & settled2
-
-
-def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
-    """Whether products differ enough for `mutual_neighbors`: a guess by a few keypoints, which saves time.
-
-    Without it, images whose descriptors are equal or nearly equal would cost both kinds of products.
-    """
-    step = max(1, len(query.norm) // _SAMPLE)
-    sample = query._replace(
-        descriptors=query.descriptors[:, ::step], norm=query.norm[::step], residual=query.residual[::step]
-    )
-    products = _products(sample, candidate)
-    largest = jnp.max(products, axis=0)
-    possible = jnp.sum(products >= (largest - _window(sample, candidate))[None], axis=0)
-    checks = jnp.minimum(possible, MOST_CHECKS + 1).astype(jnp.float32)
-    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _WORTHWHILE_CHECKS, 0.0)) <= 0
 
 
 def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 keypoints0"]:
@@ -263,14 +250,16 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
         first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
         number, _, best, _ = jax.lax.while_loop(
             lambda state: (state[0] < end).any() & (state[3] < MOST_CHECKS),
-            check, (first, lowest, index[keypoints], jnp.int32(0)),
-        )  # fmt: skip
+            check,
+            (first, lowest, index[keypoints], jnp.int32(0)),
+        )
         return start + size, index.at[places].set(best, mode="drop"), (number == end).all()
 
     _, index, settled = jax.lax.while_loop(
         lambda state: (state[0] < jnp.sum(wanted)) & state[2],
-        settle_group, (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
-    )  # fmt: skip
+        settle_group,
+        (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
+    )
     return index, settled
 
 

@@ -8,7 +8,7 @@ number, and the peak between bins.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from mfvpr.core.shifts import image_sizes, match_shifts, require_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import Weight, match_weights, weight_field
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import compiled, is_concrete, masked, positive, round_up, safe_sqrt
+from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt
 
 MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
 PAIRS_AT_ONCE = 8  # on a CPU, divided by the weightings: few and long operations that still stay in the cache
@@ -98,30 +98,38 @@ class HistogramOfShifts:
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""
-        return self.score_weightings(matches, match_weights(self.weight, matches)[None])[0]
+        shifts, bins, weights = self._shifts(matches), self._bins(matches), match_weights(self.weight, matches)[None]
+        return _where_usable(self._maxima(shifts, bins, weights), matches, shifts, bins, weights)[0]
 
-    def score_weightings(
-        self, matches: Matches, weights: Float[Array, "weightings slots"]
+    def _maxima(
+        self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
     ) -> Float[jax.Array, " weightings"]:
-        """Scores of one pair with several weights of its matches (0 on padding), of which all share the Gaussians."""
-        shifts, bins = self._shifts(matches), self._bins(matches)
+        """The (smooth) maximum over bins of one pair for each weighting of its matches (0 on padding)."""
         votes_x, votes_y, inside = bins.votes(0, shifts), bins.votes(1, shifts), bins.inside
 
-        def score(weights: Float[Array, " slots"]) -> Float[Array, ""]:
+        def maximum(weights: Float[Array, " slots"]) -> Float[Array, ""]:
             scores = bin_scores(votes_x, votes_y, weights)
             if self.temperature is None:
                 return jnp.max(scores)  # without `inside`: bins beyond the last only repeat it
             return smooth_maximum(scores, inside, temperature=positive(self.temperature, scores.dtype))
 
         if len(weights) == 1:
-            scores = score(weights[0])[None]
-        else:  # one after the other they stay in the cache of a CPU; an accelerator needs long operations
-            scores = jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, score), default=jax.vmap(score))
-        return _where_usable(scores, matches, shifts, weights, bins)
+            return maximum(weights[0])[None]
+        # One after the other they stay in the cache of a CPU; an accelerator needs long operations.
+        return jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, maximum), default=jax.vmap(maximum))
 
-    def pairs_at_once(self, matches: Matches, num_weightings: int, *, on_cpu: bool) -> int:
+    def score_weightings(
+        self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
+    ) -> Float[jax.Array, "candidates weightings"]:
+        """Scores of candidates `[C, K, ...]` with several weights of their matches, which share the Gaussians."""
+        shifts, bins = jax.vmap(self._shifts)(matches), jax.vmap(self._bins)(matches)
+        size = self.pairs_at_once(matches, weights.shape[1])
+        maxima = jax.lax.map(lambda pair: self._maxima(*pair), (shifts, bins, weights), batch_size=size)
+        return jax.vmap(_where_usable)(maxima, matches, shifts, bins, weights)
+
+    def pairs_at_once(self, matches: Matches, num_weightings: int) -> int:
         """Pairs whose votes and bins are to exist at the same time."""
-        if on_cpu:
+        if device_of(()).platform == "cpu":
             return max(1, PAIRS_AT_ONCE // num_weightings)
         capacity = self._capacity(matches)
         return max(1, CHUNK // (4 * num_weightings * capacity * (matches.mask.shape[-1] + capacity)))
@@ -251,7 +259,7 @@ class HistogramOfShifts:
         return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
 
 
-@dataclass(frozen=True)
+@value
 class _Bins:
     """Bins of one pair, and the width of the votes, px."""
 
@@ -260,7 +268,7 @@ class _Bins:
     bin_size: Float[Array, ""]
     deviation: Float[Array, ""]  # sigma of equation 1
     truncate: Float[Array, ""]  # sigmas
-    capacity: int
+    capacity: int = field(metadata={"static": True})
 
     @property
     def index(self) -> Float[Array, " bins"]:
@@ -316,8 +324,8 @@ def _where_usable(
     values: Float[Array, "*"],
     matches: Matches,
     shifts: Float[Array, "2 slots"],
-    weights: Float[Array, "_ slots"],
     bins: _Bins,
+    weights: Float[Array, "_ slots"],
 ) -> Float[jax.Array, "*"]:
     """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
     usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
@@ -336,7 +344,7 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
             reach = jnp.asarray(scorer.shift_range, shift.dtype)
             shift = jnp.clip(shift, -reach, reach)
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
-    return _where_usable(shift, matches, shifts, weights[None], bins)
+    return _where_usable(shift, matches, shifts, bins, weights[None])
 
 
 @compiled

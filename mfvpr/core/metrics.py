@@ -73,8 +73,6 @@ class _Matrix:
     def contains(self, rows: np.ndarray) -> Bool[np.ndarray, "queries k"]:
         """See `Positives`."""
         queries, size = self.matrix.shape
-        if len(rows) != queries:
-            raise InputError(f"rows: expected shape [{queries} queries, k], got {list(rows.shape)}")
-        if rows.size and (rows.dtype.kind not in "iu" or rows.max() >= size):
-            raise InputError(f"rows: expected whole numbers below {size}, got {rows.dtype} up to {rows.max()}")
+        if len(rows) != queries or (rows.size and (rows.dtype.kind not in "iu" or rows.max() >= size)):
+            raise InputError(f"order: expected rows below {size} of {queries} queries, got {rows.dtype}{rows.shape}")
         return np.take_along_axis(self.matrix, np.maximum(rows, 0).astype(int), axis=1) & (rows >= 0)

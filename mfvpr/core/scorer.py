@@ -36,9 +36,9 @@ class Scorer(Protocol):
     - `score_pairs(matches) -> [P]`, for a scorer that JAX cannot compile, for instance of another library: takes pairs
       `[P, K, ...]`, returns NumPy, and is called outside of `jit` in place of the function of one pair.
     - `fit_capacity(image_size0, image_size1, multiple) -> scorer`, for static sizes that follow from image sizes.
-    - `score_weightings(matches, weights) -> [W]`, for scores of one pair with weights `[W, K]` that share most of their
-      work, and `pairs_at_once(matches, num_weightings, on_cpu) -> int`, the number of pairs whose work fits in memory.
-      A grid calls them for the axes `weight` and `max_distance`.
+    - `score_weightings(matches, weights) -> [C, W]`, for candidates `[C, K, ...]` and weights of their matches
+      `[C, W, K]`, that share most of the work, and `pairs_at_once(matches, num_weightings) -> int`, how many pairs to
+      work on at the same time. Grids call them.
     """
 
     def __call__(self, matches: Matches, /) -> Array: ...

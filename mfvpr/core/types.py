@@ -40,9 +40,8 @@ def value(cls: Class) -> Class:
 
     A compiled program keeps the code of its methods and the values of globals: define the class again to change them.
 
-    `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 at least compares its
-    nodes without their class. The programs of this library tell the classes apart. With such classes, a `jit` of your
-    own may run the program of another class if hashes collide.
+    `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 compares its nodes
+    without their class: with such classes, a `jit` of your own may run the program of another class.
     """
     data: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
     static = [f.name for f in fields(data) if f.metadata.get("static")]

@@ -24,9 +24,12 @@ PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, a
 
 
 def score(
-    scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
+    scorers: Mapping[str, Scorer],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    *,
     runtime: Runtime = DEFAULT_RUNTIME,
-) -> dict[str, Scores]:  # fmt: skip
+) -> dict[str, Scores]:
     """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values

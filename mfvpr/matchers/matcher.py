@@ -112,8 +112,10 @@ def _require_rows(pairs: Int[Array, "pairs 2"], queries: Features, candidates: F
     if np.ndim(pairs) != 2 or not len(pairs) or np.shape(pairs)[1] != 2:
         raise InputError(f"pairs: expected rows of queries and candidates [P, 2], got shape {np.shape(pairs)}")
     if is_concrete(pairs) and ((np.asarray(pairs) < 0) | (np.asarray(pairs) >= images)).any():
-        raise InputError(f"pairs: expected rows of {images[0]} queries and {images[1]} candidates, got rows from "
-                         f"{np.min(pairs)} to {np.max(pairs)}")  # fmt: skip
+        raise InputError(
+            f"pairs: expected rows of {images[0]} queries and {images[1]} candidates, got rows from "
+            f"{np.min(pairs)} to {np.max(pairs)}"
+        )
 
 
 @partial(compiled, static_argnames="chunk_size")

@@ -120,10 +120,18 @@ def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):
         assert words in stderr
 
 
-@pytest.mark.parametrize("provenance", [
-    {"data_sets": ["a", "b"]}, {"data_sets": 5}, {"data_fingerprint": ["x"]}, {"data_fingerprint": {"database": ["x"]}},
-    {"settings": None}, {"settings": {"features": "sift"}}, {"data_sets": [{"data_fingerprint": {"query": None}}]},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "provenance",
+    [
+        {"data_sets": ["a", "b"]},
+        {"data_sets": 5},
+        {"data_fingerprint": ["x"]},
+        {"data_fingerprint": {"database": ["x"]}},
+        {"settings": None},
+        {"settings": {"features": "sift"}},
+        {"data_sets": [{"data_fingerprint": {"query": None}}]},
+    ],
+)
 def test_any_provenance_is_allowed(run, file, tmp_path, provenance):
     write_weight(file, WEIGHT, provenance)
     code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / "out"))

@@ -84,7 +84,8 @@ def test_accelerators_score_settings_and_pairs_together(chunk, temperature, monk
     expected = score_grid(scorer, pairs, **axes)
     jax.clear_caches()
     monkeypatch.setattr(histogram, "CHUNK", chunk)
-    monkeypatch.setattr(batch_module, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    for module in (batch_module, histogram):
+        monkeypatch.setattr(module, "device_of", lambda _: SimpleNamespace(platform="gpu"))
     np.testing.assert_allclose(score_grid(scorer, pairs, **axes), expected, rtol=1e-6)
 
 
