@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float
 
 from mfvpr.cli.launch import Parser, run_command
 from mfvpr.cli.systems import load_system
-from mfvpr.core.metrics import reliability
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.rankings import RETRIEVAL
+from mfvpr.evaluation.reliability import reliability
 from mfvpr.localization.calibration import data_of_drive
 from mfvpr.storage import FeatureCache
 

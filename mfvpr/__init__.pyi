@@ -11,7 +11,7 @@ from .retrieval.search import retrieve
 from .matchers.host_matcher import HostMatcher
 from .matchers.lightglue_matcher import LightGlueMatcher
 from .matchers.matcher import Matcher, NearestNeighborMatcher, match_pairs
-from .core.nearest_neighbors import compact, filter_matches, match, match_candidates
+from .core.matching import compact, filter_matches, match, match_candidates
 from .matchers.soft import soft_match
 
 # weights of matches
@@ -25,9 +25,8 @@ from .core.weights import (
 )
 
 # scores of one pair
-from .core.aggregate import AggregatedScore
+from .core.aggregate import AggregatedScore, MatchCount
 from .core.anchor import AnchorPoints
-from .core.counting import MatchCount
 from .baselines.grid_anchors import GridAnchors
 from .core.histogram import HistogramOfShifts, ShiftHistogram
 from .baselines.homography import Homography
@@ -37,8 +36,9 @@ from .baselines.phrases import VisualPhrases
 from .baselines.rapid import RapidSpatialScore
 
 # scores of all candidates, whole grids of parameters, fusion and ranking
-from .core.grids import score_grid
-from .core.ranking import balancing_c, combine, rank, rerank, score_candidates
+from .core.batch import score_candidates, score_grid
+from .core.ranking import combine, rank, rerank
+from .evaluation.shortlist_scores import balancing_c
 
 # data sets, what is correct, and recall
 from . import datasets

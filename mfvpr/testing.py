@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.core.batch import score_candidates
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import score_candidates
 from mfvpr.core.scorer import Scorer, on_host
 from mfvpr.core.types import Array, Matches, per_match
 from mfvpr.utils.errors import NoGradientError
@@ -109,10 +109,16 @@ def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
 
 def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
     for garbage in (np.inf, -1e30, 7.0):
-        close(scorer(_pad(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; take "
-              "values by mfvpr.masked(values, matches.mask)")  # fmt: skip
-    close(scorer(_pad(pair, np.nan, SLOTS + 16)), score, "more slots of padding change the score; count with "
-          "matches.mask, not with the number of slots")  # fmt: skip
+        close(
+            scorer(_pad(pair, garbage, SLOTS)),
+            score,
+            f"padding that holds {garbage} changes the score; take values by mfvpr.masked(values, matches.mask)",
+        )
+    close(
+        scorer(_pad(pair, np.nan, SLOTS + 16)),
+        score,
+        "more slots of padding change the score; count with matches.mask, not with the number of slots",
+    )
 
 
 def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
@@ -136,8 +142,10 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: Callable[..., None]) 
         expected = changed(pair)
         close(score(changed, pair), expected, "jit scores other numbers otherwise than without; use jax.numpy on them")
     if len(traces) > 1:
-        raise AssertionError(f"{len(traces)} traces for three sets of numbers, expected one: keep numbers as they are "
-                             "given, and what changes shapes in static fields")  # fmt: skip
+        raise AssertionError(
+            f"{len(traces)} traces for three sets of numbers, expected one: keep numbers as they are "
+            "given, and what changes shapes in static fields"
+        )
 
 
 def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, Array]]]:

@@ -68,14 +68,25 @@ def make_features(rng, count, *, capacity=None, dimension=16, size=SIZE, garbage
     )
 
 
-def make_matches(points0, points1, *, count0=None, count1=None, capacity=None, garbage=np.nan,
-                 sizes=((SIZE, SIZE), (SIZE, SIZE)), **entries):  # fmt: skip
+def make_matches(
+    points0,
+    points1,
+    *,
+    count0=None,
+    count1=None,
+    capacity=None,
+    garbage=np.nan,
+    sizes=((SIZE, SIZE), (SIZE, SIZE)),
+    **entries,
+):
     """Matches of one pair from real entries; the padding holds `garbage`.
 
     `entries` have a value per match: distance, scores0, scores1 (0.5 if missing), ratio, confidence, index0, index1.
     """
-    real = {name: np.asarray(points, np.float32).reshape(-1, 2) for name, points in
-            (("points0", points0), ("points1", points1))}  # fmt: skip
+    real = {
+        name: np.asarray(points, np.float32).reshape(-1, 2)
+        for name, points in (("points0", points0), ("points1", points1))
+    }
     count = len(real["points0"])
     capacity = capacity or max(count, 1)
     entries = {name: values for name, values in entries.items() if values is not None}

@@ -61,8 +61,9 @@ def lost_distance(points0, points1, distance, confidence, *, form="weighted", mi
     length = math.sqrt(math.fsum(c[k] * weights[k] ** 2 for k in matches))
     if length == 0:
         return math.inf
-    cosine_distance = _cosine_distance([w * x for w, x in zip(weights, x0, strict=True)],
-                             [w * x for w, x in zip(weights, x1, strict=True)], c)  # fmt: skip
+    cosine_distance = _cosine_distance(
+        [w * x for w, x in zip(weights, x0, strict=True)], [w * x for w, x in zip(weights, x1, strict=True)], c
+    )
     return cosine_distance / length / math.fsum(c)
 
 

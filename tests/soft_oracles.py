@@ -40,8 +40,23 @@ def _memberships(points, size, num_bins, temperature):
     return members
 
 
-def anchor_points(points0, points1, weights, confidence, size0, size1, *, temperature, num_bins, window, tolerance,
-                  window_mode="half_floor", first="query", include_self=True, cell_weight="winner_sum"):  # fmt: skip
+def anchor_points(
+    points0,
+    points1,
+    weights,
+    confidence,
+    size0,
+    size1,
+    *,
+    temperature,
+    num_bins,
+    window,
+    tolerance,
+    window_mode="half_floor",
+    first="query",
+    include_self=True,
+    cell_weight="winner_sum",
+):
     """Every anchor's mean target under V^(1/T), supported by the occupied cells of its window."""
     anchors, targets = (
         _memberships(points, size, num_bins, temperature) for points, size in ((points0, size0), (points1, size1))

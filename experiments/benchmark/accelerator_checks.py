@@ -14,7 +14,7 @@ from flax import nnx
 import mfvpr
 from experiments.benchmark import networks
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.nearest_neighbors import products
+from mfvpr.core.nearest import products
 from mfvpr.core.types import Features, Matches
 from mfvpr.networks.imagenet import preprocess
 from mfvpr.retrieval.search import ExactSearch

@@ -46,11 +46,14 @@ class GridAnchors:
     def __post_init__(self) -> None:
         check_plain(self)
         if self.side < 1 or not 1 <= self.size <= self.side or self.size % 2 == 0:
-            raise InputError(f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd "
-                             "patch up to it")  # fmt: skip
+            raise InputError(
+                f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd patch up to it"
+            )
         if self.side**2 * self.size**2 > LARGEST:
-            raise InputError(f"GridAnchors(side={self.side}, patch={self.patch}): expected scores up to 2^24, which "
-                             "float32 holds exactly; choose fewer cells")  # fmt: skip
+            raise InputError(
+                f"GridAnchors(side={self.side}, patch={self.patch}): expected scores up to 2^24, which "
+                "float32 holds exactly; choose fewer cells"
+            )
 
     @property
     def size(self) -> int:

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.baselines import planes
+from mfvpr.baselines.rapid import query_features
 from mfvpr.core.parameters import check_plain, choice, flag, integer, number
-from mfvpr.core.shifts import query_features, require_sizes
+from mfvpr.core.shifts import require_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
 from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
@@ -91,9 +92,15 @@ class Homography:
         order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         search = _Search(
-            self.measure, matches.confidence is None, normalized[order], counts[order], number, threshold,
-            max_iterations, probability,
-        )  # fmt: skip
+            self.measure,
+            matches.confidence is None,
+            normalized[order],
+            counts[order],
+            number,
+            threshold,
+            max_iterations,
+            probability,
+        )
         # The generator is named, because others draw different numbers in a batch.
         model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:

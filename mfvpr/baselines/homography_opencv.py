@@ -42,8 +42,10 @@ class OpenCvHomography:
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
         """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""
         if not is_concrete((self, matches)):
-            raise InputError("homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
-                             "OpenCV runs outside of JAX; call score_candidates, or take Homography")  # fmt: skip
+            raise InputError(
+                "homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
+                "OpenCV runs outside of JAX; call score_candidates, or take Homography"
+            )
         check_bounds(self)  # OpenCV replaces a threshold of 0 by 3 px
         points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
         real = np.asarray(matches.mask)
@@ -72,7 +74,11 @@ class OpenCvHomography:
             return len(points) if self.few == "count" else 0
         estimator = {"ransac": cv2.RANSAC, "magsac": cv2.USAC_MAGSAC}[self.estimator]
         _, inliers = cv2.findHomography(
-            points[:, :2], points[:, 2:], estimator, float(self.threshold), maxIters=round(float(self.max_iterations)),
+            points[:, :2],
+            points[:, 2:],
+            estimator,
+            float(self.threshold),
+            maxIters=round(float(self.max_iterations)),
             confidence=float(self.confidence),
-        )  # fmt: skip
+        )
         return 0 if inliers is None else inliers.sum()

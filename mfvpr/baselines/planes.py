@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
@@ -17,8 +16,6 @@ ROUND = 256  # maximum number of samples of a round
 _DRAWS = 6 * ROUND  # draws for a round: a fifth of all draws of random points keep their orientations
 _TRIANGLES = (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)
 _FLAT = 1e-6  # area of a triangle, relative to its sides, that rounding can produce
-_BLOCK = 64  # of `_running_count`
-_TRIANGLE = np.tri(_BLOCK, dtype=np.float32).T
 _STEPS = 10  # of the least squares, as in OpenCV
 _MIN_CURVATURE = 1e-9  # keeps the system solvable if the inliers do not determine a parameter
 _EXACT = jax.lax.Precision.HIGHEST
@@ -61,10 +58,10 @@ def draw_samples(
     image, or some but not all triangles change their orientation.
     """
     index = jax.lax.optimization_barrier(draw_four(key, round_number, count))  # each coordinate would draw again
-    number = _running_count(~_is_degenerate(_gather(points, index)))
-    draws = jnp.searchsorted(number, jnp.arange(1, ROUND + 1, dtype=number.dtype), method="scan_unrolled")
+    number = jnp.cumsum(~_is_degenerate(_gather(points, index)), dtype=jnp.int32)
+    draws = jnp.searchsorted(number, jnp.arange(1, ROUND + 1, dtype=jnp.int32), method="scan_unrolled")
     index = index.at[:, jnp.minimum(draws, _DRAWS - 1)].get(mode="promise_in_bounds")
-    return _gather(points, index), jnp.minimum(number[-1].astype(jnp.int32), ROUND)
+    return _gather(points, index), jnp.minimum(number[-1], ROUND)
 
 
 def areas(x: Float[Array, "4 ..."], y: Float[Array, "4 ..."]) -> tuple[Array, Array, Array, Array]:
@@ -92,13 +89,6 @@ def _is_degenerate(samples: Float[Array, "coordinates=4 matches=4 samples"]) -> 
             flat.append(jnp.abs(area) <= _FLAT * sides)
     number = jnp.sum(jnp.stack(same_orientation), axis=0)
     return ((number != 0) & (number != len(same_orientation))) | jnp.any(jnp.stack(flat), axis=0)
-
-
-def _running_count(hits: Bool[Array, " samples"]) -> Float[Array, " samples"]:
-    """Cumulative sum of booleans; a matrix product is faster than a scan."""
-    within = jnp.matmul(hits.astype(jnp.float32).reshape(-1, _BLOCK), _TRIANGLE)
-    before = jnp.cumsum(within[:, -1]) - within[:, -1]
-    return (within + before[:, None]).reshape(-1)
 
 
 def _mix(code: Array) -> Array:

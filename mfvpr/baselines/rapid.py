@@ -5,9 +5,10 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from mfvpr.core.parameters import check_plain, choice, flag, numbers
-from mfvpr.core.shifts import image_sizes, match_shifts, query_features
+from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_finite
 
 
@@ -64,3 +65,12 @@ class RapidSpatialScore:
             points = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
             reach = jnp.maximum(*map(largest, points))
         return jnp.where(jnp.any(real), reach, 0.0)
+
+
+def query_features(matches: Matches) -> Float[jax.Array, ""]:
+    """Number of the query's keypoints, at least 1, float32: divisor of scores per feature."""
+    if matches.count0 is None:
+        raise InputError(
+            "per_feature=True: expected matches that know how many keypoints the query has (count0), got None"
+        )
+    return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)

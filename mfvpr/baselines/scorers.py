@@ -6,9 +6,8 @@ from mfvpr.baselines.homography_opencv import OpenCvHomography
 from mfvpr.baselines.lost import LostScore
 from mfvpr.baselines.phrases import VisualPhrases
 from mfvpr.baselines.rapid import RapidSpatialScore
-from mfvpr.core.aggregate import AggregatedScore
+from mfvpr.core.aggregate import AggregatedScore, MatchCount
 from mfvpr.core.anchor import AnchorPoints
-from mfvpr.core.counting import MatchCount
 from mfvpr.core.histogram import HistogramOfShifts
 
 SCORERS: dict[str, type] = {

@@ -56,8 +56,14 @@ def _weight(names: list[str], content: Mapping[str, Any]) -> LearnedWeight:
     with np.errstate(over="ignore"):
         arrays = {name: values.astype(np.float32) for name, values in plain.items()}
     inputs, hidden = len(names), arrays["output"].size
-    shapes = {"center": (inputs,), "scale": (inputs,), "hidden": (inputs, hidden), "hidden_bias": (hidden,),
-              "output": (hidden,), "output_bias": ()}  # fmt: skip
+    shapes = {
+        "center": (inputs,),
+        "scale": (inputs,),
+        "hidden": (inputs, hidden),
+        "hidden_bias": (hidden,),
+        "output": (hidden,),
+        "output_bias": (),
+    }
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} of shape {list(arrays[name].shape)}, expected finite numbers {list(shape)}")

@@ -4,16 +4,19 @@ They are files because --help and a wrong setting must not wait for JAX.
 """
 
 from collections.abc import Iterator, Mapping
+from inspect import getmodule
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from mfvpr.baselines import ALONE, PAPER, SCORERS
-from mfvpr.core.parameters import parameters_of, summary
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.core.parameters import Parameter, parameters_of
 from mfvpr.systems.settings import CONF
 from mfvpr.utils.files import write_text
 
+_COUNT = "The number of matches as a score, the re-ranking of SelaVPR (Lu et al., ICLR 2024)."
 _FIRST = "# Made by `make conf` from mfvpr/core and mfvpr/baselines: change it there.\n"
 
 # Scorers with other values than their fields' defaults, by name.
@@ -48,7 +51,7 @@ def files() -> dict[str, str]:
         texts[f"scorer/{name}.yaml"] = "\n".join([f"# {about}", "defaults:", *entries])
     texts["axes.yaml"] = "\n".join(_axes())
     limits = {
-        name: {field: parameter.limits for field, parameter in parameters_of(scorer).items()}
+        name: {field: _limits(field, parameter) for field, parameter in parameters_of(scorer).items()}
         for name, scorer in SCORERS.items()
     }
     texts["rules.yaml"] = yaml.safe_dump(limits, sort_keys=False, default_flow_style=None).strip()
@@ -65,7 +68,8 @@ def write_declared_files(conf: Path) -> None:
 
 
 def _scorer(method: str) -> Iterator[str]:
-    yield f"# {summary(SCORERS[method])}"
+    of_module = (getmodule(SCORERS[method]).__doc__ or method).splitlines()[0]
+    yield f"# {_COUNT if method == 'count' else of_module}"
     yield f"method: {method}"
     yield from _values(method, {name: field.default for name, field in parameters_of(SCORERS[method]).items()})
 
@@ -75,7 +79,23 @@ def _values(method: str, values: Mapping[str, Any]) -> Iterator[str]:
     for name, value in values.items():
         field = parameters_of(SCORERS[method])[name]
         of_a_list = "a list: a scorer of each" if name == "weight" else ""
-        yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, field.words, of_a_list))))
+        yield _line(name, value, "; ".join(filter(None, (field.unit, field.note, _words(name, field), of_a_list))))
+
+
+def _limits(name: str, parameter: Parameter) -> dict[str, Any]:
+    """Limits of a plain value, themselves plain, by name; limits that are not set are left out."""
+    kind = "choices" if parameter.choices else "whole" if parameter.whole else "number"
+    choices = [*NAMED_WEIGHTS] if name == "weight" else list(parameter.choices)
+    limits = {kind: choices or list(parameter.bounds), "length": parameter.length}
+    limits |= {"optional": parameter.default is None, "file": SUFFIX if name == "weight" else ""}
+    return {name: limit for name, limit in limits.items() if limit}
+
+
+def _words(name: str, parameter: Parameter) -> str:
+    """The choices that are words, separated by commas."""
+    if name == "weight":
+        return ", ".join([*NAMED_WEIGHTS, f"FILE{SUFFIX}"])
+    return ", ".join(word for word in parameter.choices if isinstance(word, str))
 
 
 def _axes() -> Iterator[str]:
@@ -84,7 +104,7 @@ def _axes() -> Iterator[str]:
     for name, scorer in SCORERS.items():
         for field, parameter in parameters_of(scorer).items():
             if parameter.swept:
-                owners.setdefault(field, {})[name] = parameter.unit or parameter.words
+                owners.setdefault(field, {})[name] = parameter.unit or _words(field, parameter)
     yield "grid:  # lists of values of the scorer's parameters; null = its own value"
     for field, units in sorted(owners.items(), key=lambda item: len(item[1]) > 1):
         [unit, *more] = {*units.values()}

@@ -1,8 +1,29 @@
-"""The paper's methods on arrays: matches of two images, their scores, grids of parameters, rankings, and recalls.
+"""The paper on arrays: matches of two images, their scores, grids of parameters, rankings, recall.
 
-Read first: types, nearest_neighbors (one pair), scorer (the contract), aggregate (the shortest score), histogram,
-anchor; then ranking (score, fuse, rank), grids (many parameter values), metrics. Parts: weights (of matches),
-parameters (by dotted name), similarity and checked (products), shifts, lattice and tallest (histogram).
+`types` holds the values: Features of an image become Matches of a pair. `nearest` and `matching` find the matches;
+`checked` finds the same ones faster with products of bfloat16, and can be deleted. `weights` and `shifts` are what
+scores see of a match. `scorer` states the contract of a score, a function of the matches of one pair, and `parameters`
+declares the fields of its class. `aggregate` holds the shortest scores; read it before `histogram` and `anchor`, which
+also stand in one file each, from the equation to the result. `batch` scores all candidates of a query, and grids: what
+takes one pair is a plain function that JAX traces, what takes many pairs is compiled there with `vmap` and `lax.map`,
+once for each shape and whatever the numbers. `ranking` and `metrics` sort the scores and count the hits. To add a
+score, write a class like `MatchCount`, and call `mfvpr.testing.check_scorer` in its test.
+
+    unit = lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+    rng = np.random.default_rng(0)
+    places = unit(rng.normal(size=(3, 40, 64)))  # descriptors of C = 3 candidates [C, N, D]
+    seen = unit(places[1] + 0.1 * rng.normal(size=(40, 64)))  # of a query at the second place [N, D]
+
+    points, sizes = rng.uniform(0, 300, (40, 2)), np.full((3, 2), 336.0)  # (x, y) px
+    query = Features.of(points, seen, image_size=sizes[0])
+    candidates = Features.of(np.stack([points + 9.0] * 3), places, image_size=sizes)
+    matches = match_candidates(query, candidates, with_ratio=True)  # [C, K]
+
+    scorer = HistogramOfShifts(sigma=22.5)
+    order = rank(score_candidates(scorer, matches))  # candidates, the best first: order[0] is 1
+    grid = score_grid(scorer, matches, sigma=[10.0, 22.5], weight=["fs", "ratio"])  # [sigma, weight, C]
+    score_of = lambda sigma: score_candidates(replace(scorer, sigma=sigma), matches)[1]
+    slope = jax.grad(score_of)(22.5)
 """
 
 import lazy_loader

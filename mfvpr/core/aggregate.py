@@ -1,14 +1,16 @@
-"""Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean."""
+"""Aggregated score (paper, section III-C): every match counts, less so the further its shift is from the mean.
+
+Beside it the number of matches, the shortest score, by which SelaVPR re-ranks (Lu et al., ICLR 2024).
+"""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.core.parameters import check_plain, choice, flag, number, table_value
+from mfvpr.core.parameters import check_plain, choice, flag, number
 from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_confidence, match_weights
+from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
 from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 
 
@@ -34,7 +36,7 @@ class AggregatedScore:
             an array not above 0 scores NaN.
     """
 
-    weight: Weight = table_value(NAMED_WEIGHTS, "dmf", file=SUFFIX)
+    weight: Weight = weight_field("dmf")
     mean: str = choice("unweighted", "weighted", "median")
     clamp: bool = flag(False)
     temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
@@ -62,3 +64,24 @@ class AggregatedScore:
         temperature = positive(self.temperature, offsets.dtype)
         closeness = size - (safe_sqrt(offsets**2 + temperature**2) - temperature)
         return temperature * jax.nn.softplus(closeness / temperature) if self.clamp else closeness
+
+
+@value
+class MatchCount:
+    """Number of matches, each counted with its confidence.
+
+        mfvpr.MatchCount()(mfvpr.soft_match(features0, features1, temperature=0.1))  # a smooth score
+
+    Attributes:
+        single: score of a pair with exactly one match: `count` it, or `zero`, as SelaVPR's code does by accident.
+    """
+
+    single: str = choice("count", "zero", note="a pair with one match")
+
+    __post_init__ = check_plain
+
+    def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
+        """Score of one pair `[K]`, float32."""
+        confidence = match_confidence(matches)
+        score = jnp.sum(confidence)
+        return score if self.single == "count" else jnp.where(jnp.sum(confidence != 0) == 1, 0.0 * score, score)

@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.core.parameters import check_plain, choice, flag, integer, number, table_value
+from mfvpr.core.parameters import check_plain, choice, flag, integer, number
 from mfvpr.core.shifts import image_sizes
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_confidence, match_weights
+from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
 from mfvpr.utils.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 
 MAX_BINS = 215  # per side: numbers of pairs of cells then fit into 32 bits
@@ -61,7 +60,7 @@ class AnchorPoints:
     num_bins: int = integer(15, "cells per side", bounds=(1, 32))  # the soft form's memory
     window: float | Array = number(10.0, "cells")
     tolerance: float | Array = number(3.0, "cells", learned=True)
-    weight: Weight = table_value(NAMED_WEIGHTS, "fs", file=SUFFIX)
+    weight: Weight = weight_field("fs")
     window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
     first: str = choice("query", "candidate")
     include_self: bool = flag(True)

@@ -14,8 +14,8 @@ rounded product of x, and c the largest checked one, of the neighbor y:
 
 So the neighbor is among the keypoints with rounded products of at least m - 2 e. If there are several, the largest
 checked product decides, and the first index wins a tie. These are the neighbors of float32, except where two products
-differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, float32 matches the pair, and
-at once if `tells_apart` says so.
+differ by less than its rounding. If a keypoint has more than `MOST_CHECKS` of them, or all together have many, as in
+images whose descriptors are nearly equal, float32 matches the pair.
 
 The bounds themselves are computed in float32, off by a share of at most 4 g, which is added, as is what numbers below
 2^-126 can change, which may be taken for 0. Descriptors whose products could overflow are left to float32.
@@ -24,44 +24,110 @@ All of this is for a CPU. Other processors may add products of bfloat16 with few
 Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 2021), so that g is no bound there.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import BFloat16, Bool, Float, Int
 
-from mfvpr.core.similarity import Lines, Nearest, count_from, entries_from, even_size, lines_of, nearest, without
-from mfvpr.core.types import Array, Features
+from mfvpr.core.nearest import (
+    CrossCheck,
+    Lines,
+    Nearest,
+    Neighbors,
+    Product,
+    Query,
+    even_size,
+    lines_of,
+    nearest,
+    ready,
+    without,
+)
+from mfvpr.core.types import Array, Features, value
+from mfvpr.utils.errors import require_word
+from mfvpr.utils.numerics import at_least_single, device_of, has_bfloat16, masked
 
+LEAST_DIMENSIONS = 256  # with fewer, products of bfloat16 gain little
 MOST_CHECKS = 16  # of a keypoint
 GROUP = 64  # keypoints that are checked at the same time
-_SAMPLE = 16  # keypoints of the query by which `tells_apart` guesses
-_WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
+WORTHWHILE_CHECKS = 2.5  # of a keypoint, on average; with more of them, float32 is faster
 _PARTS = 8  # into which the dimensions of a checked product are split
 _SMALL, _LARGE = 2.0**-126, 2.0**126
 
 
 class Rounded(NamedTuple):
-    """Features of an image, and their descriptors in bfloat16, padded to whole blocks of products."""
+    """Descriptors of an image in bfloat16, padded to whole blocks of products."""
 
-    features: Features
+    exact: Float[Array, "keypoints _"]  # the float32 descriptors, without padding
     descriptors: BFloat16[Array, "*_"]  # `[N, D]`, or `[D, N]` of a query
     norm: Float[Array, "*_"]  # of the float32 descriptors; 0 for padding, NaN and infinity
     residual: Float[Array, "*_"]  # norm of what rounding takes away
 
 
-class Neighbors(NamedTuple):
-    """Neighbors of the query's keypoints, of use where `real`."""
+@value
+class RoundedQuery(Query):
+    """A query with its descriptors in bfloat16."""
 
-    match: Int[Array, " keypoints0"]
-    real: Bool[Array, " keypoints0"]
-    nearest: Int[Array, " keypoints0"]
-    second: Int[Array, " keypoints0"]  # the nearest of the others
-    has_second: Bool[Array, " keypoints0"]
+    rounded: Rounded
 
-    def of(self, features: Features) -> "Neighbors":
-        """Neighbors of the slots of these features, without those that fill up the last block of products."""
-        return Neighbors(*(values[: features.mask.shape[-1]] for values in self))
+    def neighbors(self, candidate: Features, cross_check: CrossCheck, *, with_second: bool) -> Neighbors:
+        """Mutual neighbors as of `Query`; both images have slots."""
+        query, candidate = jax.lax.stop_gradient((self, candidate))
+        rounded0, rounded1 = query.rounded, round_candidate(candidate)
+
+        def in_single() -> Neighbors:
+            return Query(query.features).neighbors(candidate, cross_check, with_second=with_second)
+
+        def in_bfloat16() -> Neighbors:
+            neighbors, settled = mutual_neighbors(rounded0, rounded1, with_second=with_second)
+            return jax.lax.cond(settled, lambda: neighbors.of(query.features), in_single)
+
+        # Traced arrays do not say where they are: the program may be compiled for another device than the default.
+        return jax.lax.platform_dependent(cpu=in_bfloat16, default=in_single)
+
+
+def prepare_query(
+    query: Features,
+    candidates: Features,
+    cross_check: CrossCheck = "mutual",
+    chunk_size: int = 1,
+    product: Product | None = None,
+) -> Query:
+    """A query for `match_prepared`: its descriptors in bfloat16 if `choose_product` says so."""
+    query = ready(query)
+    if choose_product(product, query, candidates, cross_check, chunk_size) == "float32":
+        return Query(query)
+    return RoundedQuery(query, round_query(query))
+
+
+def choose_product(
+    product: Product | None, query: Features, candidates: Features, cross_check: CrossCheck, chunk_size: int
+) -> Product:
+    """`product` if the pairs can be matched in it, else a ValueError; None = bfloat16 where it is faster.
+
+    On other devices than a CPU always float32: the bounds of this module do not hold there.
+    """
+    sides = query, candidates
+    lengths = {np.shape(side.descriptors)[-1] for side in sides}
+    if product is not None:
+        require_word("product", product, Product)
+    may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
+    if not may_be_faster or device_of(sides).platform != "cpu":
+        return "float32"
+    dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
+    conditions = {
+        "cross_check=mutual": cross_check == "mutual",
+        "chunk_size=1": chunk_size == 1,
+        "descriptors in single or half precision": dtypes == {jnp.dtype(jnp.float32)},
+        "images with slots": all(side.mask.shape[-1] for side in sides),
+        "descriptors of one length": len(lengths) == 1,
+    }
+    missing = [condition for condition, holds in conditions.items() if not holds]
+    if product == "bfloat16" and missing:
+        raise ValueError(f"product=bfloat16: expected {' and '.join(missing)}; leave product out")
+    return product or ("float32" if missing else "bfloat16")
 
 
 class _Direction(NamedTuple):
@@ -78,10 +144,15 @@ class _Direction(NamedTuple):
         return self.nearest.similarity - self.window
 
     @property
+    def count(self) -> Int[Array, " own"]:
+        """Number of keypoints that may be the nearest, at least if it is 0 or 1."""
+        count = count_from(self.lines, self.nearest, self.threshold)
+        return jnp.where(self.nearest.similarity > -jnp.inf, count, 0)
+
+    @property
     def is_close(self) -> Bool[Array, " own"]:
         """Whether several keypoints may be the nearest."""
-        several = count_from(self.lines, self.nearest, self.threshold) > 1
-        return several & (self.nearest.similarity > -jnp.inf)
+        return self.count > 1
 
 
 def round_query(features: Features) -> Rounded:
@@ -99,7 +170,7 @@ def round_candidate(features: Features) -> Rounded:
     norms = [_norm(rows) for rows in (features.descriptors, lost)]
     is_number = features.mask & ~jnp.isnan(norms[0]) & ~jnp.isnan(norms[1])  # rounding takes NaN away from infinity
     norm, residual = (jnp.pad(jnp.where(is_number, norm, 0.0), (0, missing)) for norm in norms)
-    return Rounded(features, jnp.pad(rounded, ((0, missing), (0, 0))), norm, residual)
+    return Rounded(features.descriptors, jnp.pad(rounded, ((0, missing), (0, 0))), norm, residual)
 
 
 def _norm(rows: Float[Array, "rows _"]) -> Float[Array, " rows"]:
@@ -114,37 +185,23 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     to1, to0 = _direction(products, 0, query, candidate), _direction(products, 1, candidate, query)
     # A keypoint without a product that is close to both largest ones has no match.
     close_to_both = products >= jnp.maximum(to1.threshold[None], to0.threshold[:, None])
-    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0))
     has_neighbor = to1.nearest.similarity > -jnp.inf
+    excess = masked(to1.count.astype(jnp.float32) - WORTHWHILE_CHECKS, has_neighbor)
+    is_worthwhile = jnp.sum(excess) <= 0
+    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0) & is_worthwhile)
     may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
     is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
-    index0, settled0 = _settle(to0, to0.is_close & is_chosen)
+    index0, settled0 = _settle(to0, to0.is_close & is_chosen & is_worthwhile)
     longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
-    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0
+    is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0 & is_worthwhile
     settled &= longest0 * longest1 < _LARGE  # False for NaN
     if not with_second:
-        return Neighbors(index1, is_match, index1, index1, is_match).of(query.features), settled
+        return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
     rest = to1._replace(lines=lines, nearest=nearest(lines))
-    second, settled2 = _settle(rest, rest.is_close & is_match)
+    second, settled2 = _settle(rest, rest.is_close & is_match & is_worthwhile)
     neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
-    return neighbors.of(query.features), settled & settled2
-
-
-def tells_apart(query: Rounded, candidate: Rounded) -> Bool[Array, ""]:
-    """Whether products differ enough for `mutual_neighbors`: a guess by a few keypoints, which saves time.
-
-    Without it, images whose descriptors are equal or nearly equal would cost both kinds of products.
-    """
-    step = max(1, len(query.norm) // _SAMPLE)
-    sample = query._replace(
-        descriptors=query.descriptors[:, ::step], norm=query.norm[::step], residual=query.residual[::step]
-    )
-    products = _products(sample, candidate)
-    largest = jnp.max(products, axis=0)
-    possible = jnp.sum(products >= (largest - _window(sample, candidate))[None], axis=0)
-    checks = jnp.minimum(possible, MOST_CHECKS + 1).astype(jnp.float32)
-    return jnp.sum(jnp.where(largest > -jnp.inf, checks - _WORTHWHILE_CHECKS, 0.0)) <= 0
+    return neighbors, settled & settled2
 
 
 def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 keypoints0"]:
@@ -156,12 +213,12 @@ def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 ke
 
 def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
     lines, window = lines_of(products, axis), _window(image, other)
-    return _Direction(image.features.descriptors, other.features.descriptors, lines, nearest(lines), window)
+    return _Direction(image.exact, other.exact, lines, nearest(lines), window)
 
 
 def _window(image: Rounded, other: Rounded) -> Float[Array, " own"]:
     """2 e for each keypoint of `image`."""
-    dimensions = image.features.descriptors.shape[1]
+    dimensions = image.exact.shape[1]
     rounding = (dimensions + 32) * 2.0**-24
     norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
     rounded = image.norm + image.residual
@@ -193,15 +250,55 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
         first, lowest = next_after(jnp.full(size, -1, jnp.int32)), jnp.full(size, -jnp.inf, jnp.float32)
         number, _, best, _ = jax.lax.while_loop(
             lambda state: (state[0] < end).any() & (state[3] < MOST_CHECKS),
-            check, (first, lowest, index[keypoints], jnp.int32(0)),
-        )  # fmt: skip
+            check,
+            (first, lowest, index[keypoints], jnp.int32(0)),
+        )
         return start + size, index.at[places].set(best, mode="drop"), (number == end).all()
 
     _, index, settled = jax.lax.while_loop(
         lambda state: (state[0] < jnp.sum(wanted)) & state[2],
-        settle_group, (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
-    )  # fmt: skip
+        settle_group,
+        (jnp.int32(0), direction.nearest.index, jnp.bool_(True)),
+    )
     return index, settled
+
+
+def count_from(lines: Lines, neighbors: Nearest, threshold: Float[Array, " lines"]) -> Int[Array, " lines"]:
+    """Number of entries of at least the threshold, which is not above the nearest neighbor.
+
+    Of a block without the nearest neighbor, only the largest entry is counted: the number is right if it is 1.
+    """
+    threshold = jnp.expand_dims(threshold, lines.axis)
+    entries = lines.take(neighbors.index // lines.length) >= threshold
+    return jnp.sum(lines.maxima >= threshold, axis=lines.axis) + jnp.sum(entries, axis=lines.axis) - 1
+
+
+def entries_from(
+    lines: Lines, places: Int[Array, " chosen"], threshold: Float[Array, " chosen"]
+) -> tuple[Callable[[Array], Array], int]:
+    """Function that finds the next entry of at least the threshold in chosen lines, and the number that means none.
+
+    It takes the numbers `[chosen]` of the entries before; -1 finds the first.
+    """
+    maxima = lines.maxima[places] if lines.axis else lines.maxima[:, places].T  # [chosen, blocks]
+    blocks, number_in_block = jnp.arange(maxima.shape[1], dtype=jnp.int32), jnp.arange(lines.length, dtype=jnp.int32)
+    end = maxima.shape[1] * lines.length
+    has_entry = maxima >= threshold[:, None]
+
+    def first_in(block: Array, number: Array) -> Array:
+        values = lines.blocks[places, block] if lines.axis else lines.blocks[block, :, places]  # [chosen, entries]
+        numbers = block[:, None] * lines.length + number_in_block[None]
+        is_next = (values >= threshold[:, None]) & (numbers > number[:, None])
+        if lines.removed is not None:
+            is_next &= numbers != lines.removed[places, None]
+        return jnp.min(jnp.where(is_next, numbers, end), axis=1)
+
+    def next_after(number: Array) -> Array:
+        block = number // lines.length
+        later = jnp.min(jnp.where(has_entry & (blocks[None] > block[:, None]), blocks[None], len(blocks)), axis=1)
+        return jnp.minimum(first_in(block, number), first_in(later, number))
+
+    return next_after, end
 
 
 def checked_product(rows0: Float[Array, "rows _"], rows1: Float[Array, "rows _"]) -> Float[Array, " rows"]:

@@ -2,10 +2,13 @@
 
 The Gaussian is a product of one along x and one along y, so all bins s_ij of a pair are one small matrix product,
 `(w * votes_y) [By, K] @ votes_x [Bx, K]^T`, instead of K x By x Bx exponentials. Lengths are pixels.
+
+In this order: the score, what else the histogram says (all bins, the dominant shift, its interval), the bins and their
+number, and the peak between bins.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,18 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.core.lattice import Lattice, bin_scores, climb, pool_bins, smooth_tallest, tallest, votes
-from mfvpr.core.parameters import SCORE, check_plain, choice, flag, integer, number, numbers, table_value
-from mfvpr.core.shifts import are_finite, image_sizes, match_shifts, require_sizes, where_usable
-from mfvpr.core.tallest import tallest_bins
+from mfvpr.core.parameters import SCORE, check_plain, choice, flag, integer, number, numbers
+from mfvpr.core.shifts import image_sizes, match_shifts, require_sizes
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_weights
+from mfvpr.core.weights import Weight, match_weights, weight_field
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import compiled, is_concrete, positive, round_up
+from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt
 
 MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
+PAIRS_AT_ONCE = 8  # on a CPU, divided by the weightings: few and long operations that still stay in the cache
 CHUNK = 2**29  # bytes of the votes and bins that exist at the same time on an accelerator
+_NEAR = 32.0  # temperatures; e^32 is far from overflow
+_MOST_STEPS = 100  # uphill; hardly any pair needs 10
+_TOLERANCE = 1e-4  # of the peak, standard deviations
 
 
 class ShiftHistogram(NamedTuple):
@@ -75,7 +79,7 @@ class HistogramOfShifts:
 
     bin_size: float | Array = number(15.0, "px")
     sigma: float | Array = number(22.5, "px", learned=True)
-    weight: Weight = table_value(NAMED_WEIGHTS, "fs", file=SUFFIX)
+    weight: Weight = weight_field("fs")
     truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
     shift_range: tuple[float, float] | None = numbers(
         None, 2, "[x, y] px", "None = all possible shifts", bounds=(0.0, 1e12)
@@ -94,47 +98,46 @@ class HistogramOfShifts:
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""
-        return self.scores_by_weights(matches, match_weights(self.weight, matches)[None])[0]
+        shifts, bins, weights = self._shifts(matches), self._bins(matches), match_weights(self.weight, matches)[None]
+        return _where_usable(self._maxima(shifts, bins, weights), matches, shifts, bins, weights)[0]
 
-    def scores_by_weights(
-        self, matches: Matches, weights: Float[Array, "weightings slots"]
+    def _maxima(
+        self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
     ) -> Float[jax.Array, " weightings"]:
-        """Scores of one pair with several weights of its matches (0 on padding)."""
-        shifts, lattice, capacity = self._shifts(matches), self._lattice(matches), self._capacity(matches)
-        pool = tallest
-        if self.temperature is not None:
-            pool = partial(smooth_tallest, temperature=positive(self.temperature, shifts.dtype))
-        scores = pool_bins(shifts, weights, lattice, capacity, pool)
-        return where_usable(scores, matches, shifts, weights, lattice.usable(capacity))
+        """The (smooth) maximum over bins of one pair for each weighting of its matches (0 on padding)."""
+        votes_x, votes_y, inside = bins.votes(0, shifts), bins.votes(1, shifts), bins.inside
 
-    def batch_scores_by_weights(
+        def maximum(weights: Float[Array, " slots"]) -> Float[Array, ""]:
+            scores = bin_scores(votes_x, votes_y, weights)
+            if self.temperature is None:
+                return jnp.max(scores)  # without `inside`: bins beyond the last only repeat it
+            return smooth_maximum(scores, inside, temperature=positive(self.temperature, scores.dtype))
+
+        if len(weights) == 1:
+            return maximum(weights[0])[None]
+        # One after the other they stay in the cache of a CPU; an accelerator needs long operations.
+        return jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, maximum), default=jax.vmap(maximum))
+
+    def score_weightings(
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
     ) -> Float[jax.Array, "candidates weightings"]:
-        """`scores_by_weights` of pairs `[C, K, ...]`; on a CPU pair by pair, without most bins where that pays."""
-        on_cpu = self._score_pair_by_pair if self.temperature is None else jax.vmap(self.scores_by_weights)
-        return jax.lax.platform_dependent(matches, weights, cpu=on_cpu, default=self._score_in_chunks)
+        """Scores of candidates `[C, K, ...]` with several weights of their matches, which share the Gaussians."""
+        shifts, bins = jax.vmap(self._shifts)(matches), jax.vmap(self._bins)(matches)
+        size = self.pairs_at_once(matches, weights.shape[1])
+        maxima = jax.lax.map(lambda pair: self._maxima(*pair), (shifts, bins, weights), batch_size=size)
+        return jax.vmap(_where_usable)(maxima, matches, shifts, bins, weights)
 
-    def pairs_at_once(self, matches: Matches, num_weights: int) -> int:
-        """Pairs whose weighted votes and bins fit `CHUNK`."""
+    def pairs_at_once(self, matches: Matches, num_weightings: int) -> int:
+        """Pairs whose votes and bins are to exist at the same time."""
+        if device_of(()).platform == "cpu":
+            return max(1, PAIRS_AT_ONCE // num_weightings)
         capacity = self._capacity(matches)
-        return max(1, CHUNK // (4 * num_weights * capacity * (matches.mask.shape[-1] + capacity)))
-
-    def _score_in_chunks(self, matches: Matches, weights: Array) -> Array:
-        chunk_size = self.pairs_at_once(matches, weights.shape[1])
-        return jax.lax.map(lambda pair: self.scores_by_weights(*pair), (matches, weights), batch_size=chunk_size)
-
-    def _score_pair_by_pair(self, matches: Matches, weights: Array) -> Array:
-        capacity, shifts = self._capacity(matches), jax.vmap(self._shifts)(matches)
-        lattice = jax.vmap(self._lattice)(matches)
-        scores = tallest_bins(shifts, weights, lattice, capacity)
-        usable = jax.vmap(lambda lattice: lattice.usable(capacity))(lattice)
-        return jax.vmap(where_usable)(scores, matches, shifts, weights, usable)
+        return max(1, CHUNK // (4 * num_weightings * capacity * (matches.mask.shape[-1] + capacity)))
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
-        scores, lattice, usable = self._vote(matches)
-        x, y = (lattice.centers(axis, jnp.arange(len(scores), dtype=scores.dtype)) for axis in (0, 1))
-        return ShiftHistogram(jnp.where(usable, scores, jnp.nan), x, y)
+        scores, bins, usable = self._vote(matches)
+        return ShiftHistogram(jnp.where(usable, scores, jnp.nan), *(bins.centers(axis, bins.index) for axis in (0, 1)))
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Float[jax.Array, "2"]:
         """Shift of the tallest bin, (x, y) px, candidate minus query; (0, 0) without votes.
@@ -204,20 +207,6 @@ class HistogramOfShifts:
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
-    def _vote(self, matches: Matches) -> tuple[Array, Lattice, Array]:
-        """Scores `[B, B]` (y, x) of the bins, -inf out of range; bins; whether usable."""
-        lattice, capacity = self._lattice(matches), self._capacity(matches)
-        shifts, weights = self._shifts(matches), match_weights(self.weight, matches)
-        scores = bin_scores(*votes(shifts, lattice, capacity), weights)
-        usable = lattice.usable(capacity) & are_finite(shifts, weights[None])[0]
-        return jnp.where(lattice.inside(capacity), scores, -jnp.inf), lattice, usable
-
-    def _lattice(self, matches: Matches) -> Lattice:
-        dtype = match_shifts(matches).dtype
-        bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
-        first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
-        return Lattice(first, num_bins, bin_size, self._deviation(dtype), truncate)
-
     def _capacity(self, matches: Matches) -> int:
         capacity = self._fit_to(matches).max_bins
         if capacity is None:
@@ -246,6 +235,19 @@ class HistogramOfShifts:
         num_bins = xp.maximum(xp.ceil((upper - edge) / bin_size - slack), 1)
         return edge + bin_size / 2, xp.where((bin_size > 0) & (lower <= upper), num_bins, 0)
 
+    def _bins(self, matches: Matches) -> "_Bins":
+        dtype = match_shifts(matches).dtype
+        bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
+        first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
+        return _Bins(first, num_bins, bin_size, self._deviation(dtype), truncate, self._capacity(matches))
+
+    def _vote(self, matches: Matches) -> tuple[Float[Array, "bins bins"], "_Bins", Bool[Array, ""]]:
+        """Scores of the bins (y, x), -inf out of range; the bins; whether they are usable."""
+        bins, shifts, weights = self._bins(matches), self._shifts(matches), match_weights(self.weight, matches)
+        scores = bin_scores(bins.votes(0, shifts), bins.votes(1, shifts), weights)
+        usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights))
+        return jnp.where(bins.inside, scores, -jnp.inf), bins, usable
+
     def _shifts(self, matches: Matches) -> Float[Array, "2 slots"]:
         """Shifts along x and along y."""
         shifts = match_shifts(matches).T
@@ -257,25 +259,98 @@ class HistogramOfShifts:
         return jnp.sqrt(sigma) if self.sigma_is_variance else sigma
 
 
+@value
+class _Bins:
+    """Bins of one pair, and the width of the votes, px."""
+
+    first: Float[Array, "2"]  # center (x, y) of the first bin
+    num_bins: Float[Array, "2"]
+    bin_size: Float[Array, ""]
+    deviation: Float[Array, ""]  # sigma of equation 1
+    truncate: Float[Array, ""]  # sigmas
+    capacity: int = field(metadata={"static": True})
+
+    @property
+    def index(self) -> Float[Array, " bins"]:
+        """Numbers of bins along an axis."""
+        return jnp.arange(self.capacity, dtype=self.first.dtype)
+
+    def centers(self, axis: int, index: Array) -> Array:
+        """Centers of bins along an axis, px, by bin number."""
+        return self.first[axis] + index * self.bin_size
+
+    def votes(self, axis: int, shifts: Float[Array, "2 slots"]) -> Float[Array, "bins slots"]:
+        """Votes exp(-d^2 / (2 sigma^2)) of shifts along one axis, without weights."""
+        index = jnp.minimum(self.index, self.num_bins[axis] - 1)  # repeats the last bin, which changes no maximum
+        # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
+        sigmas = (self.centers(axis, index)[:, None] - shifts[axis][None]) / self.deviation
+        return jnp.where(jnp.abs(sigmas) > self.truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
+
+    @property
+    def inside(self) -> Bool[Array, "bins bins"]:
+        """(y, x), True for bins within the range of shifts."""
+        return (self.index < self.num_bins[1])[:, None] & (self.index < self.num_bins[0])[None]
+
+    @property
+    def are_usable(self) -> Bool[Array, ""]:
+        """Whether the bins fit the capacity, and `deviation` and `truncate` are numbers."""
+        # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
+        fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= self.capacity))
+        return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
+
+
+def bin_scores(
+    votes_x: Float[Array, "bins slots"], votes_y: Float[Array, "bins slots"], weights: Float[Array, " slots"]
+) -> Float[Array, "bins bins"]:
+    """(y, x) s_ij of equation 1: weighted sums of the votes."""
+    return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
+
+
+def smooth_maximum(
+    values: Float[Array, "*bins"], mask: Bool[Array, "*bins"], *, temperature: Array
+) -> Float[Array, ""]:
+    """T log(mean of e^(v / T)) of the values where `mask`."""
+    # Relative to the maximum nothing overflows. The maximum drops out, so that its gradient would be 0.
+    largest = jax.lax.stop_gradient(jnp.max(values))
+    below = (masked(values, mask, largest) - largest) / temperature
+    far = largest + temperature * jnp.log(jnp.mean(jnp.exp(below), where=mask))
+    # Where the sum of both terms would cancel: small values, or one peak in many bins.
+    is_near = (largest <= _NEAR * temperature) & (jnp.min(values) >= -temperature)
+    ratios = masked(values / temperature, mask & is_near)
+    return jnp.where(is_near, temperature * jnp.log1p(jnp.mean(jnp.expm1(ratios), where=mask)), far)
+
+
+def _where_usable(
+    values: Float[Array, "*"],
+    matches: Matches,
+    shifts: Float[Array, "2 slots"],
+    bins: _Bins,
+    weights: Float[Array, "_ slots"],
+) -> Float[jax.Array, "*"]:
+    """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
+    usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
+    return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
+
+
 @partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, lattice, usable = scorer._vote(matches)
+    scores, bins, _ = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
-    shift = jnp.stack([lattice.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
-    shifts, weights = scorer._shifts(matches).T, match_weights(scorer.weight, matches)
+    shift = jnp.stack([bins.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
+    shifts, weights = scorer._shifts(matches), match_weights(scorer.weight, matches)
     if refine:
-        shift = climb(shift, shifts, weights, scorer._deviation(shifts.dtype))
+        shift = climb(shift, shifts.T, weights, bins.deviation)
         if scorer.shift_range is not None:
             reach = jnp.asarray(scorer.shift_range, shift.dtype)
             shift = jnp.clip(shift, -reach, reach)
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
-    return where_usable(shift, matches, shifts, weights[None], usable)
+    return _where_usable(shift, matches, shifts, bins, weights[None])
 
 
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
     """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
-    scores, lattice, usable = scorer._vote(matches)
+    scores, bins, usable = scorer._vote(matches)
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
@@ -285,6 +360,62 @@ def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, s
 
     def along(axis: int) -> Array:
         below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
-        return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], lattice.centers(axis, edges))
+        return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], bins.centers(axis, edges))
 
     return jnp.where(usable, jnp.stack([along(0), along(1)], axis=1), jnp.nan)
+
+
+def climb(
+    start: Float[Array, "2"],
+    shifts: Float[Array, "slots 2"],
+    weights: Float[Array, " slots"],
+    deviation: Float[Array, ""],
+) -> Float[Array, "2"]:
+    """Maximum of sum_k w_k exp(-|s - s_k|^2 / (2 sigma^2)) uphill from s = `start`, to 1e-4 sigma.
+
+    Each step is Newton's or that of mean shift, whichever ends higher. First and second derivatives are exact.
+    """
+    fixed = jax.lax.stop_gradient((shifts, weights, deviation))
+
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        number, shift, (newton, mean_shift) = state
+        newton = newton * jnp.minimum(1.0, fixed[2] / jnp.sqrt(jnp.sum(newton**2)))
+        heights = [jnp.sum(_pull(shift + move, *fixed)[1]) for move in (newton, mean_shift)]
+        shift = shift + jnp.where(heights[0] >= heights[1], newton, mean_shift)
+        return number + 1, shift, _steps(shift, *fixed)
+
+    def is_climbing(state: tuple[Array, Array, Array]) -> Array:
+        number, _, (newton, _) = state
+        return (number < _MOST_STEPS) & (jnp.sqrt(jnp.sum(newton**2)) > _TOLERANCE * fixed[2])
+
+    start = jax.lax.stop_gradient(start)
+    _, shift, _ = jax.lax.while_loop(is_climbing, step, (jnp.zeros((), jnp.int32), start, _steps(start, *fixed)))
+    for _ in range(2):  # each Newton step doubles the order up to which derivatives are correct
+        shift = shift + _steps(shift, shifts, weights, deviation)[0]
+    return shift
+
+
+def _pull(shift: Array, shifts: Array, weights: Array, deviation: Array) -> tuple[Array, Array]:
+    """Offsets of the matches from a shift, and their weighted votes for it."""
+    offsets = shifts - shift[None]
+    return offsets, weights * jnp.exp(-0.5 * jnp.sum((offsets / deviation) ** 2, axis=-1))
+
+
+def _steps(shift: Array, shifts: Array, weights: Array, deviation: Array) -> Float[Array, "2 2"]:
+    """Newton's step and the step of mean shift (Comaniciu & Meer, PAMI 2002), px; 0 without votes.
+
+    Where the sum is not concave, a multiple of the identity in the Hessian makes Newton's step lead uphill.
+    """
+    offsets, pull = _pull(shift, shifts, weights, deviation)
+    total = jnp.sum(pull)
+    pull = jnp.where(total > 0, pull / jnp.where(total > 0, total, 1.0), 0.0)[:, None]
+    mean, scaled = jnp.sum(pull * offsets, axis=0), offsets / deviation
+    xx, yy = 1 - jnp.sum(pull * scaled**2, axis=0)
+    xy = -jnp.sum(pull[:, 0] * scaled[:, 0] * scaled[:, 1])
+    smallest = (xx + yy) / 2 - safe_sqrt(((xx - yy) / 2) ** 2 + xy**2)  # eigenvalue
+    damping = 2 * jnp.maximum(-smallest, 0.0)
+    xx, yy = xx + damping, yy + damping
+    determinant = xx * yy - xy**2
+    newton = jnp.stack([yy * mean[0] - xy * mean[1], xx * mean[1] - xy * mean[0]])
+    newton = jnp.where(determinant > 0, newton / jnp.where(determinant > 0, determinant, 1.0), mean)
+    return jnp.stack([newton, mean])

@@ -1,14 +1,13 @@
-"""Parameters of scorers: declared in the metadata of fields, found by dotted name (`inner.sigma`), capacities.
+"""Parameters of scorers: declared at the field, from which settings, sweeps and learning follow; by dotted name.
 
-Programs derive settings from declarations, with bounds, comments and sweep axes, in plain values: numbers, words,
-lists, None.
+sigma: float | Array = number(22.5, "px", learned=True)     # a field of a scorer
+parameters_of(HistogramOfShifts)["sigma"].unit              # "px"
+with_parameters(scorer, {"inner.sigma": 10.0})              # a field of a part
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import reduce
-from inspect import getmodule
 from typing import Any
 
 import jax
@@ -22,12 +21,11 @@ from mfvpr.utils.errors import InputError
 
 POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 silently overflows or underflows
 SCORE = "units of the score"
-_KEY = "parameter"  # of the field's metadata
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Declaration of one field in terms of plain values."""
+    """Declaration of one field in plain values: numbers, words, flags, lists, None."""
 
     default: Any
     unit: str = ""
@@ -37,30 +35,12 @@ class Parameter:
     whole: bool = False  # numbers are integers
     length: int = 0  # of a list of numbers; 0 = one number
     none: float | None = None  # field value for None, which is allowed if it is the default
-    named: Mapping[str, Any] | None = None  # field values by the words of `choices`
-    file: str = ""  # suffix of files that are allowed in place of a word; "" = no files
     swept: bool = True  # offered as an axis of a sweep
     learned: bool = False  # a gradient may change the field
     start: float = 1.0  # of learning if the value is None; for the unit `SCORE` in units of the scores' spread
 
-    @property
-    def words(self) -> str:
-        """The choices that are words, separated by commas."""
-        words = [word for word in self.choices if isinstance(word, str)]
-        return ", ".join([*words, f"FILE{self.file}"] if self.file else words)
-
-    @property
-    def limits(self) -> dict[str, Any]:
-        """Limits of a plain value, themselves plain, by name; limits that are not set are left out."""
-        kind = "choices" if self.choices else "whole" if self.whole else "number"
-        limits = {kind: list(self.choices or self.bounds)}
-        limits |= {"length": self.length, "optional": self.default is None, "file": self.file}
-        return {name: limit for name, limit in limits.items() if limit}
-
     def value(self, plain: Any) -> Any:
-        """Field value of a plain value."""
-        if self.named is not None:
-            return self.named[plain]
+        """Field value of a plain value; the words of a weight stand for themselves."""
         if plain is None:
             return self.none
         return tuple(map(float, plain)) if self.length else plain
@@ -72,13 +52,17 @@ class Parameter:
             raise InputError(f"{name}={value}: expected numbers from {low:g} to {high:g}")
 
 
+def declare(default: Any, parameter: Parameter, *, static: bool = False) -> Any:
+    """A field of a value with a default and its declaration."""
+    return field(default=default, metadata={"static": static, "parameter": parameter})
+
+
 def number(
     default: float | None, unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE, **more: Any
 ) -> Any:
     """Declare a number; None is allowed if the default is None, or infinite (None = infinite)."""
-    unlimited = default == math.inf
-    plain, none = (None, math.inf) if unlimited else (default, None)
-    return _field(default, Parameter(plain, unit, note, bounds=bounds, none=none, **more))
+    plain, none = (None, math.inf) if default == math.inf else (default, None)
+    return declare(default, Parameter(plain, unit, note, bounds=bounds, none=none, **more))
 
 
 def numbers(
@@ -86,54 +70,37 @@ def numbers(
 ) -> Any:
     """Declare a tuple of `length` numbers, None is allowed if it is the default."""
     plain = None if default is None else list(default)
-    parameter = Parameter(plain, unit, note, bounds=bounds, length=length, swept=False)
-    return _field(default, parameter)
+    return declare(default, Parameter(plain, unit, note, bounds=bounds, length=length, swept=False))
 
 
 def integer(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
     """Declare a static integer, such as a capacity; None is allowed if it is the default."""
-    parameter = Parameter(default, unit, note, bounds=bounds, whole=True, swept=swept)
-    return _field(default, parameter, static=True)
+    return declare(default, Parameter(default, unit, note, bounds=bounds, whole=True, swept=swept), static=True)
 
 
 def choice(default: str, *alternatives: str, note: str = "") -> Any:
     """Declare a static word, one of `default` and the alternatives."""
-    return _field(default, Parameter(default, note=note, choices=(default, *alternatives)), static=True)
+    return declare(default, Parameter(default, note=note, choices=(default, *alternatives)), static=True)
 
 
 def flag(default: bool, note: str = "") -> Any:
     """Declare a static boolean."""
-    return _field(default, Parameter(default, note=note, choices=(True, False)), static=True)
-
-
-def table_value(values: Mapping[str, Any], default: str, *, file: str = "") -> Any:
-    """Declare a value of a table, written as its name, or as a file with the suffix `file`."""
-    return _field(values[default], Parameter(default, choices=tuple(values), named=values, file=file))
+    return declare(default, Parameter(default, note=note, choices=(True, False)), static=True)
 
 
 def parameters_of(method: Any) -> dict[str, Parameter]:
     """Parameters of a class, or of an instance, by name of the field."""
-    return {f.name: f.metadata[_KEY] for f in fields(method) if _KEY in f.metadata}
-
-
-def from_values(method: type, values: Mapping[str, Any]) -> Any:
-    """Create an instance from plain values by field."""
-    parameters = parameters_of(method)
-    return method(**{name: parameters[name].value(plain) for name, plain in values.items()})
-
-
-def summary(method: type) -> str:
-    """First line of the docstring of a class's module."""
-    return (getmodule(method).__doc__ or method.__name__).splitlines()[0]
+    return {f.name: f.metadata["parameter"] for f in fields(method) if "parameter" in f.metadata}
 
 
 def check_plain(method: Any) -> None:
-    """Raise an InputError if a field holds a word that is not one of its choices, or a Python float out of bounds."""
-    for name, parameter in parameters_of(method).items():
-        choices, value = parameter.choices, getattr(method, name)
-        if choices and parameter.named is None and value not in choices:
-            expected = ", ".join(map(str, choices))
-            raise InputError(f"{type(method).__name__}({name}={value!r}): expected one of {expected}")
+    """Raise an InputError for a word that is not one of the choices, for no weight, or a Python float out of bounds."""
+    for f in fields(method):
+        choices, value = getattr(f.metadata.get("parameter"), "choices", ()), getattr(method, f.name)
+        is_weight = callable(f.default)  # its choices are words of settings
+        if choices and not (callable(value) if is_weight else value in choices):
+            expected = "a weight such as RatioWeight()" if is_weight else f"one of {', '.join(map(str, choices))}"
+            raise InputError(f"{type(method).__name__}({f.name}={value!r}): expected {expected}")
     check_bounds(method, all_arrays=False)
 
 
@@ -143,9 +110,8 @@ def check_bounds(method: Any, *, all_arrays: bool = True) -> None:
         value = getattr(method, name)
         parts = value if isinstance(value, tuple) else (value,)
         is_plain = not parameter.whole and all(isinstance(part, int | float) for part in parts)
-        if parameter.choices or value is None or not (is_plain or all_arrays):
-            continue
-        parameter.check(name, value)
+        if not parameter.choices and value is not None and (is_plain or all_arrays):
+            parameter.check(name, value)
 
 
 def numbers_by_name(scorer: Any) -> dict[str, Any]:
@@ -157,6 +123,11 @@ def numbers_by_name(scorer: Any) -> dict[str, Any]:
         if path and all(isinstance(key, GetAttrKey) for key in path)
         if _is_number(leaf) or (leaf is None and path[-1].name == "temperature")
     }
+
+
+def _is_number(value: Any) -> bool:
+    scalar = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+    return scalar and (jnp.issubdtype(jnp.result_type(value), jnp.number) or isinstance(value, bool | np.bool_))
 
 
 def whole_numbers(scorer: Any) -> set[str]:
@@ -178,7 +149,11 @@ def static_names(scorer: Any) -> set[str]:
 
 def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
     """The scorer with parameters replaced by `values`, by dotted name."""
-    return reduce(lambda varied, parameter: _replace(varied, *parameter), values.items(), scorer)
+    for name, new in values.items():
+        outer, _, inner = name.partition(".")
+        part = with_parameters(getattr(scorer, outer), {inner: new}) if inner else new
+        scorer = replace(scorer, **{outer: part})
+    return scorer
 
 
 def with_capacity(
@@ -195,17 +170,3 @@ def with_capacity(
         return part.fit_capacity(image_size0, image_size1, multiple) if has_capacity(part) else part
 
     return jax.tree.map(fit_part, scorer, is_leaf=has_capacity)
-
-
-def _field(default: Any, parameter: Parameter, *, static: bool = False) -> Any:
-    return field(default=default, metadata={"static": static, _KEY: parameter})
-
-
-def _replace(scorer: Any, name: str, value: Any) -> Any:
-    outer, _, inner = name.partition(".")
-    return replace(scorer, **{outer: _replace(getattr(scorer, outer), inner, value) if inner else value})
-
-
-def _is_number(value: Any) -> bool:
-    scalar = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
-    return scalar and (jnp.issubdtype(jnp.result_type(value), jnp.number) or isinstance(value, bool | np.bool_))

@@ -1,12 +1,11 @@
-"""The contract of a scorer: matches of one pair -> a score."""
+"""What a scorer is: a function from the matches of one pair to a score."""
 
-from functools import partial
+from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Float
 
 from mfvpr.core.types import Array, Matches
@@ -32,8 +31,14 @@ class Scorer(Protocol):
     Any callable is a scorer. A class decorated with `mfvpr.value` can do more than a plain function: its numbers may be
     swept, traced and learned, and its compiled programs are reused. `mfvpr.testing.check_scorer` checks this contract.
 
-    A scorer that JAX cannot compile, for instance of another library, also has a method `score_pairs(matches) -> [P]`
-    that takes pairs `[P, K, ...]` and returns NumPy; it is called outside of `jit`. Its class is a value.
+    Optional methods of such a class:
+
+    - `score_pairs(matches) -> [P]`, for a scorer that JAX cannot compile, for instance of another library: takes pairs
+      `[P, K, ...]`, returns NumPy, and is called outside of `jit` in place of the function of one pair.
+    - `fit_capacity(image_size0, image_size1, multiple) -> scorer`, for static sizes that follow from image sizes.
+    - `score_weightings(matches, weights) -> [C, W]`, for candidates `[C, K, ...]` and weights of their matches
+      `[C, W, K]`, that share most of the work, and `pairs_at_once(matches, num_weightings) -> int`, how many pairs to
+      work on at the same time. Grids call them.
     """
 
     def __call__(self, matches: Matches, /) -> Array: ...
@@ -44,16 +49,36 @@ def on_host(scorer: Any) -> bool:
     return callable(getattr(type(scorer), "score_pairs", None))
 
 
-def check_host(scorer: Any) -> None:
-    """Raise an InputError if a scorer with `score_pairs` is no value: `jit` loses the method."""
-    if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
-        raise InputError(f"{type(scorer).__name__}: expected a class with score_pairs that is a value; decorate it "
-                         "with @mfvpr.value")  # fmt: skip
+def shares_weightings(scorer: Any) -> bool:
+    """Whether `score_weightings` is there, and of the class that defines the score: a subclass may score otherwise."""
+    names, classes = ("score_weightings", "__call__"), type(scorer).__mro__
+    owners = [[cls for cls in classes if name in vars(cls)][:1] for name in names]
+    return bool(owners[0]) and owners[0] == owners[1]
+
+
+class Static:
+    """A plain function as a static part of a scorer. `jit` takes no two of them for the same."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __call__(self, matches: Matches) -> Any:
+        return self.function(matches)
+
+
+jax.tree_util.register_static(Static)
 
 
 def with_static_functions(scorers: Tree) -> Tree:
     """Scorers with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
-    return jax.tree.map(lambda leaf: Partial(partial(leaf)) if callable(leaf) else leaf, scorers)
+    return jax.tree.map(lambda leaf: Static(leaf) if callable(leaf) else leaf, scorers)
+
+
+def check_host(scorer: Any) -> None:
+    """Raise an InputError if a scorer with `score_pairs` is no value: `jit` loses the method."""
+    if on_host(scorer) and jax.tree_util.all_leaves([scorer]):
+        name = type(scorer).__name__
+        raise InputError(f"{name}: expected a class with score_pairs that is a value; decorate it with @mfvpr.value")
 
 
 def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:

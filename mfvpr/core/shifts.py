@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mfvpr.core.types import Array, Matches
 from mfvpr.utils.errors import InputError
@@ -25,8 +25,10 @@ def match_shifts(matches: Matches) -> Float[jax.Array, "slots 2"]:
 def require_sizes(*image_sizes: Array | None) -> None:
     """Raise an InputError if the sizes of images are not known."""
     if any(size is None for size in image_sizes):
-        raise InputError("image_size: expected the sizes of both images, which this score needs, got None; give "
-                         "Features.of(..., image_size=(width, height))")  # fmt: skip
+        raise InputError(
+            "image_size: expected the sizes of both images, which this score needs, got None; give "
+            "Features.of(..., image_size=(width, height))"
+        )
 
 
 def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Array, "2"]]:
@@ -41,28 +43,3 @@ def image_sizes(matches: Matches) -> tuple[Float[jax.Array, "2"], Float[jax.Arra
     size0, size1 = at_least_single(matches.image_size0), at_least_single(matches.image_size1)
     usable = lambda size: has_matches | ((size > 0) & jnp.isfinite(size))  # noqa: E731
     return masked(size0, usable(size0), 1.0), masked(size1, usable(size1), 1.0)
-
-
-def query_features(matches: Matches) -> Float[jax.Array, ""]:
-    """Number of the query's keypoints, at least 1, float32: divisor of scores per feature."""
-    if matches.count0 is None:
-        raise InputError("per_feature=True: expected matches that know how many keypoints the query has (count0), got "
-                         "None")  # fmt: skip
-    return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)
-
-
-def where_usable(
-    values: Float[Array, "*weightings"],
-    matches: Matches,
-    shifts: Float[Array, "..."],
-    weights: Float[Array, "_ slots"],
-    usable: Bool[Array, ""],
-) -> Float[jax.Array, "*weightings"]:
-    """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
-    usable = usable & are_finite(shifts, weights)
-    return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
-
-
-def are_finite(shifts: Float[Array, "..."], weights: Float[Array, "weightings slots"]) -> Bool[Array, " weightings"]:
-    """Whether all shifts and the weights are finite."""
-    return jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)

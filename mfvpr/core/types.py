@@ -7,7 +7,7 @@ Matches also take lists, arrays of torch and other libraries (DLPack) on any dev
 """
 
 from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
@@ -40,9 +40,8 @@ def value(cls: Class) -> Class:
 
     A compiled program keeps the code of its methods and the values of globals: define the class again to change them.
 
-    `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 at least compares its
-    nodes without their class. The programs of this library tell the classes apart. With such classes, a `jit` of your
-    own may run the program of another class if hashes collide.
+    `jax.tree_util.register_dataclass` registers a class in the same way, but jaxlib up to 0.10 compares its nodes
+    without their class: with such classes, a `jit` of your own may run the program of another class.
     """
     data: Any = cls if is_dataclass(cls) and "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
     static = [f.name for f in fields(data) if f.metadata.get("static")]
@@ -71,15 +70,6 @@ def value(cls: Class) -> Class:
     return data
 
 
-def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
-    """Apply a function to the fields of a dataclass; the same object if none changes, or if it is no dataclass."""
-    if not is_dataclass(whole) or isinstance(whole, type):
-        return whole
-    parts = {part.name: getattr(whole, part.name) for part in fields(whole) if part.init}
-    changed = {name: new for name, part in parts.items() if (new := change(part)) is not part}
-    return replace(whole, **changed) if changed else whole
-
-
 def short_repr(self: Any) -> str:
     """`__repr__` of a dataclass with types and shapes in place of arrays, without None."""
     contents = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -103,8 +93,10 @@ def _check_arrays(self: Any) -> None:
         if name.startswith("image_size"):
             expected = (*(mask.shape[:-1] if name == "image_size" else np.shape(values)[:-1]), 2)
         if np.shape(values) != expected:
-            raise InputError(f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask "
-                             f"{list(mask.shape)}, got {list(np.shape(values))}")  # fmt: skip
+            raise InputError(
+                f"{type(self).__name__}.{name}: expected shape {list(expected)} beside a mask {list(mask.shape)}, "
+                f"got {list(np.shape(values))}"
+            )
 
 
 @value

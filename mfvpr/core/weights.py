@@ -1,12 +1,13 @@
 """Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot."""
 
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Num
 
+from mfvpr.core.parameters import Parameter, declare
 from mfvpr.core.types import INDICES, Array, Matches, per_match, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float, at_least_single, masked
@@ -99,6 +100,12 @@ WEIGHTS: dict[str, Weight] = {
     "ratio": RatioWeight(),
     "unit": UnitWeight(),
 }
+"""The fixed weights by the words of grids and settings."""
+
+
+def weight_field(word: str) -> Any:
+    """Declare a field that holds a weight, by default the one of a word."""
+    return declare(WEIGHTS[word], Parameter(word, choices=tuple(WEIGHTS)))
 
 
 def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"]:
@@ -117,8 +124,10 @@ def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"
     }
     weights = at_least_single(weight(replace(matches, **clean)))
     if weights.shape != matches.mask.shape:
-        raise InputError(f"weight: expected a weight for each of {list(matches.mask.shape)} matches, got an array "
-                         f"{list(weights.shape)}")  # fmt: skip
+        raise InputError(
+            f"weight: expected a weight for each of {list(matches.mask.shape)} matches, got an array "
+            f"{list(weights.shape)}"
+        )
     weights = masked(weights, matches.mask)
     return weights if matches.confidence is None else weights * match_confidence(matches)
 

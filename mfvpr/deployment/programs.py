@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import BIN_STEP
 from mfvpr.core.scorer import Scorer, on_host, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System

@@ -15,6 +15,7 @@ __all__ = [
     "Shard",
     "Split",
     "System",
+    "balancing_c",
     "best_setting",
     "calibration_data",
     "confidence_inputs",
@@ -22,12 +23,15 @@ __all__ = [
     "evaluation_protocol",
     "fill_shard",
     "fit_confidence",
+    "fuse_scales",
     "halves",
     "match_sequence",
     "mcnemar",
     "neighboring_settings",
+    "precision_recall",
     "rank_dataset",
     "read_confidences",
+    "reliability",
     "separate",
     "write_confidences",
 ]
@@ -45,9 +49,11 @@ from .evaluation import RankedDataset, Recall, rank_dataset
 from .fusion import FinalScore, FrameCorrelation, Fusion
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .rankings import Matched, Ranked
+from .reliability import precision_recall, reliability
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .sequences import DriveFilter
 from .shards import Shard, fill_shard
+from .shortlist_scores import balancing_c, fuse_scales
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

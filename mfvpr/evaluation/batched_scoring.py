@@ -10,11 +10,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
-from mfvpr.core.grids import score_settings
+from mfvpr.core.batch import BIN_STEP, score_settings
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import BIN_STEP, Scores, fuse_scales
 from mfvpr.core.scorer import Scorer, check_host, on_host, require_scores, score_pairs, with_static_functions
 from mfvpr.core.types import Array, Matches, Shortlist
+from mfvpr.evaluation.shortlist_scores import Scores, fuse_scales
 from mfvpr.matchers.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
@@ -24,9 +24,12 @@ PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, a
 
 
 def score(
-    scorers: Mapping[str, Scorer], match_set: MatchSet | Scales, candidates: Shortlist, *,
+    scorers: Mapping[str, Scorer],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    *,
     runtime: Runtime = DEFAULT_RUNTIME,
-) -> dict[str, Scores]:  # fmt: skip
+) -> dict[str, Scores]:
     """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
 
     All scorers together are one program for each shape of a batch, which is reused for other parameter values

@@ -14,10 +14,10 @@ places: if the drive passes a place twice, its images score high with each other
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.core.ranking import Scores
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.datasets.datasets import QuerySequence
+from mfvpr.evaluation.shortlist_scores import Scores
 from mfvpr.utils.errors import InputError
 
 PRIOR = 10  # average scores: on synthetic streets an image's scores vary ten times as much as the images' means

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.ranking import score_candidates
 from mfvpr.core.types import Features, Matches
 from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder

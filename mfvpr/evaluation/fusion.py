@@ -9,7 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.core.parameters import POSITIVE
-from mfvpr.core.ranking import (
+from mfvpr.core.types import Shortlist
+from mfvpr.evaluation.cohort_normalization import by_hubness
+from mfvpr.evaluation.rankings import COHORT, FRAMES, RETRIEVAL, Ranked
+from mfvpr.evaluation.sequences import DriveFilter
+from mfvpr.evaluation.shortlist_scores import (
     RetrievalScore,
     Scores,
     Ties,
@@ -17,11 +21,7 @@ from mfvpr.core.ranking import (
     fuse_shortlist,
     rank_shortlist,
     retrieval_scores,
-)  # fmt: skip
-from mfvpr.core.types import Shortlist
-from mfvpr.evaluation.cohort_normalization import by_hubness
-from mfvpr.evaluation.rankings import COHORT, FRAMES, RETRIEVAL, Ranked
-from mfvpr.evaluation.sequences import DriveFilter
+)
 from mfvpr.utils.errors import InputError, require_word
 
 
@@ -34,7 +34,7 @@ class Fusion:
             sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
             equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
             the same unit for every query. A score that is not finite affects only its own candidate.
-        retrieval_score: kind of retrieval score, see `mfvpr.core.ranking.retrieval_scores`.
+        retrieval_score: kind of retrieval score, see `mfvpr.evaluation.shortlist_scores.retrieval_scores`.
         weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
             and of further scorers, which take part only if they are named here.
     """

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from mfvpr.core.ranking import Scores
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import QuerySequence
+from mfvpr.evaluation.shortlist_scores import Scores
 from mfvpr.matchers.match_set import MatchSet, Scales
 
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking

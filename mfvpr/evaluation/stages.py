@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import BIN_STEP
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.batched_scoring import score

@@ -10,9 +10,8 @@ from jaxtyping import UInt8
 
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.parameters import check_bounds
-from mfvpr.core.ranking import Ties
 from mfvpr.core.scorer import Scorer
-from mfvpr.core.types import Shortlist, with_parts
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.images import resize, shape_size
 from mfvpr.evaluation import stages
@@ -20,6 +19,7 @@ from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_
 from mfvpr.evaluation.image_sizes import Note, size_for_images
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.sequences import DriveFilter
+from mfvpr.evaluation.shortlist_scores import Ties
 from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
@@ -27,6 +27,7 @@ from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.lightglue_matcher import LightGlueMatcher
 from mfvpr.matchers.match_set import Scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
+from mfvpr.retrieval.fitting import with_parts
 from mfvpr.retrieval.retriever import Retriever
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle

@@ -26,7 +26,7 @@ class PatchNetVladFeatures(NetworkExtractor):
 
     Attributes, beside those of `Extractor`:
         patch_sizes: sides of the patches, in positions of the map; each size is a scale.
-        scale_weights: weight of each scale's score, see `mfvpr.core.fuse_scales`; None = equal weights.
+        scale_weights: weight of each scale's score, see `mfvpr.evaluation.fuse_scales`; None = equal weights.
 
     Raises:
         InputError: another network; no patch sizes, duplicates, or a patch that is larger than the map; another number

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.batch import BIN_STEP, score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.parameters import with_capacity
-from mfvpr.core.ranking import BIN_STEP, score_candidates
 from mfvpr.core.scorer import Scorer, require_scores
 from mfvpr.core.types import Features, Matches
 from mfvpr.evaluation.stages import pair_shifts

@@ -166,8 +166,10 @@ class _CalledPairs:
         if isinstance(result, Mapping):
             result = [result.get(name) for name in ("matched_kpts0", "matched_kpts1", "matched_confidences")]
         if not isinstance(result, tuple | list) or len(result) not in (2, 3) or result[0] is None or result[1] is None:
-            raise InputError(f"{where}: expected two arrays and optionally confidences, or matched_kpts0 and "
-                             f"matched_kpts1, got {type(result).__name__}")  # fmt: skip
+            raise InputError(
+                f"{where}: expected two arrays and optionally confidences, or matched_kpts0 and "
+                f"matched_kpts1, got {type(result).__name__}"
+            )
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
         except InputError as error:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mfvpr.core.nearest_neighbors import at_least_one, distance_ratio, make_matches, ready, slot_numbers
-from mfvpr.core.similarity import lines_of, nearest
+from mfvpr.core.matching import at_least_one, distance_ratio, make_matches, slot_numbers
+from mfvpr.core.nearest import lines_of, nearest, ready
 from mfvpr.core.types import Features, Matches, short_repr, value
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError
@@ -70,8 +70,10 @@ class LightGlueMatcher:
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):
             if (got := features.descriptors.shape[-1]) != self.dimension:
-                raise InputError(f"LightGlue: expected descriptors of {self.dimension} dimensions, got {got}; take the "
-                                 "features that its weights are for")  # fmt: skip
+                raise InputError(
+                    f"LightGlue: expected descriptors of {self.dimension} dimensions, got {got}; take the "
+                    "features that its weights are for"
+                )
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
         best1, best0 = nearest(lines_of(assigned, axis=1)), nearest(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)

@@ -9,18 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from mfvpr.core.checked import Rounded
-from mfvpr.core.nearest_neighbors import (
-    CrossCheck,
-    Product,
-    choose_product,
-    filter_matches,
-    match,
-    match_rounded,
-    pairs_at_once,
-    prepare_query,
-    with_concrete_sizes,
-)
+from mfvpr.core.matching import filter_matches, match_prepared, pairs_at_once, prepare_query, with_concrete_sizes
+from mfvpr.core.nearest import CrossCheck, Product, Query, ready
 from mfvpr.core.types import Array, Features, Matches, value
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import as_array, compiled, is_concrete
@@ -71,17 +61,15 @@ class NearestNeighborMatcher:
         if self.product is not None:
             require_word("product", self.product, Product)
 
-    def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Features | Rounded:
-        """The queries, or what products of bfloat16 need of them."""
-        product = choose_product(self.product, queries, candidates, self.cross_check, chunk_size)
-        return queries if product == "float32" else jax.vmap(prepare_query)(queries)
+    def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Query:
+        """What matching needs of the queries `[B, N0]`."""
+        options = candidates, self.cross_check, chunk_size, self.product
+        return jax.vmap(lambda query: prepare_query(query, *options))(queries)
 
-    def __call__(self, features0: Features | Rounded, features1: Features) -> Matches:
+    def __call__(self, features0: Features | Query, features1: Features) -> Matches:
         """Matches of one pair, with the slots `[K]` of `match`."""
-        if isinstance(features0, Rounded):
-            matches = match_rounded(features0, features1, with_ratio=True)
-        else:
-            matches = match(features0, features1, cross_check=self.cross_check, with_ratio=True)
+        query = features0 if isinstance(features0, Query) else Query(ready(features0))
+        matches = match_prepared(query, features1, cross_check=self.cross_check, with_ratio=True)
         return filter_matches(matches, max_distance=self.max_distance, max_matches=self.max_matches)
 
 
@@ -124,8 +112,10 @@ def _require_rows(pairs: Int[Array, "pairs 2"], queries: Features, candidates: F
     if np.ndim(pairs) != 2 or not len(pairs) or np.shape(pairs)[1] != 2:
         raise InputError(f"pairs: expected rows of queries and candidates [P, 2], got shape {np.shape(pairs)}")
     if is_concrete(pairs) and ((np.asarray(pairs) < 0) | (np.asarray(pairs) >= images)).any():
-        raise InputError(f"pairs: expected rows of {images[0]} queries and {images[1]} candidates, got rows from "
-                         f"{np.min(pairs)} to {np.max(pairs)}")  # fmt: skip
+        raise InputError(
+            f"pairs: expected rows of {images[0]} queries and {images[1]} candidates, got rows from "
+            f"{np.min(pairs)} to {np.max(pairs)}"
+        )
 
 
 @partial(compiled, static_argnames="chunk_size")

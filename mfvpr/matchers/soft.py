@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.core.nearest_neighbors import at_least_one, keypoint_count, products, ready, slot_numbers
+from mfvpr.core.matching import at_least_one, keypoint_count, slot_numbers
+from mfvpr.core.nearest import products, ready
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.utils.numerics import as_float, masked, positive, safe_sqrt
 

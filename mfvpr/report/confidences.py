@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.core.metrics import chance_calibration_error, reliability
 from mfvpr.evaluation.calibration import write_confidences
 from mfvpr.evaluation.rankings import RETRIEVAL
+from mfvpr.evaluation.reliability import chance_calibration_error, reliability
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.metrics import PrecisionRecall, precision_recall
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth import Truth, Unit, middle, threshold_words
@@ -19,6 +18,7 @@ from mfvpr.evaluation.calibration import CalibrationData, absent_rankings, calib
 from mfvpr.evaluation.confidence import Confidence
 from mfvpr.evaluation.evaluation import KS, RankedDataset, Reason, Recall
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.reliability import PrecisionRecall, precision_recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mfvpr.core.metrics import PrecisionRecall, Reliability
+from mfvpr.evaluation.reliability import PrecisionRecall, Reliability
 from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
 
 BINS = 12  # of the matches, by the value of an input

@@ -1,14 +1,13 @@
 """Learn the parts of extractors and retrievals that depend on the database, and store them."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from mfvpr.core.types import with_parts
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
@@ -39,6 +38,15 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
         whitening = cache.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     return with_parts(tool, lambda part: fit_to_database(part, database, cache))
+
+
+def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
+    """Apply a function to the fields of a dataclass; the same object if none changes, or if it is no dataclass."""
+    if not is_dataclass(whole) or isinstance(whole, type):
+        return whole
+    parts = {part.name: getattr(whole, part.name) for part in fields(whole) if part.init}
+    changed = {name: new for name, part in parts.items() if (new := change(part)) is not part}
+    return replace(whole, **changed) if changed else whole
 
 
 def whitening_recipe(

@@ -11,7 +11,7 @@ from mfvpr.baselines import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
-from mfvpr.core.parameters import from_values
+from mfvpr.core.parameters import parameters_of
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System
@@ -257,6 +257,17 @@ def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
         name: from_values(SCORERS[values["method"]], _without(values, "method"))
         for name, values in expand_weights(settings).items()
     }
+
+
+def from_values(method: type, values: Mapping[str, Any]) -> Any:
+    """Create a scorer from plain values by field; a weight is a word, or the path of a file."""
+    parameters = parameters_of(method)
+    return method(
+        **{
+            name: NAMED_WEIGHTS[plain] if name == "weight" else parameters[name].value(plain)
+            for name, plain in values.items()
+        }
+    )
 
 
 def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -63,8 +63,10 @@ def test_minus_1000_may_be_a_number_that_is_expected():
         offsets = np.argwhere(10 + rows[:, None] * side + rows == -1000) - half
         expected = sum(
             not (0 <= row + down < side and 0 <= column + right < side)
-            for down, right in offsets for row in range(side) for column in range(side)
-        )  # fmt: skip
+            for down, right in offsets
+            for row in range(side)
+            for column in range(side)
+        )
         assert got == inside_only + expected
         assert (expected > 0) == meets
 
@@ -107,8 +109,10 @@ def test_matches_without_indices_and_impossible_grids_raise():
     with pytest.raises(InputError, match="expected matches that know their keypoints"):
         GridAnchors(3)(pair)
     for options, line in (
-        ({"side": 0}, "a side from 1"), ({"side": 9, "patch": 4}, "an odd patch"),
-        ({"side": 9, "patch": 11}, "patch up to it"), ({"side": 75}, "2\\^24"),
-    ):  # fmt: skip
+        ({"side": 0}, "a side from 1"),
+        ({"side": 9, "patch": 4}, "an odd patch"),
+        ({"side": 9, "patch": 11}, "patch up to it"),
+        ({"side": 75}, "2\\^24"),
+    ):
         with pytest.raises(InputError, match=line):
             GridAnchors(**options)

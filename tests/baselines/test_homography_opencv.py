@@ -21,8 +21,10 @@ pytestmark = pytest.mark.optimized
 
 
 def count_inliers(estimator, threshold=8.0, iterations=2000):
-    return [cv2.findHomography(*points, estimator, threshold, maxIters=iterations, confidence=0.995)[1].sum()
-            for points in POINTS]  # fmt: skip
+    return [
+        cv2.findHomography(*points, estimator, threshold, maxIters=iterations, confidence=0.995)[1].sum()
+        for points in POINTS
+    ]
 
 
 @pytest.mark.parametrize(("name", "estimator"), [("ransac", cv2.RANSAC), ("magsac", cv2.USAC_MAGSAC)])
@@ -38,8 +40,9 @@ def test_it_says_what_opencv_says(name, estimator):
 def test_without_numbers_of_keypoints_no_order_matters():
     points1, points0 = POINTS[1]
     shuffle = np.random.default_rng(1).permutation(len(points1))
-    scores = {float(OpenCvHomography()(make_matches(points0[order], points1[order])))
-              for order in (slice(None), shuffle)}  # fmt: skip
+    scores = {
+        float(OpenCvHomography()(make_matches(points0[order], points1[order]))) for order in (slice(None), shuffle)
+    }
     assert len(scores) == 1
 
 

@@ -49,11 +49,15 @@ def raw_oracle(matches, k, names):
         return (below + equal / 2) / len(real)
 
     values = {
-        "scores0": matches.scores0[k], "scores1": matches.scores1[k], "distance": matches.distance[k],
-        "ratio": matches.ratio[k], "distance_rank": rank(matches.distance), "score0_rank": rank(matches.scores0),
+        "scores0": matches.scores0[k],
+        "scores1": matches.scores1[k],
+        "distance": matches.distance[k],
+        "ratio": matches.ratio[k],
+        "distance_rank": rank(matches.distance),
+        "score0_rank": rank(matches.scores0),
         "score1_rank": rank(matches.scores1),
         "relative_distance": matches.distance[k] / np.median([matches.distance[other] for other in real]),
-    }  # fmt: skip
+    }
     for side in "01":
         points, size = getattr(matches, f"points{side}"), getattr(matches, f"image_size{side}")
         for axis, name in enumerate("xy"):
@@ -133,8 +137,12 @@ def test_relative_inputs_are_those_of_other_units():
     """Another detector's scores, another length of descriptors; and more padding."""
     matches, weight = pair_of(pairs(7)), random_weight(RELATIVE)
     expected = weigh(weight, matches)[:40]
-    other = replace(matches, scores0=np.float32(8) * matches.scores0 ** 3, scores1=matches.scores1 + 5,
-                    distance=np.float32(4) * matches.distance)  # fmt: skip
+    other = replace(
+        matches,
+        scores0=np.float32(8) * matches.scores0**3,
+        scores1=matches.scores1 + 5,
+        distance=np.float32(4) * matches.distance,
+    )
     np.testing.assert_allclose(weigh(weight, other)[:40], expected, rtol=1e-5)
     wider = pair_of(pairs(7, capacity=100))
     np.testing.assert_allclose(weigh(weight, wider)[:40], expected, rtol=1e-6)
@@ -161,8 +169,11 @@ def test_gradients_are_finite_and_statistics_have_none():
 
     @jax.jit
     def total(weight, points0, distance):
-        return jnp.sum(score_candidates(HistogramOfShifts(weight=weight, max_bins=64),
-                                        replace(matches, points0=points0, distance=distance)))  # fmt: skip
+        return jnp.sum(
+            score_candidates(
+                HistogramOfShifts(weight=weight, max_bins=64), replace(matches, points0=points0, distance=distance)
+            )
+        )
 
     learned, points0, distance = jax.grad(total, argnums=(0, 1, 2))(weight, matches.points0, matches.distance)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((learned, points0, distance)))

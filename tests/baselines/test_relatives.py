@@ -57,8 +57,13 @@ def test_lost_agrees_with_the_loop(matches, form, mirrored):
 
 
 def as_features(points, descriptors):
-    return Features(points.astype(np.float32), descriptors, np.ones(len(points), np.float32),
-                    np.ones(len(points), bool), np.array(public.SIZE, np.float32))  # fmt: skip
+    return Features(
+        points.astype(np.float32),
+        descriptors,
+        np.ones(len(points), np.float32),
+        np.ones(len(points), bool),
+        np.array(public.SIZE, np.float32),
+    )
 
 
 def test_rapid_is_that_of_patch_netvlad(golden):
@@ -121,9 +126,9 @@ def test_phrases_of_very_many_matches_are_exact_to_rounding():
 
 
 @pytest.mark.parametrize(
-    ("cell_size", "side"), [(size, "above") for size in (15.0, 0.1, 1 / 3, 7.3, 49.0)]
-    + [(size, "below") for size in (0.1, 1 / 3, 7.3)]
-)  # fmt: skip
+    ("cell_size", "side"),
+    [(size, "above") for size in (15.0, 0.1, 1 / 3, 7.3, 49.0)] + [(size, "below") for size in (0.1, 1 / 3, 7.3)],
+)
 def test_an_edge_belongs_to_the_cell_above_and_shifts_just_below_it_to_the_cell_below(cell_size, side):
     """Though a quotient may be rounded across a whole number: every such shift agrees with the middle of its cell."""
     size = np.float32(cell_size)
@@ -163,9 +168,17 @@ def test_lost_where_there_is_nothing_to_weigh():
     assert score(LostScore(), origin) == pytest.approx(expected, rel=1e-6)
 
 
-EVERY = [RapidSpatialScore(), RapidSpatialScore("largest_coordinate"), RapidSpatialScore("largest_shift", (9.0, 1.0)),
-         VisualPhrases(1), VisualPhrases(8, 1e-6), VisualPhrases(3, 1e12), LostScore(), LostScore("unweighted", True),
-         LostScore("described")]  # fmt: skip
+EVERY = [
+    RapidSpatialScore(),
+    RapidSpatialScore("largest_coordinate"),
+    RapidSpatialScore("largest_shift", (9.0, 1.0)),
+    VisualPhrases(1),
+    VisualPhrases(8, 1e-6),
+    VisualPhrases(3, 1e12),
+    LostScore(),
+    LostScore("unweighted", True),
+    LostScore("described"),
+]
 gradients = jax.jit(jax.value_and_grad(lambda rows, scorer, matches: scorer(replace(matches, **rows))))
 
 

@@ -38,13 +38,22 @@ def test_numbers_that_are_not_finite_are_not_written(tmp_path):
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": "mfvpr match weight 0"}, {"inputs": ["ratio"]}, {"inputs": ["ratio", "x", "x0", "x1", "y0"]},
-        {"scale": [1, 1, 0, 1, 1]}, {"hidden": [[0] * 3] * 4}, {"output": [1, "a", 2]}, {"output_bias": [1]},
-        {"center": None}, {"scale": [1, 1, 1e-300, 1, 1]}, {"output_bias": 1e300}, {"output_bias": True},
-        {"output_bias": 10**400}, {"inputs": ["ratio", "ratio", "score0_rank", "score1_rank", "distance_rank"]},
+        {"format": "mfvpr match weight 0"},
+        {"inputs": ["ratio"]},
+        {"inputs": ["ratio", "x", "x0", "x1", "y0"]},
+        {"scale": [1, 1, 0, 1, 1]},
+        {"hidden": [[0] * 3] * 4},
+        {"output": [1, "a", 2]},
+        {"output_bias": [1]},
+        {"center": None},
+        {"scale": [1, 1, 1e-300, 1, 1]},
+        {"output_bias": 1e300},
+        {"output_bias": True},
+        {"output_bias": 10**400},
+        {"inputs": ["ratio", "ratio", "score0_rank", "score1_rank", "distance_rank"]},
         {"inputs": dict.fromkeys(RELATIVE)},
     ],
-)  # fmt: skip
+)
 def test_damaged_files_raise(tmp_path, change):
     path = tmp_path / "weight.json"
     write_weight(path, create(), PROVENANCE)

@@ -14,8 +14,8 @@ import mfvpr
 from mfvpr import HistogramOfShifts
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, provenance, read_weight, write_weight
-from mfvpr.core.parameters import from_values
 from mfvpr.core.weights import WEIGHTS
+from mfvpr.systems.assembly import from_values
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed
 
@@ -120,10 +120,18 @@ def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):
         assert words in stderr
 
 
-@pytest.mark.parametrize("provenance", [
-    {"data_sets": ["a", "b"]}, {"data_sets": 5}, {"data_fingerprint": ["x"]}, {"data_fingerprint": {"database": ["x"]}},
-    {"settings": None}, {"settings": {"features": "sift"}}, {"data_sets": [{"data_fingerprint": {"query": None}}]},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "provenance",
+    [
+        {"data_sets": ["a", "b"]},
+        {"data_sets": 5},
+        {"data_fingerprint": ["x"]},
+        {"data_fingerprint": {"database": ["x"]}},
+        {"settings": None},
+        {"settings": {"features": "sift"}},
+        {"data_sets": [{"data_fingerprint": {"query": None}}]},
+    ],
+)
 def test_any_provenance_is_allowed(run, file, tmp_path, provenance):
     write_weight(file, WEIGHT, provenance)
     code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / "out"))

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.core import precision_recall, reliability
-from mfvpr.evaluation import read_confidences
+from mfvpr.evaluation import precision_recall, read_confidences, reliability
 from mfvpr.evaluation.system import noise_image
 from tests.programs import QUERIES, csv_rows, small
 

@@ -9,22 +9,20 @@ import pytest
 
 from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, value
 from mfvpr.baselines import ALONE, SCORERS
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
 from mfvpr.cli import axes, command_line, declare, groups, help_text, overrides
 from mfvpr.core import match_shifts
 from mfvpr.core.parameters import (
     check_plain,
     choice,
     flag,
-    from_values,
     integer,
     number,
     numbers,
     parameters_of,
-    table_value,
 )
 from mfvpr.core.types import Array, Matches
-from mfvpr.core.weights import UnitWeight, Weight, match_weights
+from mfvpr.core.weights import UnitWeight, Weight, match_weights, weight_field
 from mfvpr.systems import assembly, settings
 from mfvpr.systems.settings import CONF
 from mfvpr.tuning.learning.models import can_learn, first_numbers
@@ -41,7 +39,7 @@ class Nearness:
     most: float | Array | None = number(None, "px", "None = all", bounds=(1, 500))
     rounds: int = integer(2, "iterations", bounds=(1, 9))
     norm: str = choice("sum", "largest", note="of x and y")
-    weight: Weight = table_value(NAMED_WEIGHTS, "unit", file=SUFFIX)
+    weight: Weight = weight_field("unit")
     size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = any")
     strict: bool = flag(False)
     inner: tuple = ()  # no setting
@@ -94,7 +92,7 @@ def test_every_field_of_a_scorer_is_a_setting_whose_default_is_its_own():
     for scorer in SCORERS.values():
         assert [*parameters_of(scorer)] == [*scorer.__dataclass_fields__]
         assert (
-            from_values(scorer, {name: parameter.default for name, parameter in parameters_of(scorer).items()})
+            assembly.from_values(scorer, {name: parameter.default for name, parameter in parameters_of(scorer).items()})
             == scorer()
         )
 
@@ -152,7 +150,9 @@ def test_all_scores_contain_it(near):
 
 def test_plain_values_become_the_fields(near):
     plain = {"radius": 3.0, "most": None, "size": [1, 2], "weight": "unit", "strict": True}
-    assert from_values(Nearness, plain) == Nearness(3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True)
+    assert assembly.from_values(Nearness, plain) == Nearness(
+        3.0, None, size=(1.0, 2.0), weight=UnitWeight(), strict=True
+    )
     with pytest.raises(ValueError, match=r"Nearness\(norm='both'\): .*sum, largest"):
         Nearness(norm="both")
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.core import checked, nearest_neighbors
-from mfvpr.core.nearest_neighbors import match_rounded, prepare_query
+from mfvpr.core import checked
+from mfvpr.core.matching import match, match_prepared
+from mfvpr.core.nearest import ready
 from mfvpr.core.types import per_match
 from mfvpr.features import Sift
 from mfvpr.matchers.matcher import match_pairs
@@ -31,10 +32,24 @@ rounded_once = jax.jit(
 )
 
 
+WORTHWHILE_CHECKS = checked.WORTHWHILE_CHECKS
+
+
+def round_query(query):
+    query = ready(query)
+    return checked.RoundedQuery(query, checked.round_query(query))
+
+
+def match_rounded(query, candidate):
+    """`match` with products of bfloat16."""
+    query = query if isinstance(query, checked.RoundedQuery) else round_query(query)
+    return match_prepared(query, candidate, cross_check="mutual", with_ratio=True)
+
+
 @pytest.fixture(autouse=True)
 def check_every_pair(monkeypatch):
-    """Pairs that the guess would leave to float32 are checked as well."""
-    monkeypatch.setattr(nearest_neighbors, "tells_apart", lambda *_: True)
+    """Pairs that would be left to float32 are checked as well."""
+    monkeypatch.setattr(checked, "WORTHWHILE_CHECKS", np.inf)
 
 
 def numpy_products(rows0, rows1):
@@ -86,8 +101,11 @@ def neighbors_in_numpy(query, candidate):
     products = np.where(usable, products, -np.inf)
     order = np.argsort(-products, axis=1, kind="stable")
     back = np.argmax(products, axis=0)
-    return {i: (j, second) for i, (j, second) in enumerate(order[:, :2].tolist())
-            if products[i, j] > -np.inf and back[j] == i}  # fmt: skip
+    return {
+        i: (j, second)
+        for i, (j, second) in enumerate(order[:, :2].tolist())
+        if products[i, j] > -np.inf and back[j] == i
+    }
 
 
 @pytest.mark.parametrize("dimensions", [1, 7, 8, 100, 512])
@@ -142,9 +160,7 @@ def test_the_bound_holds_and_is_needed(monkeypatch):
     wrong = 0
     for seed in range(4):
         query, candidate = make_pair("positive", seed, (400, 500))
-        matches = jax.jit(lambda *pair: match_rounded(prepare_query(pair[0]), pair[1], with_ratio=True))(
-            query, candidate
-        )
+        matches = jax.jit(lambda *pair: match_rounded(*pair))(query, candidate)
         places = np.flatnonzero(matches.mask)
         expected = {(i, j) for i, (j, _) in neighbors_in_numpy(query, candidate).items()}
         wrong += expected != {*zip(places.tolist(), np.asarray(matches.index1)[places].tolist(), strict=True)}
@@ -221,18 +237,18 @@ def test_too_many_close_products_are_left_to_float32(noise, with_ratio):
 
 def assert_as_in_float32(query, candidate, monkeypatch):
     """Whatever the guess says, matches are those of float32."""
-    in_single = nearest_neighbors.match(query, candidate, with_ratio=True)
+    in_single = match(query, candidate, with_ratio=True)
     mask = np.asarray(in_single.mask)
     with monkeypatch.context() as patch:
-        for guess in (checked.tells_apart, lambda *_: jnp.bool_(False)):
-            patch.setattr(nearest_neighbors, "tells_apart", guess)
-            rounded = match_rounded(prepare_query(query), candidate, with_ratio=True)
+        for most in (WORTHWHILE_CHECKS, -np.inf):
+            patch.setattr(checked, "WORTHWHILE_CHECKS", most)
+            rounded = match_rounded(query, candidate)
             np.testing.assert_array_equal(rounded.mask, mask)
             np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
-def test_a_guess_leaves_equal_and_nearly_equal_images_to_float32(kind, monkeypatch):
+def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
     query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))
     if kind == "equal":
         query.descriptors[:], candidate.descriptors[:] = query.descriptors[0], query.descriptors[0]
@@ -242,8 +258,10 @@ def test_a_guess_leaves_equal_and_nearly_equal_images_to_float32(kind, monkeypat
     if kind == "all padding":
         query.mask[:] = False
     assert_as_in_float32(query, candidate, monkeypatch)
-    tells_apart = checked.tells_apart(prepare_query(query), checked.round_candidate(nearest_neighbors.ready(candidate)))
-    assert tells_apart == (kind not in ("twins", "near twins", "equal", "three times"))
+    monkeypatch.setattr(checked, "WORTHWHILE_CHECKS", WORTHWHILE_CHECKS)
+    rounded = round_query(query).rounded, checked.round_candidate(ready(candidate))
+    _, settled = jax.jit(partial(checked.mutual_neighbors, with_second=False))(*rounded)
+    assert settled == (kind not in ("twins", "near twins", "equal", "three times"))
 
 
 @pytest.mark.parametrize("kind", ["infinite", "far too long", "rounded to infinity", "overflow"])
@@ -306,13 +324,15 @@ def test_no_pair_of_conversions_hides_what_rounding_takes_away():
 def test_other_devices_than_a_cpu_take_float32(monkeypatch):
     query, candidate = make_pair("random")
     batch = stack([candidate])
-    monkeypatch.setattr(nearest_neighbors, "device_of", lambda _: SimpleNamespace(platform="gpu"))
-    choose = partial(nearest_neighbors.choose_product, queries=query, candidates=batch, cross_check="mutual")
+    monkeypatch.setattr(checked, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    choose = partial(checked.choose_product, query=query, candidates=batch, cross_check="mutual")
     assert {choose(product, chunk_size=8) for product in (None, "bfloat16", "float32")} == {"float32"}
     # A program that was traced for a CPU and is compiled for a GPU has no products of bfloat16.
-    function = jax.jit(partial(match_rounded, with_ratio=False)).trace(prepare_query(query), candidate)
-    products = {platform: "xbf16>) -> tensor" in function.lower(lowering_platforms=(platform,)).as_text()
-                for platform in ("cpu", "cuda")}  # fmt: skip
+    function = jax.jit(match_rounded).trace(round_query(query), candidate)
+    products = {
+        platform: "xbf16>) -> tensor" in function.lower(lowering_platforms=(platform,)).as_text()
+        for platform in ("cpu", "cuda")
+    }
     assert products == {"cpu": True, "cuda": False}
 
 
@@ -335,17 +355,17 @@ def test_bfloat16_is_taken_for_long_descriptors_where_it_is_faster(monkeypatch):
     long, short = (make_features(rng, 4, dimension=dimension) for dimension in (256, 128))
 
     def choose(features, cross_check="mutual", chunk_size=1):
-        return nearest_neighbors.choose_product(None, features, features, cross_check, chunk_size)
+        return checked.choose_product(None, features, features, cross_check, chunk_size)
 
-    monkeypatch.setattr(nearest_neighbors, "has_bfloat16", lambda: True)
+    monkeypatch.setattr(checked, "has_bfloat16", lambda: True)
     assert choose(long) == "bfloat16"
     assert {choose(short), choose(long, "none"), choose(long, chunk_size=2)} == {"float32"}
-    monkeypatch.setattr(nearest_neighbors, "has_bfloat16", lambda: False)
+    monkeypatch.setattr(checked, "has_bfloat16", lambda: False)
     assert choose(long) == "float32"
     with pytest.raises(ValueError, match="expected cross_check=mutual"):
         mfvpr.match_candidates(long, stack([long]), cross_check="none", product="bfloat16")
     with pytest.raises(ValueError, match="expected cross_check=mutual and chunk_size=1; leave product out"):
-        nearest_neighbors.choose_product("bfloat16", long, long, "none", 2)
+        checked.choose_product("bfloat16", long, long, "none", 2)
     with pytest.raises(ValueError, match="product='half': expected one of bfloat16, float32"):
         mfvpr.NearestNeighborMatcher(product="half")
     with pytest.raises(ValueError, match="cross_check='x': expected one of"):

@@ -40,9 +40,12 @@ def test_a_bin_size_below_0_raises():
 
 @pytest.mark.parametrize(
     ("count", "align"),
-    [case for count in (15, 29, 30, 31, 58, 60)
-     for case in ((count, "min_edge"), (count, "zero_center" if count % 2 else "zero_edge"))],
-)  # fmt: skip
+    [
+        case
+        for count in (15, 29, 30, 31, 58, 60)
+        for case in ((count, "min_edge"), (count, "zero_center" if count % 2 else "zero_edge"))
+    ],
+)
 def test_rounding_adds_no_bin_that_holds_nothing(count, align):
     """Bins that tile the range exactly, in widths that binary fractions only approximate."""
     scorer = HistogramOfShifts(bin_size=2 * SIZE / count, align=align)

@@ -109,12 +109,19 @@ def test_integers_and_double_precision_mode_are_welcome(scorer):
 @pytest.mark.parametrize(
     ("scorer", "field", "word"),
     [
-        (HistogramOfShifts, "align", "zero_centre"), (HistogramOfShifts, "direction", "x"),
-        (AnchorPoints, "window_mode", "x"), (AnchorPoints, "first", "reference"), (AnchorPoints, "cell_weight", "x"),
-        (AggregatedScore, "mean", "medain"), (RapidSpatialScore, "reach", "largest"), (LostScore, "form", "cosine"),
-        (VisualPhrases, "align", "min_edge"), (GridAnchors, "outside", "one"), (Homography, "measure", "most"),
+        (HistogramOfShifts, "align", "zero_centre"),
+        (HistogramOfShifts, "direction", "x"),
+        (AnchorPoints, "window_mode", "x"),
+        (AnchorPoints, "first", "reference"),
+        (AnchorPoints, "cell_weight", "x"),
+        (AggregatedScore, "mean", "medain"),
+        (RapidSpatialScore, "reach", "largest"),
+        (LostScore, "form", "cosine"),
+        (VisualPhrases, "align", "min_edge"),
+        (GridAnchors, "outside", "one"),
+        (Homography, "measure", "most"),
     ],
-)  # fmt: skip
+)
 def test_misspelled_choices_raise(scorer, field, word):
     with pytest.raises(ValueError, match=rf"{scorer.__name__}\({field}='{word}'\): expected one of"):
         scorer(**{field: word})
@@ -123,12 +130,16 @@ def test_misspelled_choices_raise(scorer, field, word):
 @pytest.mark.parametrize(
     ("scorer", "values"),
     [
-        (HistogramOfShifts, {"sigma": -3}), (HistogramOfShifts, {"temperature": np.nan}),
-        (HistogramOfShifts, {"shift_range": (10.0, -1.0)}), (AnchorPoints, {"tolerance": 0.0}),
-        (Homography, {"confidence": 1.5}), (VisualPhrases, {"cell_size": np.float64(-1)}),
-        (RapidSpatialScore, {"size": (0.0, 10.0)}), (AggregatedScore, {"temperature": -1}),
+        (HistogramOfShifts, {"sigma": -3}),
+        (HistogramOfShifts, {"temperature": np.nan}),
+        (HistogramOfShifts, {"shift_range": (10.0, -1.0)}),
+        (AnchorPoints, {"tolerance": 0.0}),
+        (Homography, {"confidence": 1.5}),
+        (VisualPhrases, {"cell_size": np.float64(-1)}),
+        (RapidSpatialScore, {"size": (0.0, 10.0)}),
+        (AggregatedScore, {"temperature": -1}),
     ],
-)  # fmt: skip
+)
 def test_python_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
     with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected numbers from"):
         scorer(**values)

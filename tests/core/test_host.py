@@ -53,12 +53,13 @@ def answer(masks):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda _: 1.0, r"\d+ pairs, got an array"), (lambda _: np.ones(1), r"\d+ pairs, got an array"),
+        (lambda _: 1.0, r"\d+ pairs, got an array"),
+        (lambda _: np.ones(1), r"\d+ pairs, got an array"),
         (lambda masks: masks[:, :1], r"\d+ pairs, got an array"),
         (lambda masks: masks.sum(axis=1) * 1j, "real numbers.* got complex"),
         (lambda masks: ["x"] * len(masks), "real numbers.* got <U"),
     ],
-)  # fmt: skip
+)
 def test_a_real_number_for_each_pair_is_expected(monkeypatch, way, wrong, words):
     monkeypatch.setitem(globals(), "answer", wrong)
     with pytest.raises(InputError, match=rf"Host\.score_pairs: .*{words}"):

@@ -80,16 +80,31 @@ def oracle_inputs(matches, weight):
 def test_histogram(matches, weight, align, parameters, truncate, shift_range, variance, direction):
     bin_size, sigma = parameters
     scorer = HistogramOfShifts(
-        bin_size=bin_size, sigma=sigma, truncate=truncate, align=align, shift_range=shift_range,
-        sigma_is_variance=variance, direction=direction, weight=WEIGHTS[weight][0], max_bins=CAPACITY,
-    )  # fmt: skip
+        bin_size=bin_size,
+        sigma=sigma,
+        truncate=truncate,
+        align=align,
+        shift_range=shift_range,
+        sigma_is_variance=variance,
+        direction=direction,
+        weight=WEIGHTS[weight][0],
+        max_bins=CAPACITY,
+    )
     points0, points1, weights = oracle_inputs(matches, weight)
     ends = [(points0, matches.image_size0), (points1, matches.image_size1)]
     (start, size0), (end, size1) = ends if direction == "candidate_minus_query" else ends[::-1]
     expected, centers_x, centers_y = oracles.histogram_of_shifts(
-        end - start, weights, size0, size1, bin_size=bin_size, sigma=sigma,
-        truncate=truncate * (1 + 1e-6), align=align, shift_range=shift_range, sigma_is_variance=variance,
-    )  # fmt: skip
+        end - start,
+        weights,
+        size0,
+        size1,
+        bin_size=bin_size,
+        sigma=sigma,
+        truncate=truncate * (1 + 1e-6),
+        align=align,
+        shift_range=shift_range,
+        sigma_is_variance=variance,
+    )
     got = scorer.histogram(matches)
     rows, columns = expected.shape
     assert scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins == max(expected.shape)
@@ -114,9 +129,14 @@ def test_histogram(matches, weight, align, parameters, truncate, shift_range, va
 def test_anchor(matches, weight, parameters, window_mode, first, include_self, cell_weight, num_bins):
     window, tolerance = parameters
     options = {
-        "window": window, "tolerance": tolerance, "window_mode": window_mode, "first": first,
-        "include_self": include_self, "cell_weight": cell_weight, "num_bins": num_bins,
-    }  # fmt: skip
+        "window": window,
+        "tolerance": tolerance,
+        "window_mode": window_mode,
+        "first": first,
+        "include_self": include_self,
+        "cell_weight": cell_weight,
+        "num_bins": num_bins,
+    }
     points0, points1, weights = oracle_inputs(matches, weight)
     expected = oracles.anchor_points(points0, points1, weights, matches.image_size0, matches.image_size1, **options)
     got = AnchorPoints(weight=WEIGHTS[weight][0], **options)(matches)

@@ -67,10 +67,16 @@ def draws(scorers, temperatures):
 
 def test_points_outside_of_an_image_are_at_its_border():
     matches = random_matches(np.random.default_rng(0), 16, capacity=16)
-    border = replace(matches, points0=np.where(matches.points0 < 90, 0, matches.points0).astype(np.float32),
-                     points1=np.where(matches.points1 > 250, SIZE, matches.points1).astype(np.float32))  # fmt: skip
-    outside = replace(border, points0=np.where(border.points0 == 0, np.float32(-40), border.points0),
-                      points1=np.where(border.points1 == SIZE, np.float32(SIZE + 99), border.points1))  # fmt: skip
+    border = replace(
+        matches,
+        points0=np.where(matches.points0 < 90, 0, matches.points0).astype(np.float32),
+        points1=np.where(matches.points1 > 250, SIZE, matches.points1).astype(np.float32),
+    )
+    outside = replace(
+        border,
+        points0=np.where(border.points0 == 0, np.float32(-40), border.points0),
+        points1=np.where(border.points1 == SIZE, np.float32(SIZE + 99), border.points1),
+    )
     scorer = replace(ANCHORS[0], temperature=0.3)
     assert score(scorer, outside) == score(scorer, border) != score(scorer, matches)
 
@@ -109,9 +115,14 @@ def test_aggregate_agrees_with_the_loop(matches, scorer, temperature):
         weights = confidence = np.zeros(0)
         points0 = points1 = np.zeros((0, 2))
     expected = soft_oracles.aggregated_score(
-        points1 - points0, weights, confidence, matches.image_size0,
-        temperature=temperature, mean=scorer.mean, clamp=scorer.clamp,
-    )  # fmt: skip
+        points1 - points0,
+        weights,
+        confidence,
+        matches.image_size0,
+        temperature=temperature,
+        mean=scorer.mean,
+        clamp=scorer.clamp,
+    )
     np.testing.assert_allclose(score(replace(scorer, temperature=temperature), matches), expected, rtol=2e-5)
 
 

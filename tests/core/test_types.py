@@ -252,11 +252,25 @@ def test_features_have_defaults_but_no_image_size():
                 mfvpr.score_candidates(scorer, matches)
 
 
-@pytest.mark.parametrize(("name", "shape"), [
-    ("keypoints", (8, 2)), ("keypoints", (2, 9)), ("descriptors", (8, 9)), ("scores", (9, 1)), ("scores", (1,)),
-    ("image_size", ()), ("image_size", (3,)), ("image_size", (1, 2)), ("points0", (1, 2)), ("points1", (9, 3)),
-    ("scores0", (1,)), ("distance", (1,)), ("confidence", (3,)), ("image_size1", (4,)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("keypoints", (8, 2)),
+        ("keypoints", (2, 9)),
+        ("descriptors", (8, 9)),
+        ("scores", (9, 1)),
+        ("scores", (1,)),
+        ("image_size", ()),
+        ("image_size", (3,)),
+        ("image_size", (1, 2)),
+        ("points0", (1, 2)),
+        ("points1", (9, 3)),
+        ("scores0", (1,)),
+        ("distance", (1,)),
+        ("confidence", (3,)),
+        ("image_size1", (4,)),
+    ],
+)
 def test_arrays_of_different_lengths_are_refused(name, shape):
     rng = np.random.default_rng(0)
     data = next(data for data in (make_features(rng, 9), random_matches(rng, 9)) if hasattr(data, name))

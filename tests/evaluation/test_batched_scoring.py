@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.core import ranking
-from mfvpr.evaluation import stages
+from mfvpr.evaluation import shortlist_scores, stages
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers import match_set as match_sets
 from mfvpr.tuning import sweeps
@@ -119,7 +118,9 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tm
         listed = replace(candidates, mask=seen)
         for rows, setting in zip(by_setting, settings, strict=True):
             scores = stages.score({"sum": mfvpr.AggregatedScore(mean=setting["mean"])}, scales, listed)["sum"]
-            order = ranking.rank_shortlist(listed, ranking.fuse_shortlist(listed, scores, setting["c"]))
+            order = shortlist_scores.rank_shortlist(
+                listed, shortlist_scores.fuse_shortlist(listed, scores, setting["c"])
+            )
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
 

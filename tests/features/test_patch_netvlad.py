@@ -10,7 +10,7 @@ import pytest
 import mfvpr
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.cli import inputs
-from mfvpr.core import fuse_scales
+from mfvpr.evaluation import fuse_scales
 from mfvpr.features import PatchNetVladFeatures
 from mfvpr.networks import VggNetVlad
 from mfvpr.retrieval import Retrieval

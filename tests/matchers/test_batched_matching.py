@@ -17,9 +17,9 @@ import pytest
 import mfvpr
 from mfvpr import Matches
 from mfvpr.core import filter_matches
-from mfvpr.core.ranking import rank_shortlist
 from mfvpr.core.types import Shortlist, per_match, per_pair
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.shortlist_scores import rank_shortlist
 from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matchers import MatchSet, NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched
@@ -117,10 +117,17 @@ def assert_same(first, second):
 
 @pytest.mark.optimized
 @pytest.mark.first_case
-@pytest.mark.parametrize("options", [
-    {}, {"cross_check": "none"}, {"max_distance": 0.6, "max_matches": 7}, {"cross_check": "candidate"},
-    {"cross_check": "opencv_legacy", "chunk_size": 3},
-], ids=["mutual", "none", "filtered", "candidate", "chunks"])  # fmt: skip
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"cross_check": "none"},
+        {"max_distance": 0.6, "max_matches": 7},
+        {"cross_check": "candidate"},
+        {"cross_check": "opencv_legacy", "chunk_size": 3},
+    ],
+    ids=["mutual", "none", "filtered", "candidate", "chunks"],
+)
 @pytest.mark.parametrize("memory", [None, SMALL], ids=["all fits", "few slots"])
 def test_every_pair_is_matched_as_alone(options, memory):
     queries, database = sets()
@@ -312,13 +319,21 @@ def test_batches_have_every_pair_with_matches_once(match_set):
 
 def test_image_sizes_are_all_combinations():
     def of_query(width):
-        return Matches(*(np.zeros((0, 2), np.float32),) * 2, *(np.zeros(0, np.float32),) * 3, np.zeros(0, bool),
-                       np.array([width, 9], np.float32), np.array([[5, 6], [7, 8]], np.float32))  # fmt: skip
+        return Matches(
+            *(np.zeros((0, 2), np.float32),) * 2,
+            *(np.zeros(0, np.float32),) * 3,
+            np.zeros(0, bool),
+            np.array([width, 9], np.float32),
+            np.array([[5, 6], [7, 8]], np.float32),
+        )
 
     sizes0, sizes1 = MatchSet.of([of_query(width) for width in (3, 4, 3)], np.zeros((3, 2), int)).image_sizes
     assert {(*a, *b) for a, b in zip(sizes0.tolist(), sizes1.tolist(), strict=True)} == {
-        (3, 9, 5, 6), (3, 9, 7, 8), (4, 9, 5, 6), (4, 9, 7, 8)
-    }  # fmt: skip
+        (3, 9, 5, 6),
+        (3, 9, 7, 8),
+        (4, 9, 5, 6),
+        (4, 9, 7, 8),
+    }
     assert len(sizes0) == 4
 
 

@@ -148,8 +148,10 @@ def test_a_function_may_change_its_arguments_and_reuse_its_results(dataset):
         second.descriptors[:] = 0
         return numbers
 
-    clean, changed = (matched(data, mfvpr.HostMatcher(function, "neighbors", inputs="features"))
-                      for function in (mutual_neighbors, neighbors))  # fmt: skip
+    clean, changed = (
+        matched(data, mfvpr.HostMatcher(function, "neighbors", inputs="features"))
+        for function in (mutual_neighbors, neighbors)
+    )
     for name in ("points0", "points1", "distance"):
         values = [getattr(each.matches[0].matches[1], name) for each in (clean, changed)]
         np.testing.assert_array_equal(*values)
@@ -241,10 +243,18 @@ class VismatchStandIn:
         assert 0.5 < img0.max() <= 1
         points = np.argwhere(img0[0] >= np.quantile(img0[0], 0.99))[:20, ::-1].astype(np.float32)
         return {
-            "num_inliers": 0, "H": None, "all_kpts0": points, "all_kpts1": points, "all_desc0": np.empty((0, 2)),
-            "all_desc1": np.empty((0, 2)), "matched_kpts0": points, "matched_kpts1": points,
-            "inlier_kpts0": np.empty((0, 2)), "inlier_kpts1": np.empty((0, 2)), "matched_confidences": None,
-        }  # fmt: skip
+            "num_inliers": 0,
+            "H": None,
+            "all_kpts0": points,
+            "all_kpts1": points,
+            "all_desc0": np.empty((0, 2)),
+            "all_desc1": np.empty((0, 2)),
+            "matched_kpts0": points,
+            "matched_kpts1": points,
+            "inlier_kpts0": np.empty((0, 2)),
+            "inlier_kpts1": np.empty((0, 2)),
+            "matched_confidences": None,
+        }
 
 
 def vismatch_adapter(network):

@@ -183,9 +183,15 @@ class InOrder:
         other = np.minimum(number, features1.mask.shape[-1] - 1)
         mask = features0.mask & features1.mask[other] & (number == other) & (number.astype(np.float32) < self.limit)
         return mfvpr.Matches(
-            features0.keypoints, features1.keypoints[other], features0.scores, features0.scores,
-            features1.scores[other], mask, features0.image_size, features1.image_size,
-        )  # fmt: skip
+            features0.keypoints,
+            features1.keypoints[other],
+            features0.scores,
+            features0.scores,
+            features1.scores[other],
+            mask,
+            features0.image_size,
+            features1.image_size,
+        )
 
 
 def test_a_matcher_of_ones_own_matches_whole_shortlists():

@@ -56,9 +56,12 @@ def test_smooth_agree_with_the_loop(pair, temperature):
     assert ((got.confidence >= 0) & (got.confidence <= 1)).all()
     if rows1.any():
         expected = soft_oracles.soft_matches(
-            features0.descriptors[rows0], features1.descriptors[rows1], features1.keypoints[rows1],
-            features1.scores[rows1], temperature,
-        )  # fmt: skip
+            features0.descriptors[rows0],
+            features1.descriptors[rows1],
+            features1.keypoints[rows1],
+            features1.scores[rows1],
+            temperature,
+        )
         columns = np.column_stack([got.points1, got.scores1, got.distance**2, got.confidence])[rows0]
         expected[:, 3] **= 2  # the root of a float32 near 0 has no digits left
         np.testing.assert_allclose(columns, expected, rtol=1e-4, atol=2e-6 + 2e-7 / temperature)
@@ -76,8 +79,10 @@ def test_soft_becomes_hard(seed):
         mutual = hard["mutual"].mask.astype(float)
         real, errors = hard["none"].mask, []
         for smooth in cool:
-            gaps = [jnp.max(jnp.abs(getattr(smooth, name) - getattr(hard["none"], name))[real])
-                    for name in ("points1", "distance", "scores1")]  # fmt: skip
+            gaps = [
+                jnp.max(jnp.abs(getattr(smooth, name) - getattr(hard["none"], name))[real])
+                for name in ("points1", "distance", "scores1")
+            ]
             errors.append([float(jnp.mean(jnp.abs(smooth.confidence - mutual)[real])), *map(float, gaps)])
     errors = np.array(errors)
     np.testing.assert_array_equal(cool[0].mask, real)

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
-from mfvpr.core import precision_recall, reliability
+from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import line_chart
 

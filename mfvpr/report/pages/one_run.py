@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.core.metrics import PrecisionRecall
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.evaluation.rankings import RETRIEVAL
+from mfvpr.evaluation.reliability import PrecisionRecall
 from mfvpr.evaluation.statistics import recall_interval
 from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Gains, Run, errors_as_input_errors, read_results, read_run, read_table

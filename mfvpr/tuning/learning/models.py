@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.baselines.learned_weight import LearnedWeight
+from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.parameters import SCORE, parameters_of
-from mfvpr.core.ranking import combine, score_candidates
+from mfvpr.core.ranking import combine
 from mfvpr.core.types import Array, Matches
 from mfvpr.tuning.learning import losses
 from mfvpr.tuning.learning.losses import Loss

@@ -7,13 +7,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.core.ranking import RetrievalScore, retrieval_scores
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array, Matches, Shortlist, value
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.batched_scoring import score
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half, separate
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, retrieval_scores
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
@@ -99,7 +99,7 @@ def training_splits(
 ) -> list[TrainingSplit]:
     """Split each half of a protocol into queries to train on and queries to validate on.
 
-    `retrieval_score` is the retrieval's part of a combined score, see `mfvpr.core.ranking.retrieval_scores`.
+    `retrieval_score` is the retrieval's part of a combined score, see `retrieval_scores`.
 
     Raises:
         InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.

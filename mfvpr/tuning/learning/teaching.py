@@ -11,8 +11,8 @@ import optax
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.core import parameters
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.ranking import RetrievalScore, Ties
 from mfvpr.core.weights import RatioWeight, UnitWeight
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
 from mfvpr.tuning.learning.losses import Loss, cross_entropy
 from mfvpr.tuning.learning.models import Model, Parameters, first_numbers
 from mfvpr.tuning.learning.splits import Batch, TrainingSplit
@@ -29,7 +29,7 @@ class Options:
     """Options of learning and comparing scores."""
 
     c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
-    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.core.ranking.retrieval_scores`
+    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.evaluation.shortlist_scores.retrieval_scores`
     ties: Ties = "retrieval"  # as in `mfvpr.core.ranking.rank_shortlist`
     loss: Loss = cross_entropy  # of one query
     steps: int = 200  # updates of a training, at most

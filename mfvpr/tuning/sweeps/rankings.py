@@ -19,12 +19,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.core import grids, ranking
-from mfvpr.core.ranking import RetrievalScore, Ties, breaks_ties_by_row, retrieval_scores
+from mfvpr.core import ranking
+from mfvpr.core.batch import WEIGHTINGS, refuse_own_names, score_settings
 from mfvpr.core.scorer import check_host, on_host
 from mfvpr.core.types import Array, Matches, Shortlist, per_match, per_pair
 from mfvpr.evaluation.batched_scoring import PaddedBatch, all_batches, fuse_all, run_batches
 from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties, breaks_ties_by_row, fuse, retrieval_scores
 from mfvpr.evaluation.validation import require_finite
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales, shapes
 from mfvpr.tuning.sweeps.drives import DriveRanking
@@ -47,8 +48,8 @@ class SweepOptions:
 
     Attributes:
         ks: depths of the recall; the largest is the number of rows of a ranking.
-        ties: see `mfvpr.core.ranking.rank_shortlist`.
-        retrieval_score: see `mfvpr.core.ranking.retrieval_scores`.
+        ties: see `mfvpr.evaluation.shortlist_scores.rank_shortlist`.
+        retrieval_score: see `mfvpr.evaluation.shortlist_scores.retrieval_scores`.
         sequence: ranks the queries of a drive together, from their rankings by a setting; then blocks have all queries.
             None = each query alone.
         settings_per_block: None = 64.
@@ -183,7 +184,7 @@ def rank_settings(
         options: depth and ties of the rankings, sizes of blocks and their folder, and the runtime.
     """
     check_host(scorer)
-    grids.refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*grids.WEIGHTINGS, FUSION))
+    refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*WEIGHTINGS, FUSION))
     views = [candidates.mask] if views is None else views
     work = Work(match_set, range(len(candidates.mask)), 1, candidates, views, options)
     all_rows = np.full((len(views), len(settings), len(work.queries), max(options.ks)), -1, np.int32)
@@ -278,7 +279,7 @@ def block_scores(
 
 
 def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array]) -> Array:
-    return grids.score_settings(scorer, matches, *values)
+    return score_settings(scorer, matches, *values)
 
 
 def _first_rows(part: Work, scores: np.ndarray, cs: Sequence[Any], number: int) -> np.ndarray:
@@ -310,7 +311,7 @@ def _orders(
 
     def order(scores_c: tuple[Array, Array | None]) -> tuple[Array, Array]:
         scores, c = scores_c
-        scores = ranking.fuse(by_retrieval, scores, view, c) if fused else scores
+        scores = fuse(by_retrieval, scores, view, c) if fused else scores
         return ranking.rank(scores, view, tie_break=tie_break), scores
 
     return jax.lax.map(order, (scores, c))
@@ -328,8 +329,8 @@ def group_program(work: Work, group: Group) -> str:
         ones = {name: np.ones((pairs, *shape[name]), values.dtype) for name, values in of_pair}
         batch = Matches(**example, **ones, mask=np.ones((pairs, size), bool))
         settings = {name: axis[:1] for name, axis in group.settings.items()}
-        score_settings = partial(grids.score_settings)  # equal to no other: nor is another class's program
-        return jax.jit(score_settings).lower(group.scorer, batch, settings, group.weightings).as_text()
+        program = partial(score_settings)  # equal to no other: nor is another class's program
+        return jax.jit(program).lower(group.scorer, batch, settings, group.weightings).as_text()
 
     return "".join(
         text(scale.matches[0], *shape)

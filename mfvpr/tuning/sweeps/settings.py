@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from mfvpr.core import grids, parameters
-from mfvpr.core.grids import WEIGHTINGS
+from mfvpr.core import parameters
+from mfvpr.core.batch import WEIGHTINGS, by_capacity
 from mfvpr.core.scorer import with_static_functions
 from mfvpr.core.weights import ChosenWeight
 
@@ -65,7 +65,7 @@ def group_by_program(
             values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
             parameter_names = set(settings[0]) - set(WEIGHTINGS)
             weightings = _arrays([settings[row] for row in rows[0]], weights, integers, without=parameter_names)
-            for fitted, part in grids.by_capacity(chosen, values, len(rows), *image_sizes):
+            for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.core import ranking
 from mfvpr.core.parameters import with_parameters
 from mfvpr.core.types import Shortlist
+from mfvpr.evaluation import shortlist_scores
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.tuning import sweeps
@@ -67,8 +67,8 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = ranking.fuse_shortlist(seen, scores, c) if fused else scores
-    order = ranking.rank_shortlist(seen, scores, **options)
+    scores = shortlist_scores.fuse_shortlist(seen, scores, c) if fused else scores
+    order = shortlist_scores.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
 

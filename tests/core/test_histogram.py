@@ -1,4 +1,4 @@
-"""Grids of the histogram: the largest of all bins without most of them, whatever the options."""
+"""The histogram with every option, in grids and pair by pair; its smooth maximum, and the peak between bins."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mfvpr import (
     DescriptorDistanceWeight,
@@ -19,22 +17,11 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.core import tallest
-from mfvpr.core.lattice import Lattice
-from mfvpr.core.tallest import tallest_bins
+from mfvpr.core.histogram import climb, smooth_maximum
 from tests.builders import per_match, random_matches, stack
 from tests.core.batches import pair_of
 
 pytestmark = pytest.mark.thorough
-
-SLOTS, WEIGHTINGS = 64, 8  # a search with every one of the capacities
-CAPACITIES = {20.0: 40, 10.0: 72, 5.0: 136, 3.0: 296}  # by bin size, with blocks of 2, 3, 4 and 8 bins
-pairs = jax.jit(tallest_bins, static_argnums=3)
-bounds = jax.jit(tallest.block_bounds, static_argnums=(3, 4))
-
-
-def search(shifts, weights, lattice, capacity):
-    return pairs(*stack([(shifts, weights, lattice)]), capacity)[0]
 
 
 @pytest.fixture(scope="module")
@@ -43,98 +30,6 @@ def matches():
     sizes = [((336, 336), (336, 336)), ((320, 240), (336, 200)), ((200, 300), (336, 336)), ((336, 336), (90, 30))]
     cases = zip((60, 0, 1, 33), sizes, strict=True)
     return stack([random_matches(rng, count, capacity=60, sizes=of_pair) for count, of_pair in cases])
-
-
-@st.composite
-def histograms(draw):
-    """Shifts `[2, SLOTS]`, weights `[WEIGHTINGS, SLOTS]`, a lattice and its capacity."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    bin_size = draw(st.sampled_from(list(CAPACITIES)))
-    capacity = CAPACITIES[bin_size]
-    num_bins = rng.integers(1, capacity + 1, 2) if draw(st.booleans()) else np.full(2, capacity)
-    scale = draw(st.sampled_from([0.1, 1.0, 20.0]))  # with bins of 1 to 60 px, and deviations from 0.05 px to flat
-    reach = bin_size * num_bins[:, None] / 2
-    shifts = rng.uniform(-1, 1, (2, SLOTS)) * reach * draw(st.sampled_from([0.01, 0.5, 1.0, 2.0]))  # 2: out of range
-    shared = rng.random(SLOTS) < draw(st.sampled_from([0.0, 0.3, 1.0]))
-    shifts = np.where(shared[None], shifts[:, :1] + rng.normal(0, bin_size / 2, (2, SLOTS)), shifts)
-    if draw(st.booleans()):  # ties: on bins, on edges
-        shifts = np.round(shifts / bin_size * 2) * bin_size / 2
-    weights = rng.uniform(0, 2, (WEIGHTINGS, SLOTS)) * (rng.random((WEIGHTINGS, SLOTS)) < rng.random((WEIGHTINGS, 1)))
-    if draw(st.booleans()):
-        weights[0] -= 1
-    weights[1] = 0
-    deviation = bin_size * draw(st.sampled_from([0.17, 0.5, 1.0, 2.1, 4.0, 8.0, 25.0, 1e4]))
-    truncate = draw(st.sampled_from([np.inf, 6.0, 1.5, 0.3]))
-    numbers = (-reach[:, 0] + bin_size / 2, num_bins, bin_size, deviation, truncate)
-    first, num_bins, bin_size, deviation, truncate = (np.asarray(number, np.float32) for number in numbers)
-    lattice = Lattice(first * scale, num_bins, bin_size * scale, deviation * scale, truncate)
-    lattice = jax.tree.map(np.float32, lattice)
-    return (shifts * scale).astype(np.float32), weights.astype(np.float32), lattice, capacity
-
-
-def all_bins(shifts, weights, lattice, dtype):
-    """Signed and unsigned sums of votes, `[W, By, Bx]`, by whole arrays of `dtype`."""
-    shifts, weights, lattice = jax.tree.map(lambda leaf: np.asarray(leaf, dtype), (shifts, weights, lattice))
-    votes = []
-    for axis in (0, 1):
-        centers = np.float32(lattice.first[axis] + np.arange(int(lattice.num_bins[axis])) * lattice.bin_size)
-        sigmas = (centers.astype(dtype)[:, None] - shifts[axis]) / lattice.deviation
-        # A match at the very end of the votes' reach counts or not by the rounding of its distance.
-        edge = np.float32(np.abs(sigmas)) <= np.float32(lattice.truncate)
-        votes.append(np.where(edge, np.exp(-0.5 * sigmas**2), 0))
-    return tuple(np.einsum("wk,yk,xk->wyx", w, votes[1], votes[0], optimize=True) for w in (weights, np.abs(weights)))
-
-
-@given(histograms())
-def test_no_bin_is_taller(histogram):
-    """Up to the rounding of votes to float32; exactly 0 for weights of 0."""
-    shifts, weights, lattice, capacity = histogram
-    assert capacity**2 * WEIGHTINGS > tallest.WORTHWHILE
-    got = search(shifts, weights, lattice, capacity)
-    expected, magnitude = all_bins(shifts, weights, lattice, np.float64)
-    # Centers are rounded to float32 as well, which narrow votes far from the origin notice.
-    rounding = 2e-6 + 4e-7 * float(np.max(np.abs(lattice.first)) / lattice.deviation)
-    np.testing.assert_array_less(abs(got - expected.max((1, 2))), rounding * magnitude.max((1, 2)) + 1e-30)
-    assert got[1] == 0
-
-
-@given(histograms())
-def test_a_bound_exceeds_all_bins_of_its_block(histogram):
-    shifts, weights, lattice, capacity = histogram
-    side = tallest.block_side(capacity)
-    count = -(-capacity // side)
-    expected, _ = all_bins(shifts, weights, lattice, np.float64)
-    padded = np.zeros((WEIGHTINGS, count * side, count * side))
-    padded[:, : expected.shape[1], : expected.shape[2]] = expected
-    blocks = padded.reshape(WEIGHTINGS, count, side, count, side).max((2, 4))
-    got = np.moveaxis(bounds(shifts, weights, lattice, side, count), 1, 0)
-    np.testing.assert_array_less(blocks, got + 1e-30)
-
-
-def test_a_bin_without_votes_is_taller_than_negative_ones():
-    shifts = np.random.default_rng(3).uniform(-20, 20, (2, SLOTS)).astype(np.float32)
-    weights = np.full((WEIGHTINGS, SLOTS), -1, np.float32)
-    lattice = jax.tree.map(np.float32, Lattice(np.full(2, -33.5), np.full(2, 136), 0.5, 1.0, 1.5))
-    np.testing.assert_array_equal(search(shifts, weights, lattice, 136), 0)
-
-
-def test_most_blocks_are_left_out(monkeypatch):
-    """Half of the matches agree: few blocks are evaluated."""
-    pair = random_matches(np.random.default_rng(1), SLOTS)
-    shifts = (pair.points1 - pair.points0).T
-    lattice = jax.tree.map(np.float32, Lattice(np.full(2, -336 + 2.5), np.full(2, 135), 5.0, 15.0, np.inf))
-    evaluated = []
-    evaluate = tallest.evaluate_blocks
-
-    def record_blocks(blocks, *inputs):
-        jax.debug.callback(lambda blocks: evaluated.extend(blocks.tolist()), blocks)
-        return evaluate(blocks, *inputs)
-
-    monkeypatch.setattr(tallest, "evaluate_blocks", record_blocks)
-    jax.block_until_ready(jax.jit(partial(tallest.search_blocks, capacity=136))(shifts, pair.scores0[None], lattice))
-    jax.effects_barrier()
-    assert len(evaluated) == len(set(evaluated))
-    assert 0 < len(evaluated) <= 34**2 // 10
 
 
 OPTIONS = [
@@ -261,3 +156,77 @@ def test_bins_of_an_infinite_shift_are_no_numbers(matches):
     points = pair.points1.copy()
     points[np.flatnonzero(pair.mask)[0]] = np.inf
     assert np.isnan(HistogramOfShifts().histogram(replace(pair, points1=points)).scores).all()
+
+
+SIGMA = np.float32(8)
+
+
+def fields(count):
+    """`[count, ...]` starts at the highest of points 2.2 sigma apart, shifts, weights: few votes or many, clusters."""
+    rng = np.random.default_rng(0)
+    number = rng.choice([2, 3, 5, 20, 60], count)
+    weights = np.where(np.arange(60) < number[:, None], rng.uniform(0.1, 1, (count, 60)), 0)
+    reach = SIGMA * rng.choice([2, 6], (count, 1, 1))
+    cluster = rng.uniform(-1, 1, (count, 1, 2)) * reach + rng.normal(0, 0.7 * SIGMA, (count, 60, 2))
+    shifts = np.where(rng.random((count, 60, 1)) < 0.5, cluster, rng.uniform(-1, 1, (count, 60, 2)) * reach)
+    axis = np.arange(-48, 49, 2.2 * SIGMA)
+    grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    offsets = shifts[:, None] - grid[None, :, None]
+    heights = np.sum(weights[:, None] * np.exp(-0.5 * np.sum((offsets / SIGMA) ** 2, -1)), -1)
+    return grid[heights.argmax(1)].astype(np.float32), shifts.astype(np.float32), weights.astype(np.float32)
+
+
+def landscape(shift, shifts, weights):
+    """Heights, slopes in sigmas, and curvatures of many sums of votes, relative to their heights."""
+    scaled = (shifts - np.asarray(shift, np.float64)[:, None]) / SIGMA
+    pull = weights * np.exp(-0.5 * np.sum(scaled**2, -1))
+    height = pull.sum(1)
+    pull = pull / height[:, None]
+    curvature = np.einsum("nk,nki,nkj->nij", pull, scaled, scaled) - np.eye(2)
+    return height, np.einsum("nk,nki->ni", pull, scaled), curvature
+
+
+def test_the_peak_is_the_maximum_to_a_ten_thousandth_of_sigma():
+    start, shifts, weights = fields(400)
+    peak = jax.jit(jax.vmap(climb, in_axes=(0, 0, 0, None)))(start, shifts, weights, SIGMA)
+    height, slope, curvature = landscape(peak, shifts, weights)
+    assert (height >= (1 - 1e-6) * landscape(start, shifts, weights)[0]).all()
+    assert np.linalg.eigvalsh(curvature).max() < 0
+    left = np.linalg.solve(curvature, slope[..., None])[..., 0]
+    assert np.linalg.norm(left, axis=1).max() < 1e-4
+
+
+def test_derivatives_of_the_peak():
+    """The first and the second along one direction of shifts, weights and sigma, beside differences of peaks."""
+    start, shifts, weights = (values[0].astype(float) for values in fields(5))
+    way, more = np.random.default_rng(1).normal(size=(2, 60))
+
+    def peak(step):
+        return climb(start, shifts + step * way[:, None], weights * (1 + step * more), float(SIGMA) * (1 + step))[0]
+
+    steps = np.array([-1e-3, 0, 1e-3])
+    with jax.enable_x64(True):
+        slope = jax.grad(peak)
+        peaks, slopes, bends = jax.jit(jax.vmap(lambda step: (peak(step), slope(step), jax.grad(slope)(step))))(steps)
+    np.testing.assert_allclose(slopes[1], np.gradient(peaks, steps)[1], rtol=1e-4)
+    np.testing.assert_allclose(bends[1], np.gradient(slopes, steps)[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("peak", [3.0, 100.0])
+def test_the_smooth_maximum_has_the_digits_of_float32_at_any_temperature(peak):
+    rng = np.random.default_rng(0)
+    values = rng.exponential(1e-3, (48, 48))
+    values[5, 7:9] = peak, 0.7 * peak
+    values, mask = np.float32(values), np.arange(48) < 40
+    mask = mask[:, None] & mask
+    smooth = jax.jit(jax.value_and_grad(lambda values, t: smooth_maximum(values, mask, temperature=t)))
+    for temperature in np.geomspace(0.01, 1e4, 60).astype(np.float32):
+        ratios = values[mask].astype(np.float64) / temperature
+        powers = np.exp(ratios - ratios.max())
+        expected = (
+            np.log1p(np.expm1(ratios).mean()) if abs(ratios).max() < 500 else ratios.max() + np.log(powers.mean())
+        )
+        score, slopes = smooth(values, temperature)
+        np.testing.assert_allclose(score, temperature * expected, rtol=1e-5)
+        np.testing.assert_allclose(slopes[mask], powers / powers.sum(), rtol=3e-5, atol=1e-30)
+        assert not np.asarray(slopes)[~mask].any()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import mfvpr
 from mfvpr import compact, filter_matches, match, match_candidates, retrieve
-from mfvpr.core import nearest_neighbors
+from mfvpr.core import matching
 from mfvpr.core.types import per_keypoint, per_match, per_pair
 from mfvpr.matchers import NearestNeighborMatcher, match_pairs
 from tests import oracles
@@ -267,9 +267,9 @@ def test_a_chunk_is_what_fits_where_the_data_are(monkeypatch):
     rng = np.random.default_rng(8)
     batch = jax.tree.map(lambda leaf: leaf[None], make_features(rng, 30))
     for memory, expected in ((None, 1), (80 * 2**30, 80 * 2**30 // 256 // (4 * 20 * 30 + 1)), (10**5, 1)):
-        monkeypatch.setattr(nearest_neighbors, "device_bytes", lambda tree: memory)  # noqa: B023
-        assert nearest_neighbors.pairs_at_once(None, make_features(rng, 20), batch) == expected
-        assert nearest_neighbors.pairs_at_once(7, make_features(rng, 20), batch) == 7
+        monkeypatch.setattr(matching, "device_bytes", lambda tree: memory)  # noqa: B023
+        assert matching.pairs_at_once(None, make_features(rng, 20), batch) == expected
+        assert matching.pairs_at_once(7, make_features(rng, 20), batch) == 7
     with pytest.raises(ValueError, match=r"chunk_size=0: .*above 0"):
         match_candidates(make_features(rng, 20), batch, chunk_size=0)
     with pytest.raises(ValueError, match=r"query \[N0\] .*candidates \[C, N1\]"):

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr.core import similarity
-from mfvpr.core.similarity import count_from, lines_of, nearest, without
+from mfvpr.core import nearest as nearest_module
+from mfvpr.core.checked import count_from
+from mfvpr.core.nearest import lines_of, nearest, without
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
@@ -53,7 +54,7 @@ def test_the_method_of_accelerators_finds_the_same_neighbors(kind, monkeypatch):
     for axis in (0, 1):
         *on_cpu, _, _ = two_of(values, axis)
         with monkeypatch.context() as patched:
-            patched.setattr(similarity, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+            patched.setattr(nearest_module, "device_of", lambda _: SimpleNamespace(platform="gpu"))
             *elsewhere, _, _ = two_of.__wrapped__(values, axis)
         jax.tree.map(np.testing.assert_array_equal, on_cpu, elsewhere)
 

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.core import precision_recall, reliability
-from mfvpr.core.metrics import chance_calibration_error
+from mfvpr.evaluation import precision_recall, reliability
+from mfvpr.evaluation.reliability import chance_calibration_error
 from mfvpr.utils import InputError
 
 

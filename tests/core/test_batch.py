@@ -22,8 +22,9 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.core import grids, histogram
-from mfvpr.core.grids import by_capacity
+from mfvpr.core import batch as batch_module
+from mfvpr.core import histogram
+from mfvpr.core.batch import by_capacity
 from tests.builders import random_matches, stack
 from tests.scorers import FOREIGN, Strongest, Wrapped, title
 
@@ -68,7 +69,7 @@ def test_axes_keep_their_order(matches):
 
 @pytest.mark.parametrize("cores", [2, 3])
 def test_every_candidate_is_scored_once_by_parts_that_overlap(cores, monkeypatch):
-    monkeypatch.setattr(grids, "available_cpus", lambda: cores)
+    monkeypatch.setattr(batch_module, "available_cpus", lambda: cores)
     pairs = random_pairs(np.random.default_rng(1).integers(0, 9, 13), capacity=8)
     scores = score_grid(MatchCount(), replace(pairs, confidence=None), max_distance=[0.7, 1.5])
     np.testing.assert_array_equal(scores, [(pairs.mask & (pairs.distance <= limit)).sum(1) for limit in (0.7, 1.5)])
@@ -83,8 +84,8 @@ def test_accelerators_score_settings_and_pairs_together(chunk, temperature, monk
     expected = score_grid(scorer, pairs, **axes)
     jax.clear_caches()
     monkeypatch.setattr(histogram, "CHUNK", chunk)
-    monkeypatch.setattr(HistogramOfShifts, "_score_pair_by_pair", HistogramOfShifts._score_in_chunks)
-    monkeypatch.setattr(grids, "device_of", lambda _: SimpleNamespace(platform="gpu"))
+    for module in (batch_module, histogram):
+        monkeypatch.setattr(module, "device_of", lambda _: SimpleNamespace(platform="gpu"))
     np.testing.assert_allclose(score_grid(scorer, pairs, **axes), expected, rtol=1e-6)
 
 
@@ -119,7 +120,7 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
         (HistogramOfShifts(), {}, "at least one axis"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
         (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
-        (AnchorPoints(), {"weight": [1.0]}, "expected weights such as 'ratio' or UnitWeight"),
+        (AnchorPoints(), {"weight": [1.0]}, "weight=1.0: expected one of fs, .* UnitWeight"),
         (AnchorPoints(), {"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
         (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
     ],
