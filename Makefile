@@ -22,8 +22,8 @@ test: .venv/.test .venv/.flags
 	$(QUICK) $(PYTEST) -m 'not (slow or optimized)'; quick=$$?; \
 	$(PYTEST) -m 'optimized and not slow' && exit $$quick
 
-test-all: .venv/.test
-	$(PYTEST)
+test-all: test
+	$(PYTEST) -m slow
 
 # The quick tests on the installed wheel, outside of this folder, without any optional dependency.
 test-wheel: .venv/.test
