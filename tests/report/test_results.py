@@ -154,10 +154,9 @@ def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
 
 def test_names_of_scores_are_not_taken_apart(systems):
     correlated = {"my + count + retrieval": FrameCorrelation()}
-    scores = replace(systems["mine"], cohort=2, correlated=correlated).final_scores
+    scores = replace(systems["mine"], correlated=correlated).final_scores
     assert {name: score.scorers for name, score in scores.items()} == {
         "retrieval": (), "histogram": ("histogram",), "my + count": ("my + count",),
-        "histogram + cohort": ("histogram",), "my + count + cohort": ("my + count",),
         "my + count + retrieval": ("my + count",), "my + count + retrieval + frames": ("my + count",),
     }  # fmt: skip
 
