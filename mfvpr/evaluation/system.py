@@ -14,7 +14,7 @@ from mfvpr.core.ranking import Ties
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Shortlist, with_parts
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import resize, shape_size
+from mfvpr.datasets.image_reading import resize, shape_size
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.evaluation.image_sizes import Note, size_for_images

@@ -15,7 +15,7 @@ from mfvpr.core.types import Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.confidence import REFUSALS, Confidence
-from mfvpr.evaluation.evaluation import Reason
+from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
     evidence_scores,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.core.metrics import chance_calibration_error, reliability
-from mfvpr.evaluation.calibration import write_confidences
+from mfvpr.evaluation.confidence_calibration import write_confidences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.evaluations import EvaluationReport

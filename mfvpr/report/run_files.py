@@ -9,8 +9,8 @@ import numpy as np
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.contents import Contents, fingerprints, readings
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.truth import middle
 from mfvpr.evaluation.fusion import FinalScore, Fusion
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts

@@ -14,10 +14,10 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, match_sequence
-from mfvpr.evaluation.evaluation import KS
+from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.features.extraction import describe_folder
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
 from mfvpr.report.evaluations import EvaluationReport, recall_table

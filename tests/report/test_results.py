@@ -10,9 +10,9 @@ import pytest
 import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
-from mfvpr.datasets.truth import RADIUS, TOLERANCES
+from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
-from mfvpr.evaluation.evaluation import KS
+from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
 from mfvpr.retrieval import Retrieval
