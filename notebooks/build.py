@@ -23,7 +23,7 @@ import numpy as np
 from nbclient import NotebookClient
 from PIL import Image
 
-from mfvpr.datasets.images import open_image
+from mfvpr.datasets.image_reading import open_image
 
 FOLDER = Path(__file__).parent
 PICTURES = FOLDER / "pictures"

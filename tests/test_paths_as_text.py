@@ -12,10 +12,12 @@ from mfvpr import InputError, Shortlist, io
 from mfvpr.baselines import weight_registry
 from mfvpr.baselines.learned_weight import LearnedWeight
 from mfvpr.baselines.weight_registry import read_weight, write_weight
-from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, images, truth_files
+from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, truth_files
+from mfvpr.datasets import image_reading as images
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
-from mfvpr.evaluation import Confidence, calibration, read_confidences, write_confidences
+from mfvpr.evaluation import Confidence, read_confidences, write_confidences
+from mfvpr.evaluation import confidence_calibration as calibration
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
 from tests.builders import fill, random_matches

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure as Canvas
 from experiments.paper.runs import STEPS
 from experiments.paper.tables import TOLERANCES, Evaluations, average, printed_tables
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.truth import middle, threshold_words
+from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.report import Table
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from experiments.paper.systems import Row
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import MEANS
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.truth import middle
 from mfvpr.report import Table
 
 BERLIN = ("berlin_a100", "berlin_kudamm", "berlin_halenseestrasse")

@@ -10,8 +10,8 @@ from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.models import can_learn
 from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.rankings import SETTINGS_PER_BLOCK
-from mfvpr.tuning.sweeps.search import require_optuna
+from mfvpr.tuning.sweeps.setting_rankings import SETTINGS_PER_BLOCK
+from mfvpr.tuning.sweeps.setting_search import require_optuna
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import free_host_bytes
 

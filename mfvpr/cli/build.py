@@ -7,9 +7,9 @@ from typing import Any
 from mfvpr import datasets
 from mfvpr.cli import console
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles
+from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
-from mfvpr.datasets.truth import CHOICES
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Cluster, Runtime

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from mfvpr.cli.console import tell
 from mfvpr.cli.inputs import Inputs
 from mfvpr.datasets.contents import fingerprints
-from mfvpr.datasets.truth import middle
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import Confidence, System, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.systems import assembly

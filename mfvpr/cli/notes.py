@@ -8,8 +8,8 @@ from mfvpr.baselines.weight_registry import provenance
 from mfvpr.cli.console import tell
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, OwnRows, fingerprints, own_rows, readings
+from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.truth import threshold_words
 from mfvpr.evaluation.sequence_matching import num_candidates
 
 # A learned match weight depends on these settings.

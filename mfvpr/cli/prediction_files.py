@@ -7,7 +7,7 @@ from typing import Any
 
 from mfvpr.cli.inputs import dataset_of
 from mfvpr.datasets import Dataset, QuerySequence, image_folder
-from mfvpr.datasets.truth import middle
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.io import read_stamps, stamps_in_names
 from mfvpr.io.containers import reading
 from mfvpr.report import prediction_files

@@ -11,8 +11,8 @@ from mfvpr.cli.launch import refuse
 from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, own_rows
+from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.published import PUBLISHED, published_differences
-from mfvpr.datasets.truth import threshold_words
 from mfvpr.report import Table
 from mfvpr.report.figures import contact_sheet
 from mfvpr.storage import FeatureCache

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from mfvpr.cli.console import tell
 from mfvpr.datasets import image_folder
-from mfvpr.datasets.images import VIDEO_SUFFIXES, read_frames
+from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user
 

@@ -12,8 +12,7 @@ from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.report import sweeps
 from mfvpr.report.run_files import matched_content
 from mfvpr.tuning import sweeps as sweeping
-from mfvpr.tuning.sweeps import Outcome, SweepOptions
-from mfvpr.tuning.sweeps.drives import DriveRanking
+from mfvpr.tuning.sweeps import DriveRanking, Outcome, SweepOptions
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint

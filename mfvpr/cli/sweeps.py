@@ -16,8 +16,7 @@ from mfvpr.report.runs import LAST
 from mfvpr.report.sweeps import Sweep, axes_json
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
-from mfvpr.tuning.sweeps import Axes, SweepOptions, search_grid
-from mfvpr.tuning.sweeps.drives import DriveRanking
+from mfvpr.tuning.sweeps import Axes, DriveRanking, SweepOptions, search_grid
 from mfvpr.utils import InputError, Runtime
 
 

@@ -19,6 +19,6 @@ __all__ = [
 ]
 
 from .datasets import Dataset, ImageFolder, IndexFile, LabelFiles, QuerySequence, folder, image_folder
-from .images import read_image, resize
+from .ground_truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth, Truth
+from .image_reading import read_image, resize
 from .positives import Positives, frame_positives, radius_positives
-from .truth import AllowedTruth, FrameTruth, LabelTruth, RadiusTruth, Truth

@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from mfvpr.datasets.datasets import ImageFolder, OwnRows
-from mfvpr.datasets.images import read_header
+from mfvpr.datasets.image_reading import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.threads import ordered_map
 
@@ -27,7 +27,7 @@ SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks e
 
 @dataclass(frozen=True)
 class Content:
-    """Hash and header of one file, see `mfvpr.datasets.images.read_header`."""
+    """Hash and header of one file, see `mfvpr.datasets.image_reading.read_header`."""
 
     sha256: str = ""  # of all bytes; "" = the file cannot be read
     orientation: int = 1

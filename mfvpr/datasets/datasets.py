@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.images import read_image
+from mfvpr.datasets.ground_truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_by_order, truth_from_names
+from mfvpr.datasets.image_reading import read_image
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_by_order, truth_from_names
 from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
@@ -57,7 +57,7 @@ class ImageFolder:
 
         mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
 
-    `orient` and `bits` are those of `mfvpr.datasets.images.read_image`.
+    `orient` and `bits` are those of `mfvpr.datasets.image_reading.read_image`.
     """
 
     root: Path
@@ -171,7 +171,7 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
         images = mfvpr.datasets.image_folder("day/")
 
     Args:
-        orient, bits: see `mfvpr.datasets.images.read_image`.
+        orient, bits: see `mfvpr.datasets.image_reading.read_image`.
 
     Raises:
         InputError: no such folder, a folder that cannot be listed, a broken link, a link to a parent folder, or no
@@ -210,7 +210,7 @@ def folder(
         ground_truth: of every sequence. "order" = query i shows database image i; "utm" = positions in the names;
             "none" or None = rankings only; or files; or a ground truth of your own.
         name: in results.
-        orient, bits: see `mfvpr.datasets.images.read_image`.
+        orient, bits: see `mfvpr.datasets.image_reading.read_image`.
 
     Raises:
         InputError: a folder or a file that cannot be used, no sequence, or a name that sequences cannot have.

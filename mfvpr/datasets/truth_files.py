@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mfvpr.datasets.truth import FrameTruth, LabelTruth, RadiusTruth, Truth, require_positions
+from mfvpr.datasets.ground_truth import FrameTruth, LabelTruth, RadiusTruth, Truth, require_positions
 from mfvpr.io.containers import choose_reader, reading, shorten
 from mfvpr.io.names import require_all
 from mfvpr.io.npz import read_npz

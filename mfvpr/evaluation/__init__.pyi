@@ -36,7 +36,7 @@ __all__ = [
     "write_confidences",
 ]
 
-from .calibration import (
+from .confidence_calibration import (
     Confidence,
     calibration_data,
     confidence_inputs,
@@ -44,8 +44,8 @@ from .calibration import (
     read_confidences,
     write_confidences,
 )
+from .dataset_ranking import RankedDataset, Recall, rank_dataset
 from .drives import Drive
-from .evaluation import RankedDataset, Recall, rank_dataset
 from .fusion import FinalScore, FrameCorrelation, Fusion
 from .protocol import EvaluationProtocol, Split, evaluation_protocol
 from .rankings import Matched, Ranked

@@ -23,9 +23,9 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.types import Features, Matches
 from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.images import gray, resize, write_image
+from mfvpr.datasets.image_reading import gray, resize, write_image
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.evaluation import RankedDataset, Reason
+from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import Pipeline, noise_image

@@ -1,8 +1,8 @@
 """Final scores of a system, which candidates are ranked by: of retrieval, of each scorer, and combined ones."""
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float
 
 from mfvpr.core.parameters import POSITIVE
 from mfvpr.core.types import Shortlist
-from mfvpr.evaluation.cohort_normalization import by_hubness
-from mfvpr.evaluation.rankings import COHORT, FRAMES, RETRIEVAL, Ranked
+from mfvpr.evaluation.rankings import FRAMES, RETRIEVAL, Ranked
 from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.shortlist_scores import (
     RetrievalScore,
@@ -46,10 +45,6 @@ class Fusion:
     def members(self, main: str) -> list[str]:
         """Names of the scorers that take part, the main scorer first."""
         return [main, *(name for name in self.weights if name not in (main, RETRIEVAL))]
-
-    def rename_main(self, main: str, name: str) -> "Fusion":
-        """This fusion for a main scorer with another name, such as one with a cohort."""
-        return replace(self, weights={name if key == main else key: weight for key, weight in self.weights.items()})
 
     def system(self, main: str) -> str:
         """Name of the fused system, such as `histogram + retrieval`."""
@@ -135,94 +130,73 @@ class FrameCorrelation:
 
 
 @dataclass(frozen=True)
-class Cohort:
-    """Normalization of a score with a cohort; `cohort` is that of `mfvpr.System`."""
-
-    cohort: int
-
-
-@dataclass(frozen=True)
 class FinalScore:
-    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of other final scores."""
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of another final score."""
 
     name: str
     scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
     base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
-    step: Cohort | Fusion | FrameCorrelation | DriveFilter | None = None
+    step: Fusion | FrameCorrelation | DriveFilter | None = None
 
 
 def final_scores(
-    scorers: Iterable[str], cohort: int | None, fused: Mapping[str, Fusion],
-    correlated: Mapping[str, FrameCorrelation], sequences: Mapping[str, Sequence[DriveFilter]],
-) -> dict[str, FinalScore]:  # fmt: skip
+    scorers: Sequence[str],
+    fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation],
+    sequences: Mapping[str, Sequence[DriveFilter]],
+) -> dict[str, FinalScore]:
     """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
-    known = {RETRIEVAL: FinalScore(RETRIEVAL)}
-
-    def add(name: str, *of: Any) -> None:
-        if name in known:
-            raise InputError(f"scorers: {name} is the name of another system; choose another one")
-        known[name] = FinalScore(name, *of)
-
-    for name in scorers:
-        add(name, (name,))
-    if cohort is not None:
-        for name in scorers:
-            add(f"{name} + {COHORT}", (name,), name, Cohort(cohort))
-    alone = [*known][1:]
+    scores = [FinalScore(RETRIEVAL), *(FinalScore(name, (name,)) for name in scorers)]
     for name, fusion in fused.items():
-        fusion.check(name, alone)
-        members = [scorer for member in fusion.members(name) for scorer in known[member].scorers]
-        add(fusion.system(name), tuple(members), name, fusion)
-    several = [*known][1:]
-
-    def add_step(field: str, name: str, words: str, step: FrameCorrelation | DriveFilter) -> None:
-        if name not in several:
-            raise InputError(f"{field}: expected names of scorers ({', '.join(several) or 'there are none'}), got "
-                             f"{name}")  # fmt: skip
-        add(f"{name} + {words}", known[name].scorers, name, step)
-
-    for name, correlation in correlated.items():
-        add_step("correlated", name, FRAMES, correlation)
+        fusion.check(name, scorers)
+        scores.append(FinalScore(fusion.system(name), tuple(fusion.members(name)), name, fusion))
+    known = {score.name: score.scorers for score in scores[1:]}
+    steps = [("correlated", name, FRAMES, correlation) for name, correlation in correlated.items()]
     for name, filters in sequences.items():
         if not isinstance(filters, list | tuple) or not all(isinstance(each, DriveFilter) for each in filters):
             raise InputError(f"sequences: expected a list of DriveFilter(...) for {name}, got {filters!r}")
-        for each in filters:
-            add_step("sequences", name, each.name, each)
-    return known
+        steps += [("sequences", name, each.name, each) for each in filters]
+    for field_name, name, words, step in steps:
+        if name not in known:
+            names = ", ".join(known) or "there are none"
+            raise InputError(f"{field_name}: expected names of scorers ({names}), got {name}")
+        scores.append(FinalScore(f"{name} + {words}", known[name], name, step))
+    by_name = {score.name: score for score in scores}
+    if len(by_name) < len(scores):
+        twice = next(score.name for score in scores if by_name[score.name] is not score)
+        raise InputError(f"scorers: {twice} is the name of another system; choose another one")
+    return by_name
 
 
 def rank_by_scores(
-    candidates: Shortlist, scores: Mapping[str, Scores], final_scores: Collection[FinalScore], ties: Ties, *,
-    hubness: Mapping[str, Float[np.ndarray, " database"]] | None = None, num_rows: int = 0,
+    candidates: Shortlist,
+    scores: Mapping[str, Scores],
+    final_scores: Collection[FinalScore],
+    ties: Ties,
+    *,
+    num_rows: int = 0,
     excluded: Bool[np.ndarray, "queries database"] | None = None,
-) -> dict[str, Ranked]:  # fmt: skip
+) -> dict[str, Ranked]:
     """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
 
-    `scores` `[Q, C]` and `hubness`, for score normalization with a cohort, are by name of the scorer. Sequences need
-    `num_rows`, the number of images in the database, and the images of it that are `excluded` for each query.
+    `scores` `[Q, C]` are by name of the scorer. Sequences need `num_rows`, the number of images in the database, and
+    the images of it that are `excluded` for each query.
     """
-    known, hubness = {RETRIEVAL: candidates.scores, **scores}, hubness or {}
+    known = {RETRIEVAL: candidates.scores, **scores}
     rankings: dict[str, Ranked] = {}
     for score in final_scores:
-        base = score.base
-        match score.step:
-            case Cohort():
-                known[score.name] = by_hubness(candidates, known[base], hubness[base], name=base)
-            case Fusion() as fusion:
-                known[score.name] = fusion(base, candidates, known)
-            case FrameCorrelation() as correlation:
-                known[score.name] = correlation(candidates, known[base])
-            case DriveFilter() as drive_filter:
-                rankings[score.name] = drive_filter(rankings[base], num_rows, excluded)
-        if score.name not in rankings:
-            rankings[score.name] = _rank(candidates, known[score.name], ties)
+        if isinstance(score.step, DriveFilter):
+            rankings[score.name] = score.step(rankings[score.base], num_rows, excluded)
+            continue
+        if isinstance(score.step, Fusion):
+            known[score.name] = score.step(score.base, candidates, known)
+        elif isinstance(score.step, FrameCorrelation):
+            known[score.name] = score.step(candidates, known[score.base])
+        order = rank_shortlist(candidates, known[score.name], ties=ties)
+        ranked = (np.take_along_axis(values, order, axis=1) for values in (candidates.indices, known[score.name]))
+        rankings[score.name] = Ranked(*ranked)
     return rankings
 
 
 def _between(value: Any, low: float, high: float) -> bool:
     return isinstance(value, int | float | np.number) and bool(low <= value <= high)
-
-
-def _rank(candidates: Shortlist, scores: Scores, ties: Ties) -> Ranked:
-    order = rank_shortlist(candidates, scores, ties=ties)
-    return Ranked(*(np.take_along_axis(values, order, axis=1) for values in (candidates.indices, scores)))

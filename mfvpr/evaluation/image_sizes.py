@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.datasets.images import read_size
+from mfvpr.datasets.image_reading import read_size
 from mfvpr.utils.errors import InputError
 
 _SAME = 0.02  # relative difference of two aspect ratios that count as the same

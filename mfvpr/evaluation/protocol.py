@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.metrics import hits
 from mfvpr.core.types import Shortlist
+from mfvpr.datasets.ground_truth import Truth, Unit, threshold_words
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Truth, Unit, threshold_words
 from mfvpr.evaluation.selection import Half, halves, places_along_path
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash

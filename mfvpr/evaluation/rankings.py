@@ -14,7 +14,6 @@ from mfvpr.matchers.match_set import MatchSet, Scales
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
 SEQUENCE = "sequence"  # in names of rankings by the motion along a drive
 FRAMES = "frames"  # in names of rankings by frame correlation, which uses the queries before
-COHORT = "cohort"  # in names of rankings by scores that are normalized with a cohort
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from mfvpr.datasets.ground_truth import Unit
 from mfvpr.datasets.positives import Positives, stack_positives
-from mfvpr.datasets.truth import Unit
 
 
 class Half(NamedTuple):

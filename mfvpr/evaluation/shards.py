@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.evaluation.cohort_normalization import cohort_sequence
 from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.sequence_matching import match_rows, matches_recipe
 from mfvpr.evaluation.system import Pipeline, System
@@ -65,8 +64,6 @@ def fill_shard(dataset: Dataset, system: System, cache: FeatureCache, shard: Sha
         raise InputError(f"shard={shard}: expected a cache with a root, the folder that all shards fill")
     system = system.fit_image_size(folders_of(dataset), cache.warn)
     database, pipeline, sequences = dataset.database, system.pipeline, dataset.sequences
-    if system.cohort is not None:
-        sequences = (cohort_sequence(cache.recipes.contents(database), system.cohort), *sequences)
     recipes = [matches_recipe(dataset, sequence, pipeline, cache) for sequence in sequences]
     marks = cache.root / f"shards-{fingerprint(recipes)}"  # a file for each shard that has described its images
     paths = [marks / f"{index}-of-{shard.count}" for index in range(shard.count)]

@@ -13,7 +13,7 @@ from mfvpr.core.parameters import check_bounds
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import resize, shape_size
+from mfvpr.datasets.image_reading import resize, shape_size
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
 from mfvpr.evaluation.image_sizes import Note, size_for_images
@@ -114,8 +114,6 @@ class System:
             other scorers' and the retrieval's (`name + other + retrieval`).
         correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
             before (`name + frames`).
-        cohort: rank with a cohort as well, see `mfvpr.evaluation.cohort_normalization`: the number of frames on both
-            sides of a database image that show its place, and are left out; None = no cohort.
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
         final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.
         sequences: by name of a scorer or a fused ranking, how the queries of a drive are ranked with the help of each
@@ -127,7 +125,6 @@ class System:
     scorers: Mapping[str, Scorer]
     fused: Mapping[str, Fusion] = field(default_factory=dict)
     correlated: Mapping[str, FrameCorrelation] = field(default_factory=dict)
-    cohort: int | None = None
     ties: Ties = "retrieval"
     final: str | None = None
     sequences: Mapping[str, Sequence[DriveFilter]] = field(default_factory=dict)
@@ -152,7 +149,7 @@ class System:
     @cached_property
     def final_scores(self) -> dict[str, FinalScore]:
         """Scores that candidates are ranked by, by name: of retrieval, of each scorer, and combined ones."""
-        return final_scores(tuple(self.scorers), self.cohort, self.fused, self.correlated, self.sequences)
+        return final_scores(tuple(self.scorers), self.fused, self.correlated, self.sequences)
 
     @property
     def headline(self) -> str:

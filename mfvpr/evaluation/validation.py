@@ -70,16 +70,15 @@ def require_finite(name: str, scores: np.ndarray) -> None:
 
 
 def score_warnings(
-    matched: Sequence[Matched], ranked: Sequence[Mapping[str, Ranked]], scorers: Iterable[str]
+    matched: Sequence[Matched], systems: Mapping[str, Sequence[Ranked]], scorers: Iterable[str]
 ) -> Iterator[str]:
     """Warnings of NaN and infinite scores of every sequence; see also `require_finite`."""
     for name in scorers:
-        values = np.concatenate([systems[name].scores[systems[name].rows >= 0] for systems in ranked])
-        require_finite(name, values)
-    for sequence, systems in zip(matched, ranked, strict=True):
-        for name, system in systems.items():
-            values = system.scores[system.rows >= 0]
-            if number := int(np.isnan(values).sum()):
-                yield f"{sequence.sequence.name}: {number} scores of {name} are NaN, and rank last"
-            if number := int(np.isinf(values).sum()):
-                yield f"{sequence.sequence.name}: {number} scores of {name} are infinite"
+        require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
+    for number, sequence in enumerate(matched):
+        for name, rankings in systems.items():
+            values = rankings[number].scores[rankings[number].rows >= 0]
+            if count := int(np.isnan(values).sum()):
+                yield f"{sequence.sequence.name}: {count} scores of {name} are NaN, and rank last"
+            if count := int(np.isinf(values).sum()):
+                yield f"{sequence.sequence.name}: {count} scores of {name} are infinite"

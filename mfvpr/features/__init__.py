@@ -2,7 +2,7 @@
 
 Read first: extractor (the protocols), sift (the shortest extractor), network (what the extractors with a network
 share, and their batches), then the others; vlad (global descriptors from local ones), feature_set (features on
-demand), extraction (folders of images, on threads).
+demand), feature_extraction (folders of images, on threads).
 """
 
 import lazy_loader

@@ -24,15 +24,15 @@ __all__ = [
     "WindowFitting",
 ]
 
-from .aliked import AlikedFeatures
-from .d2net import D2NetFeatures
+from .aliked_features import AlikedFeatures
+from .d2net_features import D2NetFeatures
 from .dinov2 import Dinov2Features
 from .extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
 from .global_descriptor import GlobalDescriptor, MixVprDescriptor
 from .patch_netvlad import PatchNetVladFeatures
-from .selavpr import SelaVprFeatures
+from .selavpr_features import SelaVprFeatures
 from .sift import Sift
-from .ssm import SsmCells, SsmWindows
+from .ssm_features import SsmCells, SsmWindows
 from .vlad import Vlad, VladFitting
 from .windows import WindowFitting

@@ -9,7 +9,7 @@ from jaxtyping import Float, Num
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
 
 
@@ -68,7 +68,7 @@ class Extractor(Protocol):
 
     @property
     def interpolation(self) -> Interpolation:
-        """Interpolation of the resizing, see `mfvpr.datasets.images.resize`."""
+        """Interpolation of the resizing, see `mfvpr.datasets.image_reading.resize`."""
         ...
 
     @property

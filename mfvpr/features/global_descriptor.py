@@ -6,7 +6,7 @@ from typing import Protocol
 import jax
 from jaxtyping import Float
 
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.network import NetworkExtractor
 from mfvpr.networks.imagenet import Images, Pixels, of_unit_length
 from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mfvpr.core.types import Features
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 
 

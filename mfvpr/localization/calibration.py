@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import Dataset
-from mfvpr.datasets.truth import middle
-from mfvpr.evaluation.calibration import (
+from mfvpr.datasets.ground_truth import middle
+from mfvpr.evaluation.confidence import REFUSALS, Confidence
+from mfvpr.evaluation.confidence_calibration import (
     CalibrationData,
     absent_rankings,
     calibration_data,
     read_confidences,
     write_confidences,
 )
-from mfvpr.evaluation.confidence import REFUSALS, Confidence
-from mfvpr.evaluation.evaluation import rank_dataset
+from mfvpr.evaluation.dataset_ranking import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.system import System

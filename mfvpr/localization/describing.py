@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import read_image, resize
-from mfvpr.features.extraction import describe_folder, describe_images
+from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.features.extractor import Aggregation, Description, Extractor
+from mfvpr.features.feature_extraction import describe_folder, describe_images
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.features import round_as_stored
 from mfvpr.utils.errors import InputError

@@ -15,7 +15,7 @@ from mfvpr.core.types import Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.confidence import REFUSALS, Confidence
-from mfvpr.evaluation.evaluation import Reason
+from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
     evidence_scores,
@@ -307,7 +307,7 @@ def _extractor(system: System) -> Extractor:
         raise InputError(f"{type(matcher).__name__}: a map compiles its matcher; expected one that JAX can compile")
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
-    if system.cohort is not None or system.correlated or system.sequences:
+    if system.correlated or system.sequences:
         raise InputError("a map ranks single images: expected a system without cohort, frame correlation and "
                          "sequences; mfvpr.Route follows a drive")  # fmt: skip
     return extractor

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 from mfvpr.core.types import Matches
-from mfvpr.evaluation.evaluation import Reason
+from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.localization.describing import Described
 from mfvpr.utils.errors import InputError
 

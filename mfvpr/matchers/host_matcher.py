@@ -10,7 +10,7 @@ from jaxtyping import Int, UInt8
 
 from mfvpr.core.types import INDICES, Features, Matches, Shortlist, per_match
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import Interpolation, resize
+from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.io.containers import shorten
 from mfvpr.io.plain_matches import numbered_matches, point_matches

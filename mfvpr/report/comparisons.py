@@ -11,7 +11,7 @@ import numpy as np
 
 from mfvpr.baselines.learned_weight import LearnedWeight
 from mfvpr.baselines.weight_registry import write_weight
-from mfvpr.datasets.truth import threshold_words
+from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import estimate, mcnemar, path_test, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure

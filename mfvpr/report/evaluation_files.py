@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.datasets.positives import stack_positives
-from mfvpr.evaluation.evaluation import RankedDataset
+from mfvpr.evaluation.dataset_ranking import RankedDataset
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.selection import places_along_path
 from mfvpr.evaluation.sequences import DriveFilter

@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
+from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Truth, Unit, middle, threshold_words
-from mfvpr.evaluation.calibration import CalibrationData, absent_rankings, calibration_data
 from mfvpr.evaluation.confidence import Confidence
-from mfvpr.evaluation.evaluation import KS, RankedDataset, Reason, Recall
+from mfvpr.evaluation.confidence_calibration import CalibrationData, absent_rankings, calibration_data
+from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason, Recall
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.reliability import PrecisionRecall, precision_recall
 from mfvpr.evaluation.selection import Half, halves, halves_of_map

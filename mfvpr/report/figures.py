@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 from mfvpr.core.types import Matches
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.images import resize
+from mfvpr.datasets.image_reading import resize
 from mfvpr.evaluation.stages import Explanation
 from mfvpr.report.plots import panels, save_figure
 from mfvpr.utils.errors import InputError

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.datasets.images import read_image, resize
-from mfvpr.datasets.truth import threshold_words
+from mfvpr.datasets.ground_truth import threshold_words
+from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.stages import explain
 from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization

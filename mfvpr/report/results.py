@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from mfvpr.datasets.datasets import Dataset
-from mfvpr.evaluation.evaluation import KS, RankedDataset, rank_dataset
+from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.prediction_files import CandidateLayout, write_candidates

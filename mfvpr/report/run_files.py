@@ -9,8 +9,8 @@ import numpy as np
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.contents import Contents, fingerprints, readings
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.published import published_differences
-from mfvpr.datasets.truth import middle
 from mfvpr.evaluation.fusion import FinalScore, Fusion
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
@@ -205,7 +205,7 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
     roots = {side: str(images.root) for side, images in folders.items()}
     settings = {
         "dataset": {"name": dataset.name, **roots}, **stages, "candidates": pipeline.candidates, "scorer": scorers,
-        "cohort": system.cohort, "ties": system.ties, "final": system.headline,
+        "ties": system.ties, "final": system.headline,
     }  # fmt: skip
     contents = {side: cache.recipes.contents(images) for side, images in folders.items()}
     by_score = parameters(system.final_scores.values(), scorers)

@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from mfvpr.datasets.truth import threshold_words
+from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.report.tables import Table, format_value, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import describe_folder
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.storage.disk import lock_store
 from mfvpr.storage.feature_cache import FeatureCache

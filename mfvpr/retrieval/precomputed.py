@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
-from mfvpr.datasets.images import Interpolation, read_size
+from mfvpr.datasets.image_reading import Interpolation, read_size
 from mfvpr.features.extractor import Scale
 from mfvpr.io.checks import Lengths
 from mfvpr.io.containers import FileEntry

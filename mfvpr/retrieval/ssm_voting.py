@@ -8,7 +8,7 @@ from jaxtyping import Float
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
-from mfvpr.features.ssm import SsmWindows
+from mfvpr.features.ssm_features import SsmWindows
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, ExactSearch

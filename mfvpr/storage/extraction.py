@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extraction import describe_folder
 from mfvpr.features.extractor import Description, Extractor
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.features.feature_set import FeatureSource, InMemory
 from mfvpr.storage import features
 from mfvpr.storage.manifest import VECTORS, store_path

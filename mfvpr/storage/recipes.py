@@ -11,8 +11,8 @@ from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.versions import versions
 
 DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
-# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.images` gives other
-# pixels, set it to the next version: stored features are then extracted again.
+# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.image_reading` gives
+# other pixels, set it to the next version: stored features are then extracted again.
 DECODING = "0.3.0"
 
 Value = TypeVar("Value")

@@ -15,7 +15,6 @@ from mfvpr.core.parameters import parameters_of
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System
-from mfvpr.evaluation.rankings import COHORT
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.matchers import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.retrieval import (
@@ -171,13 +170,11 @@ def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:
 
 
 def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All of a system but its pipeline: the main scorer is fused with the retrieval, also its scores with a cohort."""
-    chosen, fusing, cohort = scorers(settings["scorer"]), fusion(settings), settings["cohort"]
+    """All of a system but its pipeline: the main scorer is fused with the retrieval."""
+    chosen, fusing = scorers(settings["scorer"]), fusion(settings)
     main = main_scorer(chosen)
     fusing.check(main, tuple(chosen))
     fused = {main: fusing}
-    if cohort is not None and fusing.members(main) == [main]:
-        fused[f"{main} + {COHORT}"] = fusing.rename_main(main, f"{main} + {COHORT}")
     headline = fusing.system(main) if settings["final"] == "combined" else main
     correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
     methods: Any = settings.get("sequence") or ()  # files of earlier versions lack it
@@ -185,7 +182,7 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
     if len({*methods}) < len(methods):
         raise SettingsError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
-        "scorers": chosen, "fused": fused, "correlated": correlated, "cohort": cohort, "ties": settings["ties"],
+        "scorers": chosen, "fused": fused, "correlated": correlated, "ties": settings["ties"],
         "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {}, "final": headline,
         "settings": settings,
     }  # fmt: skip

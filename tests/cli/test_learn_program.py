@@ -184,9 +184,9 @@ def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, refus
     [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
     before = snapshot(root)
     for change, words in (
-        ("learning_rate=0.5", "learning_rate=0.05, expected 0.5"),
-        ("recall.tolerances=[1]", "tolerances.tolerances[0]=0, expected 1"),
-        ("loss=recall", 'loss="cross_entropy", expected "recall"'),
+        ("learning_rate=0.5", "those of another learning_rate"),
+        ("recall.tolerances=[1]", "those of another tolerances"),
+        ("loss=recall", "those of another loss"),
     ):
         arguments = (*small(root), *SHORT, change, f"checkpoints={folder.parent}", f"out={tmp_path}/out")
         error = refuse("learn", *arguments)
@@ -214,18 +214,17 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
     assert len({json.dumps(call["checkpoints"].recipe) for call in untrained}) == 5 * len(changes)
 
 
-@pytest.mark.parametrize(("rate", "step", "step_kept"), [(20, 4, " {}/4;"), (1e12, 1, "no checkpoint")])
-def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step, step_kept):
+@pytest.mark.parametrize(("rate", "step"), [(20, 4), (1e12, 1)])
+def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     place = tmp_path / "kept"
     few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
     absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
     error = refuse("learn", *small(root), *few, *absurd)
     assert error.startswith(f"error: step {step}: ")
-    assert " is not finite at numbers.sigma=" in error
-    assert step_kept.format(place / "first_half-gradient") in error
+    assert " is not finite; " in error
     assert "learning rate" in error
     assert not (tmp_path / "out").exists()
-    assert sorted(path.name for path in place.glob("*/*")) == (["3", "4"] if step == 4 else [])
+    assert sorted(path.name for path in place.glob("*/[0-9]*")) == (["3", "4"] if step == 4 else [])
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

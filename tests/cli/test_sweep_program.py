@@ -17,7 +17,7 @@ from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, matches_
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.tuning.sweeps.rankings"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps.setting_rankings"]
 
 
 @pytest.fixture(scope="session")

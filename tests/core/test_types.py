@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import FrozenInstanceError, dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +14,7 @@ from jax.extend.core import jaxpr_as_fun
 
 import mfvpr
 from mfvpr.core.types import per_match, per_pair
-from mfvpr.matchers import MatchSet
-from mfvpr.tuning.sweeps.rankings import group_program
-from mfvpr.tuning.sweeps.settings import group_by_program
-from tests.builders import make_features, of_query, random_matches
+from tests.builders import make_features, random_matches
 from tests.needs import skip_without
 from tests.programs import ROOT
 from tests.shapes import unchecked_shapes
@@ -94,17 +90,6 @@ def test_nor_with_other_hashes():
         assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment).returncode == 0
 
 
-def test_the_program_of_a_sweep_is_that_of_its_class():
-    log = []
-    rows, counts = of_query([random_matches(np.random.default_rng(0), 3)])
-    match_set = MatchSet.of([rows], np.array([counts]))
-    work = SimpleNamespace(match_set=match_set, settings=1)
-    for number in range(60):
-        [group] = group_by_program(register_scorer(number, log)(), [{"factor": 1.0}], match_set.image_sizes)
-        group_program(work, group)
-        assert log[-1:] == [number]
-
-
 PROGRAMS_OF_THEIR_OWN = {
     "features/network.py",  # of a new function, which has one model
     "baselines/learned_weight.py",  # of matches alone
@@ -115,7 +100,6 @@ PROGRAMS_OF_THEIR_OWN = {
     "matchers/batched_matching.py",  # of a new function, which has one matcher
     "matchers/lightglue_matcher.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",
-    "tuning/sweeps/rankings.py",  # of a new function
     "testing.py",  # of new functions, each of which has one scorer
 }
 

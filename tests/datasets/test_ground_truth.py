@@ -20,7 +20,7 @@ from mfvpr.datasets import (
     Positives,
     RadiusTruth,
 )  # fmt: skip
-from mfvpr.datasets.truth import threshold_words
+from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.truth_files import truth_from_labels
 from mfvpr.evaluation import evaluation_protocol
 from mfvpr.utils.files import write_text

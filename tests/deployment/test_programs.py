@@ -175,7 +175,6 @@ COUNT = {"count": mfvpr.MatchCount()}
     (lambda: make_system({}), {}, "final='retrieval': expected a scorer"),
     (lambda: make_system(COUNT, fused={"count": Fusion()}, final="count + retrieval"), {},
      r"final='count \+ retrieval': expected a scorer, got a ranking that needs the retrieval"),
-    (lambda: make_system(COUNT, cohort=1, final="count + cohort"), {}, "final='count . cohort': expected a scorer"),
     (lambda: make_system(COUNT | {"a/b": mfvpr.MatchCount()}), {}, "names of letters.*got 'a/b'"),
     (lambda: make_system(COUNT | {"cv": mfvpr.OpenCvHomography()}), {}, "OpenCvHomography: expected a scorer"),
     (lambda: make_system(COUNT, extractor=TwoScales()), {}, "TwoScales: expected local features of one scale, got 2"),

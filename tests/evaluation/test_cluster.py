@@ -68,15 +68,15 @@ def flag(tmp_path):
     return str(path)
 
 
-def system_of(extractor=SIFT, retriever=None, cohort=1, **options):
+def system_of(extractor=SIFT, retriever=None, **options):
     retriever = retriever or Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
     pipeline = Pipeline(extractor, retriever, candidates=4, **options)
-    return System(pipeline, SCORERS, {"histogram": Fusion()}, cohort=cohort)
+    return System(pipeline, SCORERS, {"histogram": Fusion()})
 
 
 def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset, cluster, tmp_path):
     extractor, labels = TwoScales(), set()
-    system = system_of(extractor, Retrieval(extractor), cohort=None)
+    system = system_of(extractor, Retrieval(extractor))
 
     def progress(label):
         def track(items, total):

@@ -14,10 +14,10 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, match_sequence
-from mfvpr.evaluation.evaluation import KS
+from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.features.extraction import describe_folder
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
 from mfvpr.report.evaluations import EvaluationReport, recall_table
@@ -302,7 +302,7 @@ def test_a_sweep_takes_features_whose_files_tell_the_image_size(
 
 
 def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatch):
-    """VLAD and a cohort ask first; a clock that only extraction moves."""
+    """VLAD asks first; a clock that only extraction moves."""
     clock = [0.0]
     monkeypatch.setattr(progress, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
@@ -311,7 +311,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
         yield from describe_folder(*arguments, **options)
 
     monkeypatch.setattr(extraction, "describe_folder", slow)
-    seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2, cohort=1).seconds
+    seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}
 

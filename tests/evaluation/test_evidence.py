@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mfvpr.core.types import Features, Shortlist
-from mfvpr.datasets.images import read_image, resize
+from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.evidence import evidence_against, reason_against_image, strength
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import noise_image

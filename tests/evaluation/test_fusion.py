@@ -92,7 +92,7 @@ def sequence_matches(dataset):
 
 def rank_by(matched, fused, correlated):
     scores = stages.score(SCORERS, matched.by_scale, matched.candidates)
-    by_name = final_scores(SCORERS, None, fused, correlated, {})
+    by_name = final_scores(tuple(SCORERS), fused, correlated, {})
     return rank_by_scores(matched.candidates, scores, by_name.values(), "retrieval")
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from mfvpr import InputError, Shortlist
 from mfvpr.datasets import FrameTruth, RadiusTruth
-from mfvpr.datasets.truth import middle
+from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import evaluation_protocol
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4

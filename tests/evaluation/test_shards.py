@@ -22,11 +22,11 @@ pytestmark = pytest.mark.thorough
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 
 
-def system_of(extractor, retriever=None, candidates=4, cohort=1):
-    """Everything that looks beyond a query: a cohort at all images, frame correlation at the queries before."""
+def system_of(extractor, retriever=None, candidates=4):
+    """Frame correlation looks at the queries before."""
     retriever = retriever or Retrieval(Aggregated(extractor, VladFitting(num_words=8)))
     ways = {"histogram": Fusion("zscore")}, {"count": FrameCorrelation(1)}
-    return System(Pipeline(extractor, retriever, candidates=candidates), SCORERS, *ways, cohort)
+    return System(Pipeline(extractor, retriever, candidates=candidates), SCORERS, *ways)
 
 
 def row_hashes(root):
@@ -66,7 +66,7 @@ def test_shards_give_what_one_machine_gives(dataset, tmp_path, count):
 
 def test_matches_are_made_by_shards_alone(dataset, tmp_path):
     """The run without shards finds and matches nothing, even if its retrieval would rank otherwise."""
-    system = system_of(SIFT, Retrieval(Mean()), cohort=None)
+    system = system_of(SIFT, Retrieval(Mean()))
     _, result = share(dataset, system, tmp_path, 2)
     assert "matches read" in result.seconds
     assert "matching" not in result.seconds
@@ -76,7 +76,7 @@ def test_matches_are_made_by_shards_alone(dataset, tmp_path):
 def test_several_sequences_and_scales_and_more_shards_than_images(small_street, split, tmp_path):
     several = datasets.folder(small_street / "database", split, ground_truth=IndexFile("truth.csv", True))
     extractor = TwoScales()
-    system = system_of(extractor, Retrieval(extractor), candidates=3, cohort=None)
+    system = system_of(extractor, Retrieval(extractor), candidates=3)
     expected = rank_dataset(several, system, cache=FeatureCache(tmp_path / "plain"))
     assert_same(share(several, system, tmp_path / "s", 17)[1], expected)
 
@@ -89,7 +89,7 @@ def test_a_bad_image_of_one_shard_is_bad_for_all(dataset, small_street, tmp_path
     (root / "0004.png").write_bytes(b"no image")
     [sequence] = dataset.sequences
     images = replace(sequence.images, root=root)
-    damaged, system = replace(dataset, sequences=(replace(sequence, images=images),)), system_of(SIFT, cohort=None)
+    damaged, system = replace(dataset, sequences=(replace(sequence, images=images),)), system_of(SIFT)
     _, result = share(damaged, system, tmp_path / "s", 3, skip_bad=True)
     assert [*result.matched[0].bad_queries] == [4]
     assert_same(result, rank_dataset(damaged, system, cache=FeatureCache(tmp_path / "plain", skip_bad=True)))

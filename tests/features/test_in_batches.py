@@ -9,7 +9,7 @@ import pytest
 
 from mfvpr.datasets import image_folder
 from mfvpr.features import Sift, network
-from mfvpr.features.extraction import describe_folder
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.utils import InputError
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (7, 6, 5, 3), np.uint8)

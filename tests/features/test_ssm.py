@@ -16,7 +16,7 @@ from mfvpr.evaluation import match_sequence, stages
 from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
 from mfvpr.features.extractor import local_features
-from mfvpr.features.ssm import SsmMaps
+from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database

@@ -10,7 +10,7 @@ from mfvpr.datasets import resize
 from mfvpr.evaluation import FrameCorrelation
 from mfvpr.features import WindowFitting
 from mfvpr.features.extractor import local_features
-from mfvpr.features.ssm import SsmMaps
+from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.retrieval.ssm_voting import vote
 from tests.baselines.test_grid_anchors import cells

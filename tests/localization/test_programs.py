@@ -16,7 +16,7 @@ from PIL import Image
 
 from mfvpr.cli import query_images
 from mfvpr.datasets import image_folder, read_image
-from mfvpr.datasets.images import read_frames
+from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
 from mfvpr.localization.declaration import read_declaration

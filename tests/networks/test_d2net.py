@@ -8,7 +8,7 @@ from flax import nnx
 
 from mfvpr import InputError
 from mfvpr.features import D2NetFeatures
-from mfvpr.features import d2net as features_d2net
+from mfvpr.features import d2net_features as features_d2net
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey

@@ -10,9 +10,9 @@ import pytest
 import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
-from mfvpr.datasets.truth import RADIUS, TOLERANCES
+from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
-from mfvpr.evaluation.evaluation import KS
+from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
 from mfvpr.retrieval import Retrieval
@@ -154,10 +154,9 @@ def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
 
 def test_names_of_scores_are_not_taken_apart(systems):
     correlated = {"my + count + retrieval": FrameCorrelation()}
-    scores = replace(systems["mine"], cohort=2, correlated=correlated).final_scores
+    scores = replace(systems["mine"], correlated=correlated).final_scores
     assert {name: score.scorers for name, score in scores.items()} == {
         "retrieval": (), "histogram": ("histogram",), "my + count": ("my + count",),
-        "histogram + cohort": ("histogram",), "my + count + cohort": ("my + count",),
         "my + count + retrieval": ("my + count",), "my + count + retrieval + frames": ("my + count",),
     }  # fmt: skip
 

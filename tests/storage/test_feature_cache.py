@@ -10,7 +10,7 @@ from PIL import Image
 
 from mfvpr import Runtime
 from mfvpr.datasets import image_folder
-from mfvpr.datasets.images import resize
+from mfvpr.datasets.image_reading import resize
 from mfvpr.features import Aggregated, Description, VladFitting
 from mfvpr.storage import FeatureCache, extraction, recipes
 from mfvpr.storage.features import forecast_bytes, forecast_vector_bytes

@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
+from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth
 from mfvpr.datasets.published.lists import expected_file, listed_images, read_lines
-from mfvpr.datasets.truth import FARTHEST, FrameTruth
 from mfvpr.datasets.truth_files import truth_from_file
 from mfvpr.io.checks import parse_number
 from mfvpr.utils.errors import InputError

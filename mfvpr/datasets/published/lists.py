@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
-from mfvpr.datasets.truth import FrameTruth
+from mfvpr.datasets.ground_truth import FrameTruth
 from mfvpr.io.containers import reading
 from mfvpr.io.formats.numpy_objects import Array, read_objects
 from mfvpr.utils.errors import InputError

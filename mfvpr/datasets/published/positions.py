@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, QuerySequence
+from mfvpr.datasets.ground_truth import FARTHEST, RadiusTruth, require_positions
 from mfvpr.datasets.positives import rows_within
 from mfvpr.datasets.published.lists import dataset_of_lists, expected_file, listed_images
-from mfvpr.datasets.truth import FARTHEST, RadiusTruth, require_positions
 from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import reading
 from mfvpr.io.formats.matlab_files import read_matlab

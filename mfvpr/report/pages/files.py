@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from mfvpr.datasets.datasets import MEANS
-from mfvpr.datasets.truth import Unit, middle, threshold_words
+from mfvpr.datasets.ground_truth import Unit, middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.runs import LAST, file_names
 from mfvpr.report.tables import Table, read_csv

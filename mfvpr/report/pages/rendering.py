@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image
 
-from mfvpr.datasets.images import open_image
+from mfvpr.datasets.image_reading import open_image
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.pages.charts import Chart
 from mfvpr.report.pages.files import Prediction

@@ -18,9 +18,9 @@ from mfvpr.tuning.learning.models import Model, can_learn
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.teaching import Options, of_matches, start, train
 from mfvpr.tuning.learning.training import Checkpoints, Fit
-from mfvpr.tuning.sweeps.axes import Axes
-from mfvpr.tuning.sweeps.rankings import SweepOptions, rank_settings
-from mfvpr.tuning.sweeps.settings import FUSION, Setting
+from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting
+from mfvpr.tuning.sweeps.setting_rankings import SweepOptions, rank_settings
+from mfvpr.tuning.sweeps.sweep_axes import Axes
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
@@ -54,10 +54,15 @@ class Comparison:
 
 
 def compare(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet, candidates: Shortlist,
-    options: Options | None = None, *,
-    checkpoints: Checkpoints | None = None, runtime: Runtime = DEFAULT_RUNTIME,
-) -> Comparison:  # fmt: skip
+    axes: Axes,
+    protocol: EvaluationProtocol,
+    match_set: MatchSet,
+    candidates: Shortlist,
+    options: Options | None = None,
+    *,
+    checkpoints: Checkpoints | None = None,
+    runtime: Runtime = DEFAULT_RUNTIME,
+) -> Comparison:
     """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
 
     Everything is chosen or learned on one half of the path and reported on the other, or chosen on some data sets and

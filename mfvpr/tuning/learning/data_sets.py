@@ -46,20 +46,26 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         for what in ("unit", "thresholds"):
             expected, got = getattr(parts[0].protocol, what), getattr(part.protocol, what)
             if expected != got:
-                raise InputError(f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; compare sets "
-                                 "whose ground truth is of one kind")  # fmt: skip
+                raise InputError(
+                    f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; compare sets "
+                    "whose ground truth is of one kind"
+                )
     sizes, databases = ([len(part.match_set) for part in parts], [part.protocol.places.num_database for part in parts])
     split = sum(sizes[: len(teach)])
     half = Half(
-        np.arange(split), np.arange(split, sum(sizes)), np.arange(sum(databases)) < sum(databases[: len(teach)]),
+        np.arange(split),
+        np.arange(split, sum(sizes)),
+        np.arange(sum(databases)) < sum(databases[: len(teach)]),
         tuple(sizes[: len(teach)]),
-    )  # fmt: skip
+    )
     protocol = replace(
         parts[0].protocol,
         positives=[join_positives(sets) for sets in zip(*(part.protocol.positives for part in parts), strict=True)],
         places=join_positives([part.protocol.places for part in parts]),
-        halves=[half], split="other sets", reported_sets={part.name: len(part.match_set) for part in report},
-    )  # fmt: skip
+        halves=[half],
+        split="other sets",
+        reported_sets={part.name: len(part.match_set) for part in report},
+    )
     width = max(part.match_set.counts.shape[1] for part in parts)
     starts = np.cumsum([0, *databases[:-1]])
     match_set = MatchSet(

@@ -30,9 +30,11 @@ def cross_entropy(
 
 
 def smooth_recall_at_1(
-    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"],
+    scores: Num[Array, " candidates"],
+    positives: Bool[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
     temperature: float | Float[Array, ""],
-) -> Float[Array, ""]:  # fmt: skip
+) -> Float[Array, ""]:
     """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
 
     It tends to 1 - R@1 as the temperature tends to 0.
@@ -43,9 +45,11 @@ def smooth_recall_at_1(
 
 
 def smooth_average_precision(
-    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"],
+    scores: Num[Array, " candidates"],
+    positives: Bool[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
     temperature: float | Float[Array, ""],
-) -> Float[Array, ""]:  # fmt: skip
+) -> Float[Array, ""]:
     """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), in [0, 1].
 
     The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
@@ -69,9 +73,11 @@ LOSSES: dict[str, Loss] = {
 
 
 def mean_loss(
-    loss: Loss, scores: Num[Array, "queries candidates"], positives: Bool[Array, "queries candidates"],
+    loss: Loss,
+    scores: Num[Array, "queries candidates"],
+    positives: Bool[Array, "queries candidates"],
     mask: Bool[Array, "queries candidates"],
-) -> Float[Array, ""]:  # fmt: skip
+) -> Float[Array, ""]:
     """Mean of the loss of one query over the queries with a positive; 0 if there are none."""
     return masked_mean(jax.vmap(loss)(scores, positives, mask), jnp.any(positives & mask, axis=-1))
 

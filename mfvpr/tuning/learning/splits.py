@@ -105,8 +105,10 @@ def training_splits(
         InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.
     """
     if not protocol.halves:
-        raise InputError("split=None: expected first_half, second_half or both, since what is learned is never "
-                         "reported on the same queries")  # fmt: skip
+        raise InputError(
+            "split=None: expected first_half, second_half or both, since what is learned is never "
+            "reported on the same queries"
+        )
     candidates = replace(candidates, scores=retrieval_scores(candidates, retrieval_score))
     split = partial(_split, match_set, candidates, protocol)
     return [split(half, name) for half, name in zip(protocol.halves, protocol.names, strict=True)]

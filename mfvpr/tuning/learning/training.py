@@ -13,13 +13,13 @@ import numpy as np
 import optax
 
 from mfvpr.core.types import Array
-from mfvpr.tuning.learning.checkpoints import leaves_by_path, lock_checkpoints, newest, restore, save_checkpoint
+from mfvpr.tuning.learning.training_checkpoints import lock_checkpoints, restore, save_checkpoint
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Track, no_progress
 
 
 class TrainingError(InputError):
-    """A value became NaN or infinite. The message is one line: step, value, parameters, and how to fix it."""
+    """A value became NaN or infinite. The message is one line: the step, the value, and how to fix it."""
 
 
 class Record(NamedTuple):
@@ -63,9 +63,15 @@ class Schedule:
 
 
 def fit(
-    parameters: Any, objective: Callable[[Any, Any], Array], batches: Callable[[int], Any], schedule: Schedule, *,
-    validate: Callable[[Any], float] | None = None, checkpoints: Checkpoints | None = None, track: Track = no_progress,
-) -> Fit:  # fmt: skip
+    parameters: Any,
+    objective: Callable[[Any, Any], Array],
+    batches: Callable[[int], Any],
+    schedule: Schedule,
+    *,
+    validate: Callable[[Any], float] | None = None,
+    checkpoints: Checkpoints | None = None,
+    track: Track = no_progress,
+) -> Fit:
     """Minimize the objective.
 
     Args:
@@ -85,106 +91,64 @@ def fit(
     every, steps, patience = schedule.every, schedule.steps, schedule.patience
     if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
         raise ValueError(f"fit({steps=}, {every=}, {patience=}): expected counts, and a patience only with validate")
-    update = _update(objective, schedule.optimizer)
-    training = _Training(update, batches, validate, schedule, checkpoints, track)
+
+    @jax.jit
+    def update(parameters: Any, memory: Any, batch: Any) -> tuple[Any, Any, Array, Array]:
+        loss, gradient = jax.value_and_grad(objective)(parameters, batch)
+        with jax.numpy_dtype_promotion("standard"):  # Optax's Adam multiplies a float with an integer
+            change, memory = schedule.optimizer.update(gradient, memory, parameters)
+        parameters = optax.apply_updates(parameters, change)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient, parameters))]
+        return parameters, _strong(memory), loss, jnp.all(jnp.stack(finite))
+
+    def validation(parameters: Any, step: int) -> float | None:
+        value = None if validate is None else float(validate(parameters))
+        if value is not None and not math.isfinite(value):
+            raise _not_finite("the validation", step)
+        return value
+
+    def add_record(state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
+        """Validate; return the state with the best parameters so far, and the history."""
+        step = history[-1].step + len(losses)
+        history = [*history, Record(step, float(np.mean(losses)), validation(state.parameters, step))]
+        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history
+
     parameters = _strong(parameters)
-    start = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
+    state = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
     with lock_checkpoints(checkpoints.folder) if checkpoints else nullcontext():
-        state, history = training.descend(*training.begin(start))
+        stored = restore(*checkpoints, state) if checkpoints else None
+        if stored:
+            state, (rows, losses) = _strong(stored[0]), stored[1]
+            history = [Record(*row) for row in rows]
+        else:
+            history, losses = [Record(0, None, validation(parameters, 0))], []
+        done = history[-1].step + len(losses)
+        if checkpoints and done > steps:
+            raise InputError(
+                f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; ask for more "
+                "steps, or choose another folder"
+            )
+        remaining = 0 if _out_of_patience(history, patience) else steps - done
+        for step in track(range(done, done + remaining), remaining):
+            learned, memory, loss, is_finite = update(state.parameters, state.optimizer, batches(step))
+            if not is_finite:
+                raise _not_finite(f"the loss, a gradient or a parameter of batch {step}", step)
+            state, losses = _State(learned, state.best, memory), [*losses, float(loss)]
+            if is_due := (step + 1) % every == 0:
+                (state, history), losses = add_record(state, history, losses), []
+            if checkpoints and (is_due or step + 1 == steps):
+                save_checkpoint(checkpoints.folder, step + 1, checkpoints.recipe, state, (history, losses))
+            if _out_of_patience(history, patience):
+                break
+        if losses:  # after the checkpoint: a training of more steps would not validate here
+            state, history = add_record(state, history, losses)
     is_early = _out_of_patience(history, patience)
     ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
     return Fit(state.best, _best(history).step, tuple(history), ended)
 
 
-def _update(objective: Callable, optimizer: optax.GradientTransformation) -> Callable:
-    """Compile a step: parameters, optimizer state, batch -> both updated, loss, gradient, whether all is finite."""
-
-    @jax.jit
-    def update(parameters: Any, memory: Any, batch: Any) -> tuple[Any, Any, Array, Any, Array]:
-        loss, gradient = jax.value_and_grad(objective)(parameters, batch)
-        with jax.numpy_dtype_promotion("standard"):  # Optax's Adam multiplies a float with an integer
-            change, memory = optimizer.update(gradient, memory, parameters)
-        parameters = optax.apply_updates(parameters, change)
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient, parameters))]
-        return parameters, _strong(memory), loss, gradient, jnp.all(jnp.stack(finite))
-
-    return update
-
-
-@dataclass(frozen=True)
-class _Training:
-    """The steps of a training; the fields are arguments of `fit`."""
-
-    update: Callable
-    batches: Callable[[int], Any]
-    validate: Callable[[Any], float] | None
-    schedule: Schedule
-    checkpoints: Checkpoints | None
-    track: Track
-
-    def begin(self, state: _State) -> tuple[_State, list[Record], list[float]]:
-        """State, history and the losses since the last validation, from the folder or at the start."""
-        stored = restore(*self.checkpoints, state) if self.checkpoints else None
-        if stored is None:
-            return state, [Record(0, None, self.validation(state.parameters, 0))], []
-        state, (rows, losses) = _strong(stored[0]), stored[1]
-        history = [Record(*row) for row in rows]
-        if self.checkpoints and (done := history[-1].step + len(losses)) > (most := self.schedule.steps):
-            raise InputError(f"{self.checkpoints.folder}: this checkpoint is of step {done}, expected at most {most}; "
-                             "ask for more steps, or choose another folder")  # fmt: skip
-        return state, history, losses
-
-    def descend(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
-        """Do the remaining steps, until patience ends."""
-        done = history[-1].step + len(losses)
-        steps, every, patience = self.schedule.steps, self.schedule.every, self.schedule.patience
-        remaining = 0 if _out_of_patience(history, patience) else steps - done
-        for step in self.track(range(done, done + remaining), remaining):
-            state, loss = self.advance(state, step)
-            losses = [*losses, loss]
-            if is_due := (step + 1) % every == 0:
-                (state, history), losses = self.add_record(state, history, losses), []
-            if self.checkpoints and (is_due or step + 1 == steps):
-                folder, recipe = self.checkpoints
-                save_checkpoint(folder, step + 1, recipe, state, (history, losses))
-            if _out_of_patience(history, patience):
-                break
-        # After the checkpoint: a training of more steps would not validate here.
-        return self.add_record(state, history, losses) if losses else (state, history)
-
-    def add_record(self, state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
-        """Validate; return the state with the best parameters so far, and the history."""
-        step = history[-1].step + len(losses)
-        history = [*history, Record(step, float(np.mean(losses)), self.validation(state.parameters, step))]
-        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history
-
-    def advance(self, state: _State, step: int) -> tuple[_State, float]:
-        """Do one step; return the loss before it as well."""
-        batch = self.batches(step)
-        parameters, memory, loss, gradient, finite = self.update(state.parameters, state.optimizer, batch)
-        if not finite:
-            suspects = leaves_by_path({"loss": loss, "gradient": gradient, "updated": parameters})
-            culprit = next(name for name, leaf in suspects.items() if not np.all(np.isfinite(leaf)))
-            raise self.error(f"{culprit} of batch {step}", state.parameters, step)
-        return _State(parameters, state.best, memory), float(loss)
-
-    def validation(self, parameters: Any, step: int) -> float | None:
-        if self.validate is None:
-            return None
-        value = float(self.validate(parameters))
-        if not math.isfinite(value):
-            raise self.error("validation", parameters, step)
-        return value
-
-    def error(self, what: str, parameters: Any, step: int) -> TrainingError:
-        leaves = leaves_by_path(parameters).items()
-        scalars = [f"{name or 'parameter'}={float(leaf):.6g}" for name, leaf in leaves if leaf.ndim == 0]
-        values = f" at {', '.join(scalars)}" if scalars else ""
-        saved = self.checkpoints and newest(self.checkpoints.folder)
-        checkpoint = f"the last good checkpoint is {saved}" if saved else "there is no checkpoint yet"
-        return TrainingError(
-            f"step {step}: {what} is not finite{values}; {checkpoint}; look at the data, or lower the learning rate"
-        )
+def _not_finite(what: str, step: int) -> TrainingError:
+    return TrainingError(f"step {step}: {what} is not finite; look at the data, or lower the learning rate")
 
 
 def _best(history: Sequence[Record]) -> Record:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mfvpr.tuning.learning import checkpoints
+from mfvpr.tuning.learning import training_checkpoints as checkpoints
 from mfvpr.tuning.learning.training import Checkpoints, Fit, Schedule, fit
 
 ROOT = Path(__file__).parents[3]
@@ -61,7 +61,8 @@ def program(lines: str) -> subprocess.CompletedProcess[str]:
 
 def contents(folder: Path) -> dict[str, bytes | None]:
     """Everything below a folder."""
-    return {str(path): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+    paths = [path for path in sorted(folder.rglob("*")) if path.name != ".lock"]
+    return {str(path): path.read_bytes() if path.is_file() else None for path in paths}
 
 
 def killed(action: Callable[[], object], folder: Path, moment: int) -> bool:
@@ -114,5 +115,5 @@ def killed_savers(folder: Path, stride: int) -> None:
         assert not killed(lambda: save_next(folder), folder, -1)
     moment = 1
     while killed(lambda: save_next(folder), folder, moment):
-        print(moment, sorted(path.name for path in folder.iterdir()))
+        print(moment, sorted(path.name for path in folder.iterdir() if path.name != ".lock"))
         moment += stride

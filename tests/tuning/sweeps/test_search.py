@@ -14,7 +14,8 @@ from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
 from mfvpr.report import sweeps
 from mfvpr.tuning import sweeps as sweeping
-from mfvpr.tuning.sweeps import Axes, search
+from mfvpr.tuning.sweeps import Axes
+from mfvpr.tuning.sweeps.setting_search import suggest_setting
 from tests.needs import needs
 from tests.scorers import Wrapped
 from tests.tuning.learning.paths import QUERIES, TOLERANCES, split
@@ -126,7 +127,7 @@ def test_optuna_draws_within_the_axes():
 
     values = {"num_bins": [4, 9], "tolerance": [1.5, 4.0], "weight": ["fs", "unit"], "window": [6]}
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
-    drawn = [search.suggest_setting(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
+    drawn = [suggest_setting(study.ask(), Axes(mfvpr.AnchorPoints(), values, {})) for _ in range(20)]
     for setting in drawn:
         assert type(setting["num_bins"]) is int
         assert 4 <= setting["num_bins"] <= 9

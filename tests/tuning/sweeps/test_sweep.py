@@ -2,9 +2,7 @@
 
 import errno
 import itertools
-import re
 import sys
-import time
 from dataclasses import replace
 
 import jax
@@ -18,7 +16,7 @@ from mfvpr.evaluation import shortlist_scores
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.tuning import sweeps
-from mfvpr.tuning.sweeps.settings import group_by_program
+from mfvpr.tuning.sweeps.setting_groups import group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
@@ -144,7 +142,7 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
 @pytest.fixture
 def block_scores(monkeypatch):
     """Scores of every block that the test computes."""
-    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.rankings"])
+    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.setting_rankings"])
     scores = module["block_scores"]
     monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
     return computed
@@ -214,32 +212,27 @@ def test_memory_is_told_beforehand(data):
     assert block_bytes(uneven, many, 1) == block_bytes(largest, many, 1)
 
 
-def with_matches(change):
-    """Change the matches of every query."""
-
-    def changed(match_set, candidates):
-        return replace(match_set, matches=list(map(change, match_set.matches))), candidates
-
-    return changed
+def with_points(match_set, points):
+    """The matches of every query with other points in the candidates."""
+    return replace(match_set, matches=[replace(each, points1=points(each.points1)) for each in match_set.matches])
 
 
 OTHER_DATA = {
-    "matches": with_matches(lambda matches: replace(matches, points1=matches.points1[::-1].copy())),
-    "sizes": with_matches(lambda matches: replace(matches, image_size1=matches.image_size1 / 2)),
+    "matches": lambda matches, listed: (with_points(matches, lambda points: points[::-1].copy()), listed),
     "shortlist": lambda matches, listed: (
-        matches, replace(listed, indices=np.where(listed.mask, listed.indices[:, ::-1], -1))
+        matches,
+        replace(listed, indices=np.where(listed.mask, listed.indices[:, ::-1], -1)),
     ),
     "retrieval": lambda matches, listed: (matches, replace(listed, scores=listed.scores[:, ::-1])),
     "fusion of scales": lambda matches, listed: (Scales([matches], weights=[0.01]), listed),
-}  # fmt: skip
+}
 
 
 def sweep_with_folder(folder, scorer, settings, *data, **options):
-    """Rows without a folder of blocks; those with it are the same."""
+    """Rows with a folder of blocks are those without it."""
     expected = rank(scorer, settings, *data, **options)
     stored = rank(scorer, settings, *data, **options, folder=folder)
     np.testing.assert_array_equal(stored, expected, err_msg=str(options))
-    return expected
 
 
 @pytest.mark.parametrize("change", OTHER_DATA)
@@ -249,41 +242,31 @@ def test_blocks_of_other_data_in_the_same_folder_are_not_taken(data, tmp_path, c
         sweep_with_folder(tmp_path, scorer, settings, match_set, candidates)
 
 
-def test_nor_are_those_of_other_views_options_or_scorers_of_one_name(data, tmp_path):
+def test_nor_are_those_of_other_views_options_or_scorers(data, tmp_path):
     limits, fused = [{"max_distance": 0.3}, {"max_distance": 2.0}], [{"c": 10.0}, {"c": 20.0}]
     view = np.random.default_rng(1).random(data[1].mask.shape) < 0.6
-
-    def scorer(factor):
-        @mfvpr.value
-        class Score:
-            number: float = 1.0
-
-            def __call__(self, matches):
-                return factor * self.number * mfvpr.MatchCount()(matches)
-
-        return Score()
-
-    for changed_scorer, settings, options in (
-        (scorer(1.0), limits, {}),
-        (scorer(-1.0), limits, {}),
-        (scorer(1.0), limits, {"views": [view]}),
-        (scorer(1.0), limits, {"views": [~view]}),
-        (scorer(1.0), limits, {"ties": "index"}),
-        (lambda matches: mfvpr.MatchCount()(matches), limits, {}),
-        (lambda matches: -mfvpr.MatchCount()(matches), limits, {}),
+    for scorer, settings, options in (
+        (mfvpr.HistogramOfShifts(), limits, {}),
+        (mfvpr.HistogramOfShifts(sigma=40.0), limits, {}),
+        (mfvpr.AggregatedScore(), limits, {}),
+        (mfvpr.AggregatedScore(), limits, {"views": [view]}),
+        (mfvpr.AggregatedScore(), limits, {"views": [~view]}),
+        (mfvpr.AggregatedScore(), limits, {"ties": "index"}),
         (mfvpr.MatchCount(), fused, {"retrieval_score": "cosine"}),
         (mfvpr.MatchCount(), fused, {"retrieval_score": "negative_euclidean"}),
     ):
-        sweep_with_folder(tmp_path, changed_scorer, settings, *data, **options)
+        sweep_with_folder(tmp_path, scorer, settings, *data, **options)
 
 
-def test_scores_by_the_number_of_keypoints_are_kept(data, tmp_path):
-    """The numbers of one data set are not those of another."""
-    match_set, candidates = data
-    scorer, settings = mfvpr.RapidSpatialScore(per_feature=True), [{"c": 1e5}]
-    fewer = replace(match_set, matches=[replace(matches, count0=np.int32(1)) for matches in match_set.matches])
-    rows = [sweep_with_folder(tmp_path, scorer, settings, pairs, candidates) for pairs in (match_set, fewer) * 2]
-    assert (rows[0] != rows[1]).any()
+def test_results_of_a_scorer_without_a_recipe_are_not_kept(data, tmp_path):
+    lines = []
+    options = {"folder": tmp_path, "runtime": mfvpr.Runtime(log=lines.append)}
+    for sign in (1, -1):
+        scorer = lambda matches, sign=sign: sign * mfvpr.MatchCount()(matches)  # noqa: E731
+        got = rank(scorer, [{"max_distance": 2.0}], *data, **options)
+        np.testing.assert_array_equal(got, rank(scorer, [{"max_distance": 2.0}], *data))
+    assert not list(tmp_path.iterdir())
+    assert "no results are kept" in lines[0]
 
 
 def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
@@ -295,28 +278,6 @@ def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
     for _ in range(2):
         got = rank(sampled, settings, *data, folder=tmp_path)
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
-
-
-def signed_by_slots(sign):
-    return lambda matches: mfvpr.MatchCount()(matches) * (1.0 if len(matches.mask) <= 8 else sign)
-
-
-def signed_by_pairs(sign):
-    @jax.custom_batching.custom_vmap
-    def signed(count):
-        return count
-
-    @signed.def_vmap
-    def _(pairs, _, count):
-        return count * (1.0 if pairs == 1 else sign), True
-
-    return lambda matches: signed(mfvpr.MatchCount()(matches))
-
-
-@pytest.mark.parametrize("scorer", [signed_by_slots, signed_by_pairs])
-def test_code_that_depends_on_a_shape_is_told_apart(data, tmp_path, scorer):
-    for sign in (1.0, -1.0):
-        sweep_with_folder(tmp_path, scorer(sign), [{"max_distance": 2.0}], *data)
 
 
 def test_a_number_named_as_retrievals_share_is_refused(data):
@@ -345,53 +306,28 @@ def test_pairs_score_the_same_in_a_smaller_set(data, scorer, block_scores):
     np.testing.assert_array_equal(block_scores[0][..., :2, :], block_scores[1])
 
 
-def test_a_folder_that_goes_meanwhile_costs_nothing_but_a_full_disk_is_told(data, tmp_path, monkeypatch):
-    """Whoever ends the same sweep first removes the folder of blocks."""
-    settings, expected = [{"c": 0.5}], rank(mfvpr.MatchCount(), [{"c": 0.5}], *data)
-    error = FileNotFoundError
-
+def test_a_full_disk_is_told(data, tmp_path, monkeypatch):
     def write(*_):
-        raise error(errno.ENOSPC, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sys.modules["mfvpr.tuning.sweeps.rankings"], "write_arrays", write)
-    np.testing.assert_array_equal(rank(mfvpr.MatchCount(), settings, *data, folder=tmp_path), expected)
-    error = OSError
+    monkeypatch.setattr(sys.modules["mfvpr.tuning.sweeps.setting_rankings"], "write_arrays", write)
     with pytest.raises(OSError, match="No space left"):
-        rank(mfvpr.MatchCount(), settings, *data, folder=tmp_path)
+        rank(mfvpr.MatchCount(), [{"c": 0.5}], *data, folder=tmp_path)
 
 
-@mfvpr.value
-class Slow:
-    """A scorer of another library that takes 20 ms for each call."""
+def test_progress_counts_batches_of_blocks_also_those_that_are_read(data, tmp_path):
+    settings, options = sweeps.grid({"max_distance": [0.5, 1.0, 1.5]}), {"settings_per_block": 1, "folder": tmp_path}
+    for _ in range(2):
+        moves = []
 
-    share: float = 1.0
+        def track(items, total, moves=moves):
+            for item in items:
+                moves.append((item, total))
+                yield item
 
-    def __call__(self, matches):
-        raise NotImplementedError
-
-    def score_pairs(self, matches):
-        time.sleep(0.02)
-        return self.share * matches.mask.sum(axis=-1)
-
-
-def test_long_work_says_how_long_it_takes_and_advances_meanwhile(data):
-    lines, moves, settings = [], [], [{"share": float(share)} for share in range(1, 161)]
-
-    def track(items, total):
-        for item in items:
-            moves.append((time.perf_counter(), item + 1, total))
-            yield item
-
-    runtime = mfvpr.Runtime(log=lambda line: lines.append((time.perf_counter(), line)), progress=lambda _: track)
-    got = rank(Slow(), settings, *data, runtime=runtime)
-    [(start, line)], seconds = lines, time.perf_counter()
-    seconds -= start
-    expected = float(re.fullmatch(r"sweep: about (\d+) s", line)[1])
-    assert expected / 2 - 0.5 <= seconds <= 2 * expected + 0.5
-    times, numbers, totals = zip(*moves, strict=True)
-    assert max(np.diff([start, *times])) < 2
-    assert numbers[-1] == totals[-1]
-    np.testing.assert_array_equal(got, rank(Slow(), settings[:1], *data).repeat(160, axis=1))
+        rank(mfvpr.MatchCount(), settings, *data, runtime=mfvpr.Runtime(progress=lambda _, t=track: t), **options)
+        assert [item for item, _ in moves] == list(range(moves[0][1]))
+        assert moves[0][1] % len(settings) == 0
 
 
 def all_nan(matches):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Num
 
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size

@@ -1,7 +1,7 @@
 """The axes of a sweep, in plain values: words, numbers, None."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from operator import attrgetter
 from typing import Any
@@ -14,7 +14,7 @@ from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.core import parameters
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.weights import WEIGHTS
-from mfvpr.tuning.sweeps.settings import FUSION, Setting, grid
+from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
 
 MAX_DISTANCE = "max_distance"
@@ -50,8 +50,8 @@ class Axes:
         values = {}
         for name, axis in self.values.items():
             if name not in {*known, MAX_DISTANCE, FUSION}:
-                raise InputError(f"{name}: expected a parameter of {type(scorer).__name__}, of "
-                                 f"{', '.join([*known, MAX_DISTANCE, FUSION])}")  # fmt: skip
+                names = ", ".join([*known, MAX_DISTANCE, FUSION])
+                raise InputError(f"{name}: expected a parameter of {type(scorer).__name__}, of {names}")
             is_list = np.iterable(axis) and not isinstance(axis, str)
             values[name] = list(map(_plain, axis)) if is_list else []
             if len({*values[name]}) < max(1, len(values[name])):
@@ -85,7 +85,14 @@ class Axes:
 
     def setting(self, plain: Mapping[str, Any]) -> Setting:
         """Convert plain values to a setting of `mfvpr.tuning.sweeps.rank_settings`."""
-        return {name: self._value(name, value) for name, value in plain.items()}
+        special: dict[str, Callable[[Any], Any]] = {
+            FUSION: lambda c: None if c == "auto" else float(c),
+            MAX_DISTANCE: lambda limit: math.inf if limit is None else limit,
+            "weight": named_weight,
+        }
+        declared = {name: parameter.value for name, parameter in self.parameters.items()}
+        converters = declared | special
+        return {name: converters[name](value) if name in converters else value for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
         """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
@@ -103,15 +110,6 @@ class Axes:
             return words[0] if words else value
         is_none = name in self.parameters and value == self.parameters[name].none
         return None if is_none else _plain(value)
-
-    def _value(self, name: str, value: Any) -> Any:
-        if name == FUSION:
-            return None if value == "auto" else float(value)
-        if name == MAX_DISTANCE:
-            return math.inf if value is None else value
-        if name == "weight":
-            return named_weight(value)
-        return self.parameters[name].value(value) if name in self.parameters else value
 
 
 def _plain(value: Any) -> Any:

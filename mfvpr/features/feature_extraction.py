@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Num
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.images import Interpolation, resize
+from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.extractor import Description, Extractor
 from mfvpr.features.feature_set import check_features, without_padding
 from mfvpr.utils.errors import InputError, require_word

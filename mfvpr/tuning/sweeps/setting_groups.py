@@ -26,7 +26,6 @@ class Group:
     settings: Mapping[str, Shaped[np.ndarray, " settings"]]
     weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]  # of `weight` (an option's number) and `max_distance`
     rows: Int[np.ndarray, "settings weightings"]  # numbers of the settings
-    program: str = ""  # the scorer's program as text, if blocks are stored
 
     def blocks(self, size: int) -> Iterator["Group"]:
         """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""

@@ -9,8 +9,8 @@ import numpy as np
 import scipy  # its subpackages are imported at their first use
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.datasets.ground_truth import Truth
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth import Truth
 from mfvpr.evaluation.confidence import APART, INPUTS, REFUSALS, Confidence, Input, confidence_inputs
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Num
 
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows

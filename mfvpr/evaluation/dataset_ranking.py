@@ -18,13 +18,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mfvpr.core.metrics import count_correct
-from mfvpr.datasets.datasets import Dataset, QuerySequence
+from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.cohort_normalization import cohort_sequence, hubness
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.image_sizes import folders_of
-from mfvpr.evaluation.rankings import COHORT, Matched, Ranked
+from mfvpr.evaluation.rankings import Matched, Ranked
 from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import System
 from mfvpr.evaluation.validation import score_warnings
@@ -39,8 +38,6 @@ Reason = Literal[  # why there is no place
     "no candidates", "overexposed", "blurred", "too few features", "too few matches", "no better than noise",
     "low confidence", "off the map",
 ]  # fmt: skip
-
-Scored = tuple[Matched, dict[str, np.ndarray]]  # a sequence, and its scores [Q, C] by name of the scorer
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,8 +138,7 @@ def rank_dataset(
         runtime: devices, memory, progress and messages; None = those of the cache.
 
     Returns:
-        Rankings by name, and the seconds of each stage. Extraction always counts as `features`; a cohort is a stage of
-        its own.
+        Rankings by name, and the seconds of each stage. Extraction always counts as `features`.
 
     Raises:
         InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
@@ -153,35 +149,22 @@ def rank_dataset(
     if cache.root is not None:
         keep_compiled_programs()
     system = system.fit_image_size(folders_of(dataset), cache.warn)
-    strengths, size = dict[str, np.ndarray](), len(dataset.database)
-    if system.cohort is not None:
-        cohort, values = _score_cohort(dataset, system, system.cohort, cache, watch)
-        strengths = {name: hubness(cohort.candidates, values[name], size, name=name) for name in values}
-    scored = [_score(dataset, sequence, system, cache, watch) for sequence in dataset.sequences]
-    ways = system.final_scores.values(), system.ties
-    ranked = []
-    for matched, scores in scored:
-        excluded = matched.sequence.excluded if system.sequences else None
-        options = {"num_rows": size, "excluded": None if excluded is None else excluded.dense()}
-        ranked.append(rank_by_scores(matched.candidates, scores, *ways, hubness=strengths, **options))
-    matched = [sequence for sequence, _ in scored]
-    for line in score_warnings(matched, ranked, system.scorers):
+    systems: dict[str, list[Ranked]] = {}
+    matched = [match_sequence(dataset, each, system.pipeline, cache=cache, watch=watch) for each in dataset.sequences]
+    for sequence in matched:
+        with watch("scores"):
+            scores = stages.score(system.scorers, sequence.by_scale, sequence.candidates, runtime=cache.runtime)
+        excluded = sequence.sequence.excluded if system.sequences else None
+        rankings = rank_by_scores(
+            sequence.candidates,
+            scores,
+            system.final_scores.values(),
+            system.ties,
+            num_rows=len(dataset.database),
+            excluded=None if excluded is None else excluded.dense(),
+        )
+        for name, ranking in rankings.items():
+            systems.setdefault(name, []).append(ranking)
+    for line in score_warnings(matched, systems, system.scorers):
         cache.warn(line)
-    systems = {name: [by_system[name] for by_system in ranked] for name in ranked[0]}
     return RankedDataset(dataset, system, matched, systems, watch.seconds)
-
-
-def _score(dataset: Dataset, sequence: QuerySequence, system: System, cache: FeatureCache, watch: Stopwatch) -> Scored:
-    """Match and score a sequence."""
-    matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, watch=watch)
-    with watch("scores"):
-        return matched, stages.score(system.scorers, matched.by_scale, matched.candidates, runtime=cache.runtime)
-
-
-def _score_cohort(dataset: Dataset, system: System, cohort: int, cache: FeatureCache, watch: Stopwatch) -> Scored:
-    """Match and score the database with itself, as a stage of its own."""
-    sequence = cohort_sequence(cache.recipes.contents(dataset.database), cohort)
-    progress = cache.runtime.progress
-    cache = replace(cache, runtime=replace(cache.runtime, progress=lambda label: progress(f"cohort {label}")))
-    with watch(COHORT):
-        return _score(dataset, sequence, system, cache, Stopwatch())

@@ -1,6 +1,5 @@
 """Search for the best setting: all of a grid, or those that Optuna proposes, batch by batch; and its result."""
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,8 +14,8 @@ from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.evaluation.statistics import Estimate, McNemar, PathTest, estimate, mcnemar, path_test
 from mfvpr.matchers.match_set import MatchSet, Scales
-from mfvpr.tuning.sweeps.axes import Axes
-from mfvpr.tuning.sweeps.rankings import DEFAULT_OPTIONS, SweepOptions, duration, rank_settings
+from mfvpr.tuning.sweeps.setting_rankings import DEFAULT_OPTIONS, SweepOptions, rank_settings
+from mfvpr.tuning.sweeps.sweep_axes import Axes
 from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,19 +90,20 @@ class Outcome:
         """Verdicts by threshold, on the queries to report on."""
         chosen_hits = self.protocol.reported_hits(self.rows, self.chosen)
         own_hits = self.protocol.reported_hits(self.rows, [self.own] * len(self.chosen))
-        return [
-            Verdict(
-                threshold, len(first), estimate(first), estimate(second),
-                mcnemar(first, second), path_test(first, second),
-            )
-            for threshold, first, second in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True)
-        ]  # fmt: skip
+        verdicts = []
+        for threshold, first, second in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True):
+            tests = mcnemar(first, second), path_test(first, second)
+            verdicts.append(Verdict(threshold, len(first), estimate(first), estimate(second), *tests))
+        return verdicts
 
 
 def search_grid(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist,
+    axes: Axes,
+    protocol: EvaluationProtocol,
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
     options: SweepOptions = DEFAULT_OPTIONS,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them."""
     axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), axes.grid()
@@ -114,9 +114,15 @@ def search_grid(
 
 
 def search_optuna(
-    axes: Axes, protocol: EvaluationProtocol, match_set: MatchSet | Scales, candidates: Shortlist,
-    options: SweepOptions = DEFAULT_OPTIONS, *, trials: int, seed: int = 0,
-) -> Outcome:  # fmt: skip
+    axes: Axes,
+    protocol: EvaluationProtocol,
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    options: SweepOptions = DEFAULT_OPTIONS,
+    *,
+    trials: int,
+    seed: int = 0,
+) -> Outcome:
     """Rank with the scorer's own values, and with settings that Optuna's sampler (TPE) proposes from a seed.
 
     Numbers are drawn between the smallest and the largest value of an axis, words among its values. If the protocol has
@@ -130,20 +136,33 @@ def search_optuna(
     _announce(1 + trials, candidates, options)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
-    settings, start = [dict(axes.own)], time.perf_counter()
+    settings = [dict(axes.own)]
     rows = [_rank(axes, settings, protocol, match_set, candidates, replace(options, label="own values"))]
-    while len(settings) <= trials:
-        batch = [study.ask() for _ in range(min(BATCH, trials + 1 - len(settings)))]
+    while (done := len(settings) - 1) < trials:
+        batch = [study.ask() for _ in range(min(BATCH, trials - done))]
         proposed = [suggest_setting(trial, axes) for trial in batch]
-        label = f"trials {len(settings)} to {len(settings) + len(batch) - 1}"
+        label = f"trials {done + 1} to {done + len(batch)} of {trials}"
         rows.append(_rank(axes, proposed, protocol, match_set, candidates, replace(options, label=label)))
         recall = protocol.tuning(rows[-1])[..., protocol.main].mean(axis=0)
         for trial, value in zip(batch, recall, strict=True):
             study.tell(trial, float(value))
         settings += proposed
-        seconds = (time.perf_counter() - start) / len(settings) * (1 + trials - len(settings))
-        options.runtime.log(f"{label}: done, {duration(seconds)} left")
     return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
+
+
+def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
+    pairs, queries = int(candidates.mask.sum()), len(candidates.mask)
+    options.runtime.log(
+        f"sweep: {number:,} settings on {pairs:,} pairs of {queries:,} queries with their candidates, "
+        f"{number * pairs:,} scores"
+    )
+
+
+def _rank(axes: Axes, settings: Sequence[Mapping[str, Any]], protocol: EvaluationProtocol, *data: Any) -> np.ndarray:
+    """Rows `[V, S, Q, depth]` of the rankings by plain settings; `data` are matches, candidates and options."""
+    match_set, candidates, options = data
+    of_scorer = [axes.setting(plain) for plain in settings]
+    return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
 
 
 def require_optuna() -> None:
@@ -152,30 +171,15 @@ def require_optuna() -> None:
         raise InputError("Optuna is not installed; pip install 'mfvpr[sweep]'")
 
 
-def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
-    pairs = int(candidates.mask.sum())
-    options.runtime.log(f"sweep: {number:,} settings on {pairs:,} pairs of {len(candidates.mask):,} queries with their "
-                        f"candidates, {number * pairs:,} scores")  # fmt: skip
-
-
-def _rank(
-    axes: Axes, settings: Sequence[Mapping[str, Any]], protocol: EvaluationProtocol,
-    match_set: MatchSet | Scales, candidates: Shortlist, options: SweepOptions,
-) -> np.ndarray:  # fmt: skip
-    """Rows `[V, S, Q, depth]` of the rankings by plain settings."""
-    of_scorer = [axes.setting(plain) for plain in settings]
-    return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
-
-
 def suggest_setting(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
     """Draw a plain value of every axis."""
-    integers = {name for name, parameter in axes.parameters.items() if parameter.whole}
-    return {name: _suggest(trial, name, values, is_integer=name in integers) for name, values in axes.values.items()}
-
-
-def _suggest(trial: "optuna.Trial", name: str, values: Sequence[Any], *, is_integer: bool) -> Any:
-    numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
-    if len(numbers) < len(values) or len(values) == 1:
-        return trial.suggest_categorical(name, values)
-    suggest = trial.suggest_int if is_integer else trial.suggest_float
-    return suggest(name, min(values), max(values))
+    setting = {}
+    for name, values in axes.values.items():
+        numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
+        if len(numbers) < len(values) or len(values) == 1:
+            setting[name] = trial.suggest_categorical(name, values)
+        elif name in axes.parameters and axes.parameters[name].whole:
+            setting[name] = trial.suggest_int(name, min(values), max(values))
+        else:
+            setting[name] = trial.suggest_float(name, min(values), max(values))
+    return setting

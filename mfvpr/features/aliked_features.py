@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Num
 
-from mfvpr.datasets.images import Interpolation
+from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.aliked import STRIDE, Aliked
