@@ -172,7 +172,7 @@ class TestInstall:
             (random_checkpoint(d2net_shapes()), "expected the keys of another network, got those of d2net"),
             ({f"module.{key}": np.zeros(2) for key in SOURCE_SHAPES}, "its keys begin with module."),
             ({f"{place}{99 * '.long'}": np.zeros(2) for place in range(500)}, "500 unknown (0.long.long"),
-            ({"net.conv.weight": np.zeros(2, np.float16)}, "got Half at net.conv."),
+            ({"net.conv.weight": np.zeros(2, np.float16)}, "asks for torch.HalfStorage"),
         ],
         ids=["another network", "prefix", "unknown network", "half"],
     )
