@@ -122,12 +122,9 @@ def write_legacy(path: Path, content: Any) -> Path:
     return path
 
 
-HEADER = "{'descr': '|O', 'fortran_order': False, 'shape': (), }"
-
-
-def write_numpy(path: Path, content: Any, *, protocol: int = 4, header: str = HEADER) -> Path:
+def write_numpy(path: Path, content: Any, *, protocol: int = 4) -> Path:
     """A .npy file of one pickled object, as NumPy writes it; `content` may be the bytes of the pickle."""
-    start = header.ljust(117) + "\n"
+    start = "{'descr': '|O', 'fortran_order': False, 'shape': (), }".ljust(117) + "\n"
     if not isinstance(content, bytes):
         content = pickle.dumps(np.array(content, dtype=object), protocol=protocol)
     path.write_bytes(b"\x93NUMPY\x01\0" + struct.pack("<H", len(start)) + start.encode() + content)

@@ -1,12 +1,11 @@
 """Convert the tensors of published checkpoints to the parameters of our networks, by one table per network.
 
 The conversion is strict: each key is used once or listed as ignored, each parameter is set once, and all types and
-shapes are checked. The error counts the problems by kind, with an example of each.
+shapes are checked.
 """
 
 import re
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import NamedTuple
@@ -15,6 +14,8 @@ import numpy as np
 
 from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
+
+_MOST_EXAMPLES = 3  # of problems in a message
 
 
 class _Change(NamedTuple):
@@ -66,55 +67,25 @@ def convert(
         InputError: keys are missing or unknown, or a tensor has another shape or type.
     """
     parameters: dict[str, np.ndarray] = {}
-    origin: dict[str, str] = {}
-    problems: dict[str, list[str]] = defaultdict(list)
-
+    problems: list[str] = []
     for key, value in source.items():
         if is_ignored(key, table):
             for pattern, shape in table.expected.items():
                 if re.fullmatch(pattern, key) and value.shape != shape:
-                    problems["of another shape"].append(f"{key}: expected {shape}, got {value.shape}")
+                    problems.append(f"{key} of another shape: expected {shape}, got {value.shape}")
             continue
-        targets = _targets(key, table)
-        target, layout = targets[0] if targets else ("", Layout.COPY)
-        if len(targets) > 1:
-            problems["with several rules"].append(shorten(key))
-        elif target not in shapes:
-            problems["unknown"].append(shorten(key))
-        elif target in origin:
-            problems["twice"].append(f"{key} and {origin[target]}")
-        else:
-            origin[target] = key
-            parameters[target] = _convert_tensor(key, value, layout, shapes[target], problems)
-    problems |= {"missing": missing} if (missing := [target for target in shapes if target not in origin]) else {}
+        rules = [(match, rule) for rule in table.rules if (match := re.fullmatch(rule.source, key))]
+        target = rules[0][0].expand(rules[0][1].target) if len(rules) == 1 else ""
+        if target not in shapes or target in parameters:
+            problems.append(f"{shorten(key)} {'twice' if target in parameters else 'unknown'}")
+            continue
+        parameters[target], problem = _convert_tensor(value, rules[0][1].layout, shapes[target])
+        problems += [f"{key} {problem}"] if problem else []
+    problems += [f"{target} missing" for target in shapes if target not in parameters]
     if problems:
-        kinds = (f"{len(examples)} {kind} ({examples[0]})" for kind, examples in problems.items())
-        raise InputError(f"keys do not fit the network: {', '.join(kinds)}")
+        examples = "; ".join(problems[:_MOST_EXAMPLES])
+        raise InputError(f"keys do not fit the network in {len(problems)} places: {examples}")
     return parameters
-
-
-def _convert_tensor(
-    key: str, value: np.ndarray, layout: Layout, shape: tuple[int, ...], problems: Mapping[str, list[str]]
-) -> np.ndarray:
-    """The parameter of this shape; a tensor that does not fit is added to the problems."""
-    if layout.value.first_pixel and value.ndim:
-        value = value[(0,) * (value.ndim - 1)]
-    expected = _source_shape(shape, layout)
-    if _significant_shape(value.shape, layout) != expected:
-        problems["of another shape"].append(f"{key}: expected {expected}, got {value.shape}")
-    elif value.dtype not in (np.float32, np.float64):
-        problems["of another type"].append(f"{key}: expected float32 or float64, got {value.dtype}")
-    else:
-        axes = layout.value.axes or range(len(expected))
-        ordered = value.reshape(expected).transpose(axes)
-        return (layout.value.sign * np.array(ordered, np.float32, order="C")).reshape(shape)
-    return value
-
-
-def known_share(keys: Sequence[str], table: Table) -> float:
-    """Share of the keys that the table names, from 0 to 1; 0 if the table ignores all of them."""
-    used = {key for key in keys if _targets(key, table)}
-    return sum(key in used or is_ignored(key, table) for key in keys) / len(keys) if used else 0.0
 
 
 def is_ignored(key: str, table: Table) -> bool:
@@ -122,16 +93,19 @@ def is_ignored(key: str, table: Table) -> bool:
     return any(re.fullmatch(pattern, key) for pattern in table.ignored)
 
 
-def _targets(key: str, table: Table) -> list[tuple[str, Layout]]:
-    matches = ((re.fullmatch(rule.source, key), rule) for rule in table.rules)
-    return [(match.expand(rule.target), rule.layout) for match, rule in matches if match]
-
-
-def _significant_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
-    return tuple(side for side in shape if side != 1) if layout.value.squeezed else shape
-
-
-def _source_shape(shape: tuple[int, ...], layout: Layout) -> tuple[int, ...]:
-    """Shape in the checkpoint of a parameter of this shape."""
-    shape, axes = _significant_shape(shape, layout), layout.value.axes
-    return shape if axes is None else tuple(shape[axes.index(axis)] for axis in range(len(shape)))
+def _convert_tensor(value: np.ndarray, layout: Layout, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+    """The parameter of this shape, and what does not fit in a tensor."""
+    change = layout.value
+    if change.first_pixel and value.ndim:
+        value = value[(0,) * (value.ndim - 1)]
+    significant, got = (
+        tuple(side for side in each if side != 1 or not change.squeezed) for each in (shape, value.shape)
+    )
+    axes = change.axes or tuple(range(len(significant)))
+    expected = tuple(significant[axes.index(axis)] for axis in range(len(significant)))
+    if got != expected:
+        return value, f"of another shape: expected {expected}, got {value.shape}"
+    if value.dtype not in (np.float32, np.float64):
+        return value, f"of another type: expected float32 or float64, got {value.dtype}"
+    ordered = value.reshape(expected).transpose(axes)
+    return (change.sign * np.array(ordered, np.float32, order="C")).reshape(shape), ""

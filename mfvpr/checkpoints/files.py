@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.checkpoints.conversion import convert, is_ignored
-from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint, resemblance
+from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint
 from mfvpr.checkpoints.registry import OWN, REGISTRY, Entry, entry_of, how_to_install, own_entry
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file, write_text
@@ -82,8 +82,7 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
     try:
         arrays = convert(tensors, network.table, plan.shapes)
     except InputError as error:
-        reason = resemblance(list(tensors), network) or error
-        raise InputError(f"{checkpoint}: {reason}; use the official {entry_of(name).file}") from error
+        raise InputError(f"{checkpoint}: {error}; use the official {entry_of(name).file}") from error
     needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
     rounded = sum(tensor.dtype == np.float64 for tensor in needed)
     return save(entry, arrays, checkpoint, parameters=plan.parameters, rounded=rounded)
@@ -91,13 +90,8 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
     """Raise an InputError if a file has another hash than the published one, or cannot be read."""
-    if entry.sha256 is None:
-        return
-    try:
-        sha256 = file_sha256(checkpoint)
-    except OSError as error:
-        raise InputError(f"{checkpoint}: expected a checkpoint file, got: {error.strerror}") from error
-    check_sha256(sha256, entry, checkpoint)
+    if entry.sha256 is not None:
+        check_sha256(file_sha256(checkpoint), entry, checkpoint)
 
 
 def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
@@ -141,8 +135,6 @@ def load(name: str) -> dict[str, np.ndarray]:
     """
     entry, manifest = installed_entry(name), read_manifest(name)
     path = _path(entry)
-    if (size := path.stat().st_size) != manifest.size:
-        raise WeightsError(f"{path}: expected {manifest.size} bytes, got {size}; {_MEND}", entry)
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != manifest.sha256:
         raise WeightsError(f"{path}: the file has changed since it was written (sha256 differs); {_MEND}", entry)
@@ -199,18 +191,14 @@ def read_manifest(name: str) -> Manifest:
         source = f"{entry.file} from {entry.source} ({entry.license})"
         raise WeightsError(f"{name}: not installed in {path.parent}; get {source} and install it", entry)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        manifest = Manifest(**values)
-        if any(type(getattr(manifest, field.name)) is not field.type for field in fields(Manifest)):
-            raise TypeError
+        manifest = Manifest(**json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
         raise WeightsError(f"{path}: there is no manifest, so the file was never finished; {_MEND}", entry) from error
     except (ValueError, TypeError) as error:
         raise WeightsError(f"{path}: expected a manifest of format {FORMAT}; {_MEND}", entry) from error
-    if manifest.format != FORMAT:
-        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}, got {manifest.format}; {_MEND}", entry)
-    if manifest.name != name:
-        raise WeightsError(f"{path}: expected the manifest of {name}, got that of {manifest.name}; {_MEND}", entry)
+    if (manifest.format, manifest.name) != (FORMAT, name):
+        got = f"that of {manifest.name}, format {manifest.format}"
+        raise WeightsError(f"{path}: expected the manifest of {name}, format {FORMAT}, got {got}; {_MEND}", entry)
     return manifest
 
 

@@ -4,15 +4,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mfvpr.checkpoints import tables
-from mfvpr.checkpoints.conversion import Rule, Table, convert, known_share
-from mfvpr.checkpoints.registry import REGISTRY, Entry
-from mfvpr.io.containers import shorten
+from mfvpr.checkpoints.conversion import Rule, Table, convert
+from mfvpr.checkpoints.registry import Entry
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -37,9 +35,6 @@ def _network(table: Table, name: str, *arguments: Any, **options: Any) -> Networ
 
 
 _ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
-
-_LIKELY_SHARE = 0.5  # of keys that a table knows, if the checkpoint is its network's
-_MAX_PREFIX = 4  # parts between dots
 
 # Names in the registry -> networks.
 NETWORKS: dict[str, Network] = {
@@ -89,20 +84,6 @@ class Blueprint:
         module = nnx.merge(self._graph, nnx.from_flat_state(leaves))
         module.eval()
         return module
-
-
-def resemblance(keys: Sequence[str], expected: Network) -> str | None:
-    """Reason why keys do not fit: they are another network's, or have a prefix; None = neither."""
-    if known_share(keys, expected.table) > _LIKELY_SHARE:
-        return None
-    for name, network in NETWORKS.items():
-        if network.table is not expected.table and known_share(keys, network.table) > _LIKELY_SHARE:
-            return f"expected the keys of another network, got those of {REGISTRY[name].network}"
-    *parts, _ = keys[0].split(".", maxsplit=_MAX_PREFIX)
-    for prefix in accumulate(f"{part}." for part in parts):
-        if known_share([key.removeprefix(prefix) for key in keys], expected.table) > _LIKELY_SHARE:
-            return f"its keys begin with {shorten(prefix)}, which the official file's do not"
-    return None
 
 
 def blueprint(entry: Entry) -> Blueprint:

@@ -22,15 +22,27 @@ def check_inputs(program: Program) -> dict[str, np.ndarray]:
     numbers = np.broadcast_to(np.arange(shapes.keypoints), lengths)
     scores0 = rng.uniform(0.1, 1, shapes.keypoints)
     values = {
-        "points0": np.broadcast_to(points0, (*lengths, 2)), "points1": points1, "mask": mask,
-        "distance": rng.uniform(0, 1, lengths), "ratio": rng.uniform(0.5, 1, lengths),
+        "points0": np.broadcast_to(points0, (*lengths, 2)),
+        "points1": points1,
+        "mask": mask,
+        "distance": rng.uniform(0, 1, lengths),
+        "ratio": rng.uniform(0.5, 1, lengths),
         "confidence": np.linspace(0, 1, lengths[0] * lengths[1]).reshape(lengths),
-        "scores0": scores0, "scores1": rng.uniform(0.1, 1, lengths),
-        "image_size0": size, "image_size1": np.broadcast_to(size, (shapes.candidates, 2)),
-        "index0": numbers, "index1": numbers, "count0": shapes.keypoints, "count1": np.full(lengths[0], lengths[1]),
-        "keypoints0": points0, "descriptors0": descriptors0, "mask0": rng.uniform(size=shapes.keypoints) < 0.9,
-        "keypoints1": points1, "descriptors1": descriptors1, "mask1": mask,
-    }  # fmt: skip
+        "scores0": scores0,
+        "scores1": rng.uniform(0.1, 1, lengths),
+        "image_size0": size,
+        "image_size1": np.broadcast_to(size, (shapes.candidates, 2)),
+        "index0": numbers,
+        "index1": numbers,
+        "count0": shapes.keypoints,
+        "count1": np.full(lengths[0], lengths[1]),
+        "keypoints0": points0,
+        "descriptors0": descriptors0,
+        "mask0": rng.uniform(size=shapes.keypoints) < 0.9,
+        "keypoints1": points1,
+        "descriptors1": descriptors1,
+        "mask1": mask,
+    }
     return {
         each.name: np.array(np.broadcast_to(values[each.name], each.shape), each.dtype, order="C")
         for each in program.inputs

@@ -142,14 +142,16 @@ def _system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -
     """Features of a query and C candidates -> scores of all scorers; the deciding score comes first."""
     scales, main = system.pipeline.extractor.scales, system.headline
     if len(scales) != 1:
-        raise InputError(f"{type(system.pipeline.extractor).__name__}: expected local features of one scale, got "
-                         f"{len(scales)}; export a scorer alone, and fuse the scales outside")  # fmt: skip
+        name = type(system.pipeline.extractor).__name__
+        raise InputError(f"{name}: expected local features of one scale, got {len(scales)}; export a scorer alone")
     if isinstance(system.pipeline.matcher, PairSource):
-        raise InputError(f"{type(system.pipeline.matcher).__name__}: expected a matcher that JAX compiles, got one "
-                         "that runs on the host; export a scorer alone")  # fmt: skip
+        name = type(system.pipeline.matcher).__name__
+        raise InputError(f"{name}: expected a matcher that JAX compiles, not on the host; export a scorer alone")
     if main not in system.scorers:
-        raise InputError(f"final={main!r}: expected a scorer, got a ranking that needs the retrieval or further "
-                         "queries; choose another by dataclasses.replace(system, final=...)")  # fmt: skip
+        raise InputError(
+            f"final={main!r}: expected a scorer, got a ranking that needs the retrieval or further queries; choose "
+            "another by dataclasses.replace(system, final=...)"
+        )
     names = [main, *(name for name in system.scorers if name != main)]
     outputs = {"scores" if name == main else f"scores_{name}": system.scorers[name] for name in names}
     scorers, matcher = _scorers(outputs, shapes), system.pipeline.matcher
@@ -168,11 +170,13 @@ def _scorers(scorers: Mapping[str, Scorer], shapes: ExportShapes) -> dict[str, S
     """Scorers with the capacities that images need; an InputError for scorers that JAX cannot compile."""
     for output, scorer in scorers.items():
         if on_host(scorer):
-            raise InputError(f"{type(scorer).__name__}: expected a scorer that JAX compiles, got one that runs on the "
-                             "host (score_pairs); leave it out")  # fmt: skip
+            name = type(scorer).__name__
+            raise InputError(
+                f"{name}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
+            )
         if not output.isidentifier():
-            raise InputError(f"scorers: expected names of letters, digits and _, got "
-                             f"{output.removeprefix('scores_')!r}; rename the scorer")  # fmt: skip
+            name = output.removeprefix("scores_")
+            raise InputError(f"scorers: expected names of letters, digits and _, got {name!r}; rename the scorer")
     size = np.asarray(shapes.image_size, np.float32)
     return with_capacity(dict(scorers), size, size, multiple=BIN_STEP)
 
@@ -198,8 +202,8 @@ def _tensors(table: Mapping[str, tuple[str, str, str]], shapes: ExportShapes) ->
 
 def _outputs(scorers: Mapping[str, Scorer], shapes: ExportShapes, with_shift: bool) -> tuple[Tensor, ...]:
     if with_shift and not isinstance(scorers["scores"], HistogramOfShifts):
-        raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got "
-                         f"{type(scorers['scores']).__name__}; leave with_shift out")  # fmt: skip
+        got = type(scorers["scores"]).__name__
+        raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got {got}; leave with_shift out")
     table = {name: ("C", "float32", "") for name in scorers}
     return _tensors(table | ({"shift": ("C2", "float32", "px")} if with_shift else {}), shapes)
 

@@ -45,8 +45,8 @@ def deserialize(content: bytes, where: str) -> jax_export.Exported:
         exported = jax_export.deserialize(bytearray(content))
         operations = _CUSTOM_CALL.findall(exported.mlir_module())
     except Exception as error:  # of flatbuffers, of MLIR, or of JAX's own checks
-        raise InputError(f"{where}: expected a program that JAX {jax.__version__} reads, got {_first_line(error)}; "
-                         "export it again with this version") from error  # fmt: skip
+        got = _first_line(error)
+        raise InputError(f"{where}: expected a program that JAX {jax.__version__} reads, got {got}") from error
     _require_none(operations, where)
     return exported
 
@@ -63,16 +63,19 @@ def _export(function: Callable[..., Any], inputs: tuple[Tensor, ...]) -> jax_exp
         _require_none(_CALLBACK.findall(str(traced.jaxpr)), "scorer")
         text = traced.lower(lowering_platforms=PLATFORMS).as_text()
     except (jax.errors.JAXTypeError, NotImplementedError) as error:
-        raise InputError(f"scorer: expected code that JAX compiles for {' and '.join(PLATFORMS)}, got "
-                         f"{_first_line(error)}; use jax.numpy instead of NumPy and Python") from error  # fmt: skip
+        expected = f"code that JAX compiles for {' and '.join(PLATFORMS)}"
+        mend = "use jax.numpy instead of NumPy and Python"
+        raise InputError(f"scorer: expected {expected}, got {_first_line(error)}; {mend}") from error
     _require_none(_CUSTOM_CALL.findall(text), "scorer")
     return jax_export.export(program, platforms=PLATFORMS)(*structs)
 
 
 def _require_none(operations: list[str], where: str) -> None:
     if operations:
-        raise InputError(f"{where}: expected a program without calls into Python or libraries, got "
-                         f"{', '.join(sorted({*operations}))}; leave the operation out")  # fmt: skip
+        got = ", ".join(sorted({*operations}))
+        raise InputError(
+            f"{where}: expected a program without calls into Python or libraries, got {got}; leave the operation out"
+        )
 
 
 def _require_flatbuffers() -> None:

@@ -41,8 +41,10 @@ def with_length(
     if lengths == "unit":
         worst = int(np.abs(norms - 1).argmax())
         if abs(norms[worst] - 1) > TOLERANCE:
-            raise InputError(f"{where}: expected unit length, got length {norms[worst]:.4g} at {worst}; set "
-                             "lengths='normalize' to scale descriptors, or lengths='keep' to keep them")  # fmt: skip
+            raise InputError(
+                f"{where}: expected unit length, got length {norms[worst]:.4g} at {worst}; set lengths='normalize' to "
+                "scale descriptors, or lengths='keep' to keep them"
+            )
     elif not norms.all():
         raise InputError(f"{where}: expected descriptors with a direction, got zeros at {int(norms.argmin())}")
     scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # unit length in float32: no bit changes

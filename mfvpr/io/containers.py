@@ -67,9 +67,3 @@ def shorten(text: str, limit: int = 60) -> str:
     start = text[: limit + 1]
     start = start if start.isprintable() else start.encode("unicode_escape").decode("ascii")
     return start if len(start) <= limit else f"{start[: limit - 20]}... ({len(text)} characters)"
-
-
-def require_plain(where: str, dtype: np.dtype) -> None:
-    """Raise an InputError for arrays of Python objects, which need a pickle, and of records."""
-    if dtype.hasobject or dtype.kind in "OV":
-        raise InputError(f"{where}: expected an array of numbers or text, got objects or records, which are not loaded")

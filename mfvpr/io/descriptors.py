@@ -11,7 +11,7 @@ from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
 from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
 from mfvpr.io.h5 import H5File, write_h5
 from mfvpr.io.names import match_names, require_all, require_different
-from mfvpr.io.npz import parse_npy, read_npz, write_npz
+from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -87,7 +87,7 @@ Rows = tuple[list[str], np.ndarray]  # entries [M] of the images and their descr
 
 def _from_npy(path: Path, names: Sequence[str]) -> Rows:
     with reading(path):
-        return _from_name_order(path, names, parse_npy(str(path), path.read_bytes()))
+        return _from_name_order(path, names, np.load(path, allow_pickle=False))
 
 
 def _from_npz(path: Path, names: Sequence[str]) -> Rows:

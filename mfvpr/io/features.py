@@ -84,26 +84,27 @@ class ImportedFeatures:
             yield row, self._features(row, f"{self.path}: {shorten(images[row])}", parts)
 
     def _features(self, row: int, where: str, parts: Mapping[str, np.ndarray]) -> Features:
-        count, shape = int(self.counts[row]), (int(self.counts[row]), self.dimension)
+        count = int(self.counts[row])
         _require_parts(where, parts)
         keypoints = as_float32(f"{where}: keypoints", parts["keypoints"], "fiu")[:, :2]
         descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
         descriptors = descriptors.T if self._transposed else descriptors
         part = _score_part(parts)
-        scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1) if part else np.ones(count, np.float32)
-        has_shape = descriptors.shape == shape if count else not descriptors.size  # [D, 0], [0, D] or [0] if count = 0
-        if len(keypoints) != count or len(scores) != count or not has_shape or self.scored != (part is not None):
-            got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
-            raise InputError(f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} "
-                             f"numbers, got {got}; has the file changed since it was opened?")  # fmt: skip
-        scores = scores if scores.any() else np.ones(count, np.float32)
+        scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1) if part else np.zeros(count, np.float32)
+        if not count and not descriptors.size:  # [D, 0], [0, D] or [0]
+            descriptors = np.zeros((0, self.dimension), np.float32)
+        if not len(keypoints) == len(scores) == count or descriptors.shape != (count, self.dimension):
+            raise InputError(
+                f"{where}: expected {count} keypoints with scores and descriptors of {self.dimension} numbers, got "
+                f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; has the file changed since it was "
+                "opened?"
+            )
         size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
         require_inside(where, keypoints, size)
-        descriptors = with_length(f"{where}: descriptors", descriptors.reshape(shape), self._lengths)
         return Features(
             keypoints=np.ascontiguousarray(keypoints),
-            descriptors=np.ascontiguousarray(descriptors),
-            scores=scores,
+            descriptors=np.ascontiguousarray(with_length(f"{where}: descriptors", descriptors, self._lengths)),
+            scores=scores if scores.any() else np.ones(count, np.float32),
             mask=np.ones(count, bool),
             image_size=size,
         )
@@ -219,25 +220,23 @@ def _layout(path: Path, shapes: Mapping[str, Shapes], default: bool) -> tuple[bo
 
     An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
     """
-    votes: dict[bool, str] = {}
-    descriptors = {image: parts["descriptors"] for image, parts in shapes.items() if parts["keypoints"][0]}
-    for image, shape in descriptors.items():
-        count = shapes[image]["keypoints"][0]
-        if len(shape) != 2 or count not in shape:
+    is_transposed: dict[bool, str] = {}  # an image of each layout
+    dimensions: set[int] = set()
+    for image, parts in shapes.items():
+        count, shape = parts["keypoints"][0], parts["descriptors"]
+        if count and (len(shape) != 2 or count not in shape):
             expected = f"[{count}, D] or [D, {count}] like the keypoints"
             raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
-        if shape[0] != shape[1]:
-            votes.setdefault(shape[1] == count, image)
-    if len(votes) == 2:
-        got = f"[D, N] for {shorten(votes[True])} and [N, D] for {shorten(votes[False])}"
-        raise InputError(f"{path}: expected descriptors of one layout, got {got}")
-    transposed = next(iter(votes), default)
-    dimensions = {image: shape[0 if transposed else 1] for image, shape in descriptors.items()}
-    dimension = next(iter(dimensions.values()), 0)
-    for image, numbers in dimensions.items():
-        if numbers != dimension:
-            raise InputError(f"{path}: {shorten(image)}: descriptors: expected {dimension} numbers each, got {numbers}")
-    return transposed, dimension
+        if count and shape[0] != shape[1]:
+            is_transposed.setdefault(shape[1] == count, image)
+        if count:
+            dimensions.add(shape[0] if shape[1] == count else shape[1])
+    if len(is_transposed) == 2 or len(dimensions) > 1:
+        raise InputError(
+            f"{path}: expected descriptors of one layout, [D, N] or [N, D], and of one length for all images, got "
+            f"lengths {sorted(dimensions)}"
+        )
+    return next(iter(is_transposed), default), next(iter(dimensions), 0)
 
 
 def _score_part(parts: Collection[str]) -> str | None:
@@ -256,13 +255,11 @@ def _image_size(
     where: str, stored_size: np.ndarray | None, explicit_size: Float32[np.ndarray, "2"] | None
 ) -> Float32[np.ndarray, "2"]:
     """Size in the file, or the one that the caller states."""
-    if stored_size is None:
-        if explicit_size is None:
-            raise InputError(f"{where}: expected image_size, got none; has the file changed since it was opened?")
+    if stored_size is None and explicit_size is not None:
         return explicit_size.copy()
-    size = as_float32(f"{where}: image_size", stored_size, "fiu").reshape(-1)
+    size = as_float32(f"{where}: image_size", np.asarray(stored_size), "fiu").reshape(-1)
     if size.shape != (2,) or not (size > 0).all():
-        raise InputError(f"{where}: image_size: expected (width, height) in pixels, got {stored_size.tolist()}")
+        raise InputError(f"{where}: image_size: expected (width, height) in pixels, got {size.tolist()}")
     if explicit_size is not None and (size != explicit_size).any():
         expected = explicit_size.tolist()
         raise InputError(f"{where}: expected the image_size that was given, {expected}, got {size.tolist()}")
@@ -275,8 +272,10 @@ def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
     outside = ((keypoints < -margin) | (keypoints > size - 1 + margin)).any(axis=1)
     if outside.any():
         x, y = keypoints[int(outside.argmax())].tolist()
-        raise InputError(f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, "
-                         f"got ({x:g}, {y:g}); check image_size (width, height)")  # fmt: skip
+        raise InputError(
+            f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, got ({x:g}, {y:g}); "
+            "check image_size (width, height)"
+        )
 
 
 def _arrays_of(name: str, features: Features, half: bool) -> dict[str, np.ndarray]:

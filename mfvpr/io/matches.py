@@ -8,7 +8,7 @@ Matches are numbers of keypoints (hloc, kapture, COLMAP), or points (dense match
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Num
@@ -59,6 +59,7 @@ class ImportedMatches:
     ) -> None:
         self.path, self._reader, self._sides = reader.path, reader, sides
         self._image_size, self._use_confidences = image_size, confidences
+        self._has_confidences: bool | None = None  # whether the first pair that was read has confidences
         self.numbered = reader.by_number
         self.names = _names(reader, sides)
 
@@ -73,11 +74,21 @@ class ImportedMatches:
             InputError: matches are damaged, beyond the keypoints or the images, or confidences beyond 0 to 1.
         """
         stored = {row: pair for row in candidates if (pair := self._stored(query, row)) is not None}
-        names = [pair for pair, _ in stored.values()]
-        contents = zip(stored.items(), self._reader.read(names), strict=True)
-        matches = {row: raw.exchanged() if is_exchanged else raw for (row, (_, is_exchanged)), raw in contents}
-        convert = self._numbered if self.numbered else self._at_points
-        return list(map(convert(query, matches).get, candidates))
+        contents = self._reader.read([pair for pair, _ in stored.values()])
+        features = self._features(0, [query]) | self._features(1, [*stored]) if self.numbered and stored else {}
+        matches = {}
+        for (row, (_, is_exchanged)), content in zip(stored.items(), contents, strict=True):
+            raw = content.exchanged() if is_exchanged else content
+            where = f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"
+            confidence = self._confidence(where, raw)
+            if self.numbered:
+                sides: Any = features[0, query], features[1, row]
+                matches[row] = numbered_matches(where, raw.first, raw.second, confidence, *sides)
+            else:
+                sizes = raw.sizes or (None, None)
+                sides = self._size(0, query, sizes[0]), self._size(1, row, sizes[1])
+                matches[row] = point_matches(where, raw.first, raw.second, confidence, *sides)
+        return list(map(matches.get, candidates))
 
     def _stored(self, query: int, candidate: int) -> tuple[Pair, bool] | None:
         """Names of a pair in the file's order, and whether that is candidate, query."""
@@ -96,74 +107,55 @@ class ImportedMatches:
             return []
         query, row = missing[0]
         first = f"{shorten(self._sides[0].names[query])} and {shorten(self._sides[1].names[row])}"
+        count = f"{len(missing)} of {len(pairs)} pairs of the shortlist"
         if len(missing) == len(pairs):
-            raise InputError(f"{self.path}: expected matches of the {len(pairs)} pairs of the shortlist, got none; the "
-                             f"first is {first}; match these pairs, or check the prefixes")  # fmt: skip
-        return [f"{self.path}: no matches of {len(missing)} of {len(pairs)} pairs of the shortlist, the first {first}; "
-                "they score 0"]  # fmt: skip
+            raise InputError(
+                f"{self.path}: expected matches of the {len(pairs)} pairs of the shortlist, got none; the first is "
+                f"{first}; match these pairs, or check the prefixes"
+            )
+        return [f"{self.path}: no matches of {count}, the first {first}; they score 0"]
 
-    def _numbered(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
-        """Matches from numbers of keypoints, by candidate."""
-        if not matches:
-            return {}
-        [features0] = self._features(0, [query]).values()
-        features1 = self._features(1, list(matches))
-        return {row: numbered_matches(where := self._where(query, row), raw.first, raw.second,
-                                      self._confidence(where, raw), features0, features1[row])
-                for row, raw in matches.items()}  # fmt: skip
-
-    def _at_points(self, query: int, matches: dict[int, FileMatches]) -> dict[int, Matches]:
-        """Matches from points, by candidate."""
-        converted = {}
-        for row, raw in matches.items():
-            where = self._where(query, row)
-            size0, size1 = (self._size(side, image, raw.sizes and raw.sizes[side])
-                            for side, image in enumerate((query, row)))  # fmt: skip
-            confidence = self._confidence(where, raw)
-            converted[row] = point_matches(where, raw.first, raw.second, confidence, size0, size1)
-        return converted
-
-    def _features(self, side: int, rows: list[int]) -> dict[int, Features]:
-        """Features of images of a side, by row."""
+    def _features(self, side: int, rows: list[int]) -> dict[tuple[int, int], Features]:
+        """Features of images of a side, by side and row."""
         images = self._sides[side]
         if images.features is not None:
-            return dict(images.features.read(rows))
+            return {(side, row): features for row, features in images.features.read(rows)}
         features = {}
         for row in rows:
             name = str(self.names[side][row])
             size = np.array(self._size(side, row, self._reader.image_size(name)), np.float32)
-            where, points = f"{self.path}: keypoints of {shorten(name)}", self._reader.keypoints(name)
-            assert points is not None  # readers of numbers have them, or `open_matches` has the features
-            points = as_float32(where, points)
+            where = f"{self.path}: keypoints of {shorten(name)}"
+            points = as_float32(where, np.asarray(self._reader.keypoints(name)))
             require_inside(where, points, size)
-            features[row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
+            features[side, row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
         return features
 
     def _confidence(self, where: str, raw: FileMatches) -> Num[np.ndarray, "..."] | None:
         """Confidences of the file; all pairs or none must have them."""
         if not self._use_confidences or not raw.first.size:
             return None
-        if (raw.confidence is not None) != self._reader.has_confidences:
-            raise InputError(f"{where}: expected confidences of all pairs or of none, unlike the first pair; ignore "
-                             "them with confidences=False")  # fmt: skip
+        has_confidence = raw.confidence is not None
+        if self._has_confidences not in (None, has_confidence):
+            raise InputError(
+                f"{where}: expected confidences of all pairs or of none, unlike the first pair; ignore them with "
+                "confidences=False"
+            )
+        self._has_confidences = has_confidence
         return raw.confidence
 
     def _size(self, side: int, row: int, stored: Size | None) -> Size:
         """Size of the image that points are in; an InputError if nobody knows it."""
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
-            raise InputError(f"{self.path}: expected the image_size that was given, {list(self._image_size)}, got "
-                             f"{list(stored)}")  # fmt: skip
+            expected = list(self._image_size)
+            raise InputError(f"{self.path}: expected the image_size that was given, {expected}, got {list(stored)}")
         size_of = self._sides[side].size if self._reader.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
-        if size is None:
-            raise InputError(f"{self.path}: expected the size of the images that the points are in, got none; set "
-                             "image_size=[W,H]")  # fmt: skip
-        if not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):
-            raise InputError(f"{self.path}: expected the size of an image, width and height in px, got {list(size)}")
+        if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):
+            raise InputError(
+                f"{self.path}: expected the size of an image, width and height in px, got {size and list(size)}; set "
+                "image_size=[W,H]"
+            )
         return size
-
-    def _where(self, query: int, row: int) -> str:
-        return f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"
 
 
 def open_matches(
@@ -239,6 +231,8 @@ def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str |
             require_one_image(reader.path, [*map(Path, side.paths)], entries, images)
     for side, each in zip(("queries", "database images"), names, strict=True):
         if not any(each):
-            raise InputError(f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, "
-                             f"such as {shorten(reader.images[0])}; give the prefix of their folder")  # fmt: skip
+            raise InputError(
+                f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, such as "
+                f"{shorten(next(iter(reader.images), 'none'))}; give the prefix of their folder"
+            )
     return names[0], names[1]

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -39,12 +39,17 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     foreign = dict.fromkeys(foreign)
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
-    for variants in (lambda name: [name], _stems):
-        free = foreign.keys() - set(matched)
-        rows = [row for row, match in enumerate(matched) if match is None]
-        if free and rows:
-            candidates = _candidates([names[row] for row in rows], free, variants)
-            _match_ends(path, names, dict(zip(rows, candidates, strict=True)), matched)
+    for spellings in (lambda name: [name], _stems):
+        by_file = defaultdict(list)  # free names, and each as it may be spelled, by the last part of the path
+        for name in foreign.keys() - set(matched):
+            for spelling in spellings(printable(name)):
+                by_file[PurePosixPath(spelling).name].append((name, _parts(spelling)))
+        candidates = {}
+        for row in (row for row, match in enumerate(matched) if match is None):
+            spelling = spellings(printable(names[row]))[0]
+            others = by_file[PurePosixPath(spelling).name]
+            candidates[row] = {name for name, parts in others if _has_same_end(parts, _parts(spelling))}
+        _choose(path, names, candidates, matched)
     return matched
 
 
@@ -67,8 +72,10 @@ def require_all(path: Path, names: Sequence[str], matched: Sequence[Entry | None
     """Return what a file has of each image, if that is not None; InputError if it lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
-        raise InputError(f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; "
-                         f"the first without is {shorten(missing[0])} (names are paths below the folder)")  # fmt: skip
+        raise InputError(
+            f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; the first "
+            f"without is {shorten(missing[0])} (names are paths below the folder)"
+        )
     return [match for match in matched if match is not None]
 
 
@@ -88,8 +95,10 @@ def require_one_image(
         if other != image and os.path.realpath(other) != os.path.realpath(image):
             name = shorten(entry.name or entry.file.name)
             first, second = (shorten(str(file), 300) for file in (other, image))
-            raise InputError(f"{path}: expected one image for each entry, got {name} for {first} and for {second}; "
-                             f"{_FULL_NAMES}, or a file for each folder")  # fmt: skip
+            raise InputError(
+                f"{path}: expected one image for each entry, got {name} for {first} and for {second}; {_FULL_NAMES}, "
+                "or a file for each folder"
+            )
 
 
 def adds_folders(name: str, match: str) -> bool:
@@ -97,19 +106,7 @@ def adds_folders(name: str, match: str) -> bool:
     return bool(_prefix(name, match)[0])
 
 
-def _candidates(names: Iterable[str], foreign: Iterable[str], variants: Callable[[str], list[str]]) -> list[set[str]]:
-    """For each image, the foreign names that may mean it: one of both paths is the end of the other."""
-    by_variant, by_end = defaultdict(set), defaultdict(set)
-    for name in foreign:
-        for variant in variants(printable(name)):
-            by_variant[variant].add(name)
-            for end in _ends(variant):
-                by_end[end].add(name)
-    images = [variants(printable(name))[0] for name in names]
-    return [by_end[image].union(*(by_variant[end] for end in _ends(image))) for image in images]
-
-
-def _match_ends(path: Path, names: Sequence[str], candidates: dict[int, set[str]], matched: list[str | None]) -> None:
+def _choose(path: Path, names: Sequence[str], candidates: dict[int, set[str]], matched: list[str | None]) -> None:
     """Fill `matched` for pairs of an image and a foreign name that have no other candidates.
 
     Candidates have the prefix of earlier matches, or none: a name at the image's own path contradicts an earlier prefix
@@ -131,14 +128,18 @@ def _match_ends(path: Path, names: Sequence[str], candidates: dict[int, set[str]
             continue
         if len(row_candidates) > 1 or num_images[next(iter(row_candidates))] > 1:
             several = " and ".join(shorten(name) for name in sorted(row_candidates)[:2])
-            raise InputError(f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, "
-                             f"which may mean other images as well; {_FULL_NAMES}")  # fmt: skip
+            raise InputError(
+                f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, which may mean "
+                f"other images as well; {_FULL_NAMES}"
+            )
         matched[row] = match = next(iter(row_candidates))
         examples.setdefault(_prefix(names[row], match), (names[row], match))
     if len(examples) > 1:
         pairs = " but ".join(f"{shorten(match)} for {shorten(name)}" for name, match in [*examples.values()][:2])
-        raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the "
-                         "prefix of the folder, or name the images by their relative paths")  # fmt: skip
+        raise InputError(
+            f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the prefix of the "
+            "folder, or name the images by their relative paths"
+        )
 
 
 def _prefix(name: str, match: str) -> Prefix:
@@ -154,10 +155,10 @@ def _stems(name: str) -> list[str]:
     return [path.with_suffix("").as_posix(), name] if path.suffix.lower() in IMAGE_SUFFIXES else [name]
 
 
-def _ends(name: str) -> Iterator[str]:
-    """The path and its shorter ends: a/b/c, b/c, c."""
-    parts = _parts(name)
-    return ("/".join(parts[start:]) for start in range(len(parts)))
+def _has_same_end(first: Sequence[str], second: Sequence[str]) -> bool:
+    """Whether one of two paths is the end of the other."""
+    shared = min(len(first), len(second))
+    return first[len(first) - shared :] == second[len(second) - shared :]
 
 
 def _parts(name: str) -> list[str]:

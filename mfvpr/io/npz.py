@@ -1,19 +1,16 @@
 """Read and write NumPy archives: one file for all images, or a folder with one for each image."""
 
-import io
-import math
 import os
 import zipfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
 
-from mfvpr.io.containers import MAX_INFLATED, Container, FileEntry, Shapes, reading, require_plain, shorten
+from mfvpr.io.containers import MAX_INFLATED, Container, FileEntry, Shapes, reading, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -28,29 +25,29 @@ class NpzFile(Container):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _open_archive(path) as archive:
-            members = [name.removesuffix(".npy") for name in archive.namelist()]
-        self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in members if "/" in name))
+        with _open(path) as archive:
+            names = archive.files
+        self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in names if "/" in name))
         if not self.images:
-            got = shorten(", ".join(members)) or "none"
-            raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}; "
-                             "if every image has its own file, give their folder")  # fmt: skip
+            raise InputError(
+                f"{path}: expected arrays named by images (a.jpg/keypoints), got {shorten(', '.join(names)) or 'none'};"
+                " if every image has its own file, give their folder"
+            )
 
     def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
-        with _open_archive(self.path) as archive:
-            members: dict[str, set[str]] = defaultdict(set)
-            for name in archive.namelist():
+        with _open(self.path) as archive:
+            members = defaultdict(list)
+            for name in archive.files:
                 image, _, part = name.rpartition("/")
-                members[image].add(part)
+                members[image].append(part)
             for image in images:
                 yield _shapes(archive, members[image], f"{image}/", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        with _open_archive(self.path) as archive:
-            members = set(archive.namelist())
+        with _open(self.path) as archive:
             for image in images:
-                names = {part: f"{image}/{part}.npy" for part in parts}
-                yield {part: _array(archive, name) for part, name in names.items() if name in members}
+                names = {part: f"{image}/{part}" for part in parts}
+                yield {part: _read(archive, name) for part, name in names.items() if name in archive}
 
 
 class NpzFolder(Container):
@@ -70,8 +67,8 @@ class NpzFolder(Container):
 
     def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
         for image in images:
-            with _open_archive(self._paths[image]) as archive:
-                yield _shapes(archive, archive.namelist(), "", parts)
+            with _open(self._paths[image]) as archive:
+                yield _shapes(archive, archive.files, "", parts)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         for image in images:
@@ -83,9 +80,8 @@ class NpzFolder(Container):
 
 def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
     """Read the arrays of an archive among `parts`, and no others; InputError if it is damaged, or holds objects."""
-    with _open_archive(path) as archive:
-        members = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-        return {part: _array(archive, members[part]) for part in parts if part in members}
+    with _open(path) as archive:
+        return {part: _read(archive, part) for part in parts if part in archive}
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
@@ -98,57 +94,35 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
 
 
 @contextmanager
-def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; raise an InputError if two members share a name, since readers choose either."""
-    with reading(path), zipfile.ZipFile(path) as archive:
-        if twice := [name for name, count in Counter(archive.namelist()).items() if count > 1]:
-            raise InputError(f"{path}: expected every array once, got {shorten(twice[0])} again; write the file anew")
-        yield archive
+def _open(path: Path) -> Iterator[Any]:
+    with reading(path), path.open("rb") as file:
+        archive = np.load(file, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise InputError("expected an archive of NumPy (.npz), got an array")
+        with archive:
+            yield archive
 
 
-def _shapes(archive: zipfile.ZipFile, members: Iterable[str], prefix: str, parts: Sequence[str]) -> Shapes:
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys((name.removesuffix(".npy") for name in members), ())
-    for part in parts:
-        if part in shapes:
-            with archive.open(f"{prefix}{part}.npy") as file:
-                shapes[part] = _read_header(f"{archive.filename}: {shorten(prefix + part)}.npy", file)[0]
-    return shapes
+def _shapes(archive: Any, names: Iterable[str], prefix: str, parts: Sequence[str]) -> Shapes:
+    return {name: _shape(archive, prefix + name) if name in parts else () for name in names}
 
 
-def _read_header(where: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    version = np.lib.format.read_magic(file)
-    if version not in readers:
-        raise InputError(f"{where}: expected an array of NumPy's format 1.0 or 2.0, got {version}")
-    shape, _, dtype = readers[version](file)
-    require_plain(where, dtype)
-    return shape, dtype
+def _shape(archive: Any, name: str) -> tuple[int, ...]:
+    with archive.zip.open(f"{name}.npy") as file:
+        is_first = np.lib.format.read_magic(file) == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if is_first else np.lib.format.read_array_header_2_0
+        return read(file)[0]
 
 
-def _array(archive: zipfile.ZipFile, member: str) -> np.ndarray:
-    where, entry = f"{archive.filename}: {shorten(member)}", archive.getinfo(member)
+def _read(archive: Any, name: str) -> np.ndarray:
+    entry = archive.zip.getinfo(f"{name}.npy")
     if entry.file_size > max(MAX_INFLATED, entry.compress_size):
-        raise InputError(f"{where}: expected at most 1 GiB in a compressed array, got more; write it uncompressed")
-    return parse_npy(where, archive.read(member))  # completely, which verifies the checksum
-
-
-def parse_npy(where: str, content: bytes) -> Shaped[np.ndarray, "..."]:
-    """The array in the bytes of a `.npy`; raise an InputError if bytes are missing or left over."""
-    file = io.BytesIO(content)
-    shape, dtype = _read_header(where, file)
-    expected = math.prod(shape) * dtype.itemsize
-    if expected != len(content) - file.tell():
-        raise InputError(f"{where}: expected {expected} bytes of values, got {len(content) - file.tell()}")
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
+        raise InputError(f"{shorten(name)}: expected at most 1 GiB in a compressed array; write it uncompressed")
+    return np.asarray(archive[name])
 
 
 def _files_below(root: Path) -> Iterator[Path]:
-    def refuse(error: OSError) -> None:
-        raise InputError(f"{error.filename}: cannot be listed ({error.strerror}); make it readable") from None
-
-    for folder, folders, files in os.walk(root, onerror=refuse, followlinks=False):
+    """Files of features, without hidden files and folders; links to folders are not followed."""
+    for folder, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in files:
-            if name.endswith(SUFFIXES) and not name.startswith("."):
-                yield Path(folder, name)
+        yield from (Path(folder, name) for name in files if name.endswith(SUFFIXES) and not name.startswith("."))

@@ -26,14 +26,13 @@ def numbered_matches(
         features0: of the query, without padding; distances are 0 without descriptors.
         features1: of the candidate.
     """
-    number0, number1 = (_numbers(where, values, features) for values, features in
-                        ((first, features0), (second, features1)))  # fmt: skip
+    number0, number1 = _numbers(where, first, features0), _numbers(where, second, features1)
     if len(number0) != len(number1):
         raise InputError(f"{where}: expected pairs of keypoints, got {len(number0)} and {len(number1)} numbers")
     dimensions = [np.shape(features.descriptors)[1] for features in (features0, features1)]
     if dimensions[0] != dimensions[1]:
-        raise InputError(f"{where}: expected descriptors of one length, got {dimensions[0]} and {dimensions[1]}; give "
-                         "the features that were matched")  # fmt: skip
+        got = f"{dimensions[0]} and {dimensions[1]}"
+        raise InputError(f"{where}: expected descriptors of one length, got {got}; give the features that were matched")
     differences = np.asarray(features0.descriptors)[number0] - np.asarray(features1.descriptors)[number1]
     return Matches(
         points0=features0.keypoints[number0],
@@ -84,8 +83,10 @@ def _numbers(where: str, values: Any, features: Features) -> Num[np.ndarray, " m
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
         raise InputError(f"{where}: expected numbers of keypoints [M], got {numbers.dtype}{list(numbers.shape)}")
     if numbers.size and not 0 <= numbers.min() <= numbers.max() < count:
-        raise InputError(f"{where}: expected numbers of {count} keypoints, got {numbers.min()} to {numbers.max()}; "
-                         "give the features that were matched")  # fmt: skip
+        got = f"{numbers.min()} to {numbers.max()}"
+        raise InputError(
+            f"{where}: expected numbers of {count} keypoints, got {got}; give the features that were matched"
+        )
     return numbers.astype(np.int32)
 
 
@@ -96,6 +97,8 @@ def _confidences(where: str, confidence: Any, count: int) -> Float32[np.ndarray,
     if values.shape != (count,):
         raise InputError(f"{where}: expected {count} confidences, got {list(values.shape)}")
     if count and not -_ROUNDING <= values.min() <= values.max() <= 1 + _ROUNDING:
-        raise InputError(f"{where}: expected confidences from 0 to 1, got {values.min():g} to {values.max():g}; scale "
-                         "them, or leave them out (confidences=False for files)")  # fmt: skip
+        raise InputError(
+            f"{where}: expected confidences from 0 to 1, got {values.min():g} to {values.max():g}; scale them, or "
+            "leave them out (confidences=False for files)"
+        )
     return np.clip(values, 0, 1)

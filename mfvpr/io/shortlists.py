@@ -4,10 +4,8 @@ Lists of image pairs are hloc's `query database` and kapture's `query, reference
 a folder of predictions, a text file for each query. To-Match adds the results of an image matcher.
 """
 
-import re
-from collections.abc import Iterator, Sequence, Set
-from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,9 +22,7 @@ from mfvpr.utils.files import printable, require_file, require_replaceable, writ
 PairLayout = Literal["hloc", "kapture", "preds"]
 Candidates = dict[int, float | None]  # database rows and scores of one query, best first
 Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
-_SEPARATOR = re.compile(r"\s*,\s*|\s+")
-_MOST_CHARACTERS, _MOST_WORDS = 10_000, 200  # of a line, since every split of it is tried
-_HEADINGS = PREDICTIONS, POSITIVES
+_SEPARATORS = {"hloc": " \t\n\r", "kapture": ",\n\r", "preds": "\n\r"}  # characters that names must not contain
 
 
 class Pair(NamedTuple):
@@ -79,7 +75,7 @@ def read_with_entries(
     if path.suffix.lower() == ".npz":
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
-        names = _read_predictions(path) if path.is_dir() else _read_pairs(path, query_names, database_names)
+        names = _read_predictions(path) if path.is_dir() else _read_pairs(path)
         queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
         database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
@@ -134,15 +130,11 @@ def write_shortlist(
     for names in (query_names, database_names):
         require_different(path, names)
         for name in names:
-            if name != name.strip() or "\n" in name or "\r" in name:
-                raise InputError(f"{path}: expected names of one line without spaces around, got {name!r}; write .npz")
+            if name != name.strip() or name.startswith("#") or {*_SEPARATORS[layout]} & {*name}:
+                raise InputError(f"{path}: expected names that fit the layout {layout}, got {name!r}; write .npz")
+    rows = [row[real].tolist() for row, real in zip(indices, mask, strict=True)]
     if layout == "preds":
-        lists = [
-            [row[real] for row, real in zip(indices, mask, strict=True)],
-            *([] if positives is None else [positives]),
-        ]
-        names = [[[database_names[int(row)] for row in rows] for rows in each] for each in lists]
-        _write_predictions(path, query_names, names)
+        _write_predictions(path, query_names, database_names, rows, positives)
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
@@ -163,17 +155,13 @@ def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
 
 def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Scored]:
     arrays = read_npz(path, ("predictions", "scores"))
-    predictions, scores = arrays.get("predictions"), arrays.get("scores")
-    if predictions is None or predictions.ndim != 2 or predictions.dtype.kind not in "iu":
-        got = "none" if predictions is None else f"{predictions.dtype}{list(predictions.shape)}"
+    predictions, scores = arrays.get("predictions", np.zeros(0)), arrays.get("scores")
+    if predictions.ndim != 2 or predictions.dtype.kind not in "iu" or len(predictions) != num_queries:
+        got = f"{predictions.dtype}{list(predictions.shape)}"
         raise InputError(f"{path}: expected predictions [{num_queries}, K], whole numbers, got {got}")
-    if len(predictions) != num_queries:
-        raise InputError(f"{path}: expected predictions of {num_queries} queries, got {len(predictions)}")
-    wrong = (predictions >= num_database) | (predictions < -1)
-    if wrong.any():
-        query, position = np.argwhere(wrong)[0].tolist()
-        raise InputError(f"{path}: predictions of query {query}: expected database rows from 0 to {num_database - 1}, "
-                         f"or -1 for none, got {predictions[query, position]}")  # fmt: skip
+    if (predictions >= num_database).any() or (predictions < -1).any():
+        got = f"{predictions.min()} to {predictions.max()}"
+        raise InputError(f"{path}: expected database rows from 0 to {num_database - 1}, or -1 for none, got {got}")
     if scores is not None and (scores.shape != predictions.shape or scores.dtype.kind not in "fiu"):
         got = f"{scores.dtype}{list(scores.shape)}"
         raise InputError(f"{path}: expected scores {list(predictions.shape)} of numbers, got {got}")
@@ -182,25 +170,23 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Score
         yield from ((query, row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0)
 
 
-def _read_pairs(path: Path, query_names: Sequence[str], database_names: Sequence[str]) -> list[Pair]:
-    """Read the pairs of a file, in its order.
-
-    Names may contain spaces or commas: of all splits of a line, the one with known names counts. (hloc splits at every
-    space.) Lines that begin with # and hold no known pair are comments.
-
-    Raises:
-        InputError: a line has no split with known names, or several, or it has more than 10,000 characters or 200
-            words.
-    """
+def _read_pairs(path: Path) -> list[Pair]:
+    """Read the pairs of a text file, in its order: commas or spaces are between the columns."""
     with reading(path, mend="expected a text file of image pairs"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-    sides = [{printable(name) for name in names} for names in (query_names, database_names)]
-    ends = [{end for name in names for end in _ends(name)} for names in sides]
     pairs = []
-    for number, line in enumerate(text.split("\n"), start=1):
-        stripped = printable(line.strip())
-        if stripped and (pair := _pair(f"{path}: line {number}", stripped, sides, ends)):
-            pairs.append(pair)
+    for number, line in enumerate(map(str.strip, printable(text).split("\n")), start=1):
+        if not line or line.startswith("#"):
+            continue
+        words = [word.strip() for word in line.split(",")] if "," in line else line.split()
+        try:
+            query, database, score = words if len(words) == 3 and "," in line else (*words, None)
+            pairs.append(Pair(query, database, None if score is None else parse_number(score)))
+        except ValueError:  # another number of words, or no number
+            raise InputError(
+                f"{path}: line {number}: expected 'query database', or 'query, database' and a score, got "
+                f"{shorten(line)!r}; names with spaces need commas between the columns, names with commas an .npz"
+            ) from None
     return pairs
 
 
@@ -210,78 +196,45 @@ def _read_predictions(folder: Path) -> list[Pair]:
     for path in sorted(folder.glob("*.txt")):
         query, predictions = read_predictions(path)
         if (other := files.setdefault(query, path)) != path:
-            raise InputError(f"{path}: expected another query than in {other.name}, got {shorten(query)} again; "
-                             "remove the files of older runs")  # fmt: skip
+            raise InputError(f"{path}: expected another query than in {other.name}; remove the files of older runs")
         results = path.with_suffix(".torch")
-        if results.exists():
-            pairs += _by_inliers(query, predictions, results)
-        else:
+        if not results.exists():
             pairs += [Pair(query, database) for database in predictions]
+            continue
+        counts = read_num_inliers(results)
+        if not 0 < len(counts) <= len(predictions):
+            raise InputError(
+                f"{results}: expected results of at most {len(predictions)} predictions, as in the text file, got "
+                f"{len(counts)}; match the predictions of this run"
+            )
+        scored = zip(predictions, counts, strict=False)  # predictions that were not matched are no candidates
+        pairs += [
+            Pair(query, *each) for each in sorted(scored, key=lambda each: -each[1])
+        ]  # equal ones keep their order
     if not files:
         mend = "; copy the .torch files beside those of preds" if any(folder.glob("*.torch")) else ""
         raise InputError(f"{folder}: expected text files of predictions, one for each query, got none{mend}")
     return pairs
 
 
-def _by_inliers(query: str, predictions: Sequence[str], results: Path) -> list[Pair]:
-    """Pairs of the predictions that were matched, most inliers first; equal numbers keep their order."""
-    counts = read_num_inliers(results)
-    if not 0 < len(counts) <= len(predictions):
-        raise InputError(f"{results}: expected results of at most {len(predictions)} predictions, as in the text file, "
-                         f"got {len(counts)}; match the predictions of this run")  # fmt: skip
-    order = sorted(range(len(counts)), key=lambda position: -counts[position])
-    return [Pair(query, predictions[position], counts[position]) for position in order]
-
-
-def _write_predictions(folder: Path, query_names: Sequence[str], lists: Sequence[Sequence[Sequence[str]]]) -> None:
-    """Write a file for each query that has predictions; its number is the query's row.
-
-    `lists` are the names of the predictions of each query, and those of its positives if they are known.
-    """
+def _write_predictions(
+    folder: Path,
+    query_names: Sequence[str],
+    database_names: Sequence[str],
+    predictions: Sequence[Sequence[int]],
+    positives: Sequence[Sequence[int]] | None,
+) -> None:
+    """Write a file for each query that has predictions; its number is the query's row."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     folder.mkdir(parents=True, exist_ok=True)
-    for row, (query, *names) in enumerate(zip(query_names, *lists, strict=True)):
-        if names[0]:
-            parts = [(QUERY, query), *((heading, *part) for heading, part in zip(_HEADINGS, names, strict=False))]
+    for row, query in enumerate(query_names):
+        if predictions[row]:
+            parts = [[QUERY, query], [PREDICTIONS, *(database_names[each] for each in predictions[row])]]
+            if positives is not None:
+                parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
             text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
             write_text(folder / f"{row:03d}.txt", text)
-
-
-def _ends(name: str) -> tuple[str, str]:
-    """File name and stem, which may stand for an image."""
-    return PurePosixPath(name).name, PurePosixPath(name).stem
-
-
-def _pair(where: str, line: str, sides: Sequence[Set[str]], ends: Sequence[Set[str]]) -> Pair | None:
-    """The pair of a line; `sides` are the paths of query and database images, `ends` the ends of these paths."""
-    words = line.split()
-    if len(words) == 2 and words[0] in sides[0] and words[1] in sides[1]:
-        return Pair(words[0], words[1])  # nearly every line of hloc
-    if len(line) > _MOST_CHARACTERS or line.count(",") + len(words) > _MOST_WORDS:
-        if line.startswith("#"):
-            return None
-        raise InputError(f"{where}: expected the names of a query and a database image, got {len(line)} characters")
-    splits = list(_splits(line))
-    pairs = [pair for pair in splits if pair.query in sides[0] and pair.database in sides[1]]
-    pairs = pairs or [pair for pair in splits if _ends(pair.query)[0] in ends[0] and _ends(pair.database)[0] in ends[1]]
-    if len(pairs) == 1:
-        return pairs[0]
-    if not pairs and line.startswith("#"):
-        return None
-    got = "several ways to read" if pairs else "names of none in"
-    raise InputError(f"{where}: expected the names of a query and a database image, got {got} {shorten(line)!r}")
-
-
-def _splits(line: str) -> Iterator[Pair]:
-    """All pairs that a line may mean."""
-    for separator in _SEPARATOR.finditer(line):
-        query, database = line[: separator.start()], line[separator.end() :]
-        yield Pair(query, database)
-        name, comma, number = database.rpartition(",")
-        if comma:
-            with suppress(ValueError):  # no number
-                yield Pair(query, name.rstrip(), parse_number(number.strip()))
 
 
 def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
@@ -289,9 +242,10 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
     for name in foreign:
         if name not in rows:
-            raise InputError(f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which "
-                             f"none of the {len(names)} has, or one has by its full path; give names with their "
-                             "folders as the file has them")  # fmt: skip
+            raise InputError(
+                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none of the "
+                f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
+            )
     return rows
 
 
@@ -325,6 +279,8 @@ def _descending(where: str, scores: Any) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(f"{where}: expected finite scores, got others")
     if (np.diff(values) > 0).any():
-        raise InputError(f"{where}: expected scores, larger = better, that descend, got ascending ones; sort the "
-                         "candidates, and negate distances")  # fmt: skip
+        raise InputError(
+            f"{where}: expected scores, larger = better, that descend, got ascending ones; sort the candidates, and "
+            "negate distances"
+        )
     return values

@@ -38,21 +38,20 @@ def stamps_in_names(names: Sequence[str]) -> list[int]:
 
     A whole number with fewer than 10 digits, or with a 0 at its beginning, is an `InputError`: it numbers the frames.
     """
-    stamps = []
-    for name in names:
-        stem = PurePosixPath(name).stem
+    stems = [PurePosixPath(name).stem for name in names]
+    for name, stem in zip(names, stems, strict=True):
         if not _NAME.fullmatch(stem):
-            raise InputError(f"{shorten(name)}: expected the time as the name of the file, such as "
-                             "1403636579763555584.png (ns) or 12.345.png (s); rename the images, or give a file of "
-                             "times (read_stamps, or --times FILE)")  # fmt: skip
-        stamps.append(_stamp(shorten(name), stem))
-    return stamps
+            raise InputError(
+                f"{shorten(name)}: expected the time as the name of the file, such as 1403636579763555584.png (ns) or "
+                "12.345.png (s); rename the images, or give a file of times (read_stamps, or --times FILE)"
+            )
+    return [parse_line_stamp(shorten(name), stem) for name, stem in zip(names, stems, strict=True)]
 
 
 def read_stamps(path: Path | str, num_images: int) -> list[int]:
     """Times of images in ns from a text file: a line for each image, as `parse_stamp` reads it; # begins a comment."""
     path = Path(path)
-    stamps = [_stamp(where, line) for where, line in read_content_lines(path, "a text file of times")]
+    stamps = [parse_line_stamp(where, line) for where, line in read_content_lines(path, "a text file of times")]
     if len(stamps) != num_images:
         raise InputError(f"{path}: expected times of {num_images} images, a line for each, got {len(stamps)}")
     return stamps
@@ -66,9 +65,10 @@ def read_content_lines(path: Path, kind: str) -> list[tuple[str, str]]:
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
-def _stamp(where: str, text: str) -> int:
+def parse_line_stamp(where: str, text: str) -> int:
+    """`parse_stamp` with an InputError that begins with the place of the text."""
     try:
         return parse_stamp(text)
     except ValueError:
-        raise InputError(f"{where}: expected a time in s, or a whole number of ms, us or ns since 1970, got "
-                         f"{shorten(text)!r}") from None  # fmt: skip
+        expected = "a time in s, or a whole number of ms, us or ns since 1970"
+        raise InputError(f"{where}: expected {expected}, got {shorten(text)!r}") from None

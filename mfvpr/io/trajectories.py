@@ -6,12 +6,12 @@ from pathlib import Path
 
 from mfvpr.io.checks import parse_number
 from mfvpr.io.containers import shorten
-from mfvpr.io.stamps import SECOND, parse_stamp, read_content_lines, stamps_in_names
+from mfvpr.io.stamps import SECOND, parse_line_stamp, read_content_lines, stamps_in_names
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
 
 _TUM, _KITTI = 7, 12  # numbers of a pose
-_WORDS = {_TUM + 1: "tum", _KITTI: "kitti"}  # of a line
+_WORDS = (_TUM + 1, _KITTI)  # of a line
 _LARGEST_GAP = SECOND // 100  # between an image and its pose, as evo allows
 
 
@@ -36,11 +36,9 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
     num_words = len(lines[0][1]) if lines else 0
     for where, words in lines:
         if len(words) != num_words or num_words not in _WORDS:
-            expected = num_words if num_words in _WORDS else "8 (TUM) or 12 (KITTI)"
-            raise InputError(f"{where}: expected {expected} numbers, got {len(words)}")
+            raise InputError(f"{where}: expected 8 numbers (TUM) or 12 (KITTI) in all lines, got {len(words)}")
     if len(lines) != len(names):
-        raise InputError(f"{path}: expected a pose of each of the {len(names)} images, got {len(lines)}; take the pose "
-                         "at the time of each image")  # fmt: skip
+        raise InputError(f"{path}: expected a pose of each of the {len(names)} images, got {len(lines)}")
     if num_words == _KITTI:
         return [_pose(where, words) for where, words in lines]
     _check_stamps(path, lines, names)
@@ -67,64 +65,54 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
             two images have the same time.
     """
     path = Path(path)
+    if len({*(stamps or ())}) < len(stamps or ()):
+        raise InputError(f"{path}: expected different times, got one twice")
+    places = [pose for pose in poses if pose is not None]
+    if not places or (stamps is None and len(places) < len(poses)):
+        expected = "all images, since a line of KITTI is a frame; write TUM" if stamps is None else "at least one image"
+        raise InputError(f"{path}: expected a place of {expected}, got {len(places)} places of {len(poses)} images")
     num_numbers = _KITTI if stamps is None else _TUM
-    stamps = range(len(poses)) if stamps is None else stamps
-    if len(stamps) and min(stamps) < 0:
-        raise InputError(f"{path}: expected times from 0 ns, got {min(stamps)}")
-    if len(stamps) != len(poses):
-        raise InputError(f"{path}: expected times of {len(poses)} images, got {len(stamps)}")
-    refused = [row for row, pose in enumerate(poses) if pose is None]
-    if num_numbers == _KITTI and refused:
-        raise InputError(f"{path}: expected a place of all {len(poses)} images, since a line of KITTI is a frame, got "
-                         f"none of {len(refused)}, the first in row {refused[0]}; write TUM")  # fmt: skip
-    lines = {}
-    for row in sorted(range(len(poses)), key=stamps.__getitem__):
-        if stamps[row] in lines:
-            raise InputError(f"{path}: expected different times, got {_seconds(stamps[row])} s twice")
-        if (pose := poses[row]) is not None:
-            words = pose.split()
-            if len(words) != num_numbers:
-                raise InputError(f"{path}: expected {num_numbers} numbers of each pose, got {len(words)} in row {row}; "
-                                 "TUM needs times, KITTI has none")  # fmt: skip
-            lines[stamps[row]] = _pose(f"{path}: row {row}", words)
-    if not lines:
-        raise InputError(f"{path}: expected at least one image with a place, got none")
+    if any(len(pose.split()) != num_numbers for pose in places):
+        raise InputError(f"{path}: expected poses of {num_numbers} numbers; TUM needs times, KITTI has none")
+    if stamps is None:
+        lines = places
+    else:
+        timed = sorted(zip(stamps, poses, strict=True), key=lambda pair: pair[0])
+        lines = [f"{_seconds(stamp)} {pose}" for stamp, pose in timed if pose is not None]
     require_replaceable(path)
-    starts = [f"{_seconds(stamp)} " if num_numbers == _TUM else "" for stamp in lines]
-    write_text(path, "".join(f"{start}{pose}\n" for start, pose in zip(starts, lines.values(), strict=True)))
+    write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def _pose(where: str, words: Sequence[str]) -> str:
     """Text of a pose, if all its words are finite numbers."""
-    for word in words:
-        try:
-            is_finite = math.isfinite(parse_number(word))
-        except ValueError:
-            is_finite = False
-        if not is_finite:
-            raise InputError(f"{where}: expected finite numbers, got {shorten(word)!r}")
+    try:
+        is_finite = all(math.isfinite(parse_number(word)) for word in words)
+    except ValueError:
+        is_finite = False
+    if not is_finite:
+        raise InputError(f"{where}: expected finite numbers, got {shorten(' '.join(words))!r}")
     return " ".join(words)
 
 
 def _check_stamps(path: Path, lines: Sequence[tuple[str, Sequence[str]]], names: Sequence[str]) -> None:
     """Raise an InputError unless the timestamps ascend, and are those of the images if their names are times."""
-    stamps = []
-    for where, words in lines:
-        try:
-            stamps.append(parse_stamp(words[0]))
-        except ValueError:
-            raise InputError(f"{where}: expected a timestamp in s first, got {shorten(words[0])!r}") from None
-        if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
-            raise InputError(f"{where}: expected ascending timestamps, got {_seconds(stamps[-1])} after "
-                             f"{_seconds(stamps[-2])}; sort the lines by time")  # fmt: skip
+    stamps = [parse_line_stamp(where, words[0]) for where, words in lines]
+    for (where, _), before, stamp in zip(lines[1:], stamps, stamps[1:], strict=False):
+        if stamp <= before:
+            raise InputError(
+                f"{where}: expected ascending timestamps, got {_seconds(stamp)} after {_seconds(before)}; sort the "
+                "lines by time"
+            )
     try:
         image_stamps = stamps_in_names(names)
     except InputError:
         return
     for (where, _), stamp, image_stamp, name in zip(lines, stamps, image_stamps, names, strict=True):
         if abs(stamp - image_stamp) > _LARGEST_GAP:
-            raise InputError(f"{where}: expected the pose of {shorten(name)}, within 10 ms, got one at "
-                             f"{_seconds(stamp)}; take the pose at the time of each image")  # fmt: skip
+            raise InputError(
+                f"{where}: expected the pose of {shorten(name)}, within 10 ms, got one at {_seconds(stamp)}; take the "
+                "pose at the time of each image"
+            )
 
 
 def _seconds(stamp: int) -> str:

@@ -8,7 +8,7 @@ import pytest
 from mfvpr.checkpoints import REGISTRY, entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import Rule, Table, convert
-from mfvpr.checkpoints.networks import NETWORKS, blueprint, resemblance
+from mfvpr.checkpoints.networks import NETWORKS, blueprint
 from mfvpr.utils import InputError
 from tests import random_checkpoints as checkpoints
 from tests.checkpoints.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
@@ -61,53 +61,35 @@ def message(source, table=TABLE, shapes=SHAPES):
     return str(caught.value)
 
 
-def test_what_is_wrong_is_counted_by_kind_with_an_example_of_each(source):
-    source["net.conv.kernel"] = source.pop("net.conv.weight")
-    del source["net.mix.1.bias"]
-    source["net.mix.2.bias"] = np.zeros(2, np.float32)
-    source["net.bn.weight"] = np.zeros(7, np.float32)
-    source["net.mix.0.weight"] = source["net.mix.0.weight"].T
-    source["net.mix.1.weight"] = np.zeros((2, 5, 1), np.float32)
-    text = message(source)
-    assert text.startswith("keys do not fit the network: ")
-    assert "2 unknown (net.conv.kernel)" in text
-    assert "2 missing (conv.kernel)" in text
-    assert "3 of another shape (net.bn.weight: expected (4,), got (7,))" in text
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"net.conv.kernel": np.zeros(3)}, "in 1 places: net.conv.kernel unknown"),
+        ({"net.mix.1.bias": None}, "in 1 places: mix.1.bias missing"),
+        ({"net.bn.weight": np.zeros(7)}, "net.bn.weight of another shape: expected (4,), got (7,)"),
+        ({"net.mix.0.weight": np.zeros((4, 5))}, "net.mix.0.weight of another shape"),
+        ({"net.mix.1.weight": np.zeros((2, 5, 1))}, "net.mix.1.weight of another shape"),
+    ],
+)
+def test_what_is_wrong_is_named(source, change, words):
+    changed = {key: value for key, value in (source | change).items() if value is not None}
+    assert words in message(changed)
 
 
 def test_filled_twice_and_ambiguous_rules(source):
     twice = Table((*TABLE.rules, Rule(r"copy", "conv.bias"), Rule(r"net\.bn\.bi.*", "bn.bias")), TABLE.ignored)
     text = message(source | {"copy": np.zeros(4)}, twice)
-    assert "1 twice (copy and net.conv.bias)" in text
-    assert "1 with several rules (net.bn.bias)" in text
-    assert "1 missing (bn.bias)" in text
+    assert "in 3 places: net.bn.bias unknown; copy twice; bn.bias missing" in text
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.int64, np.complex64, bool])
 def test_other_types_than_float32_and_float64_are_refused(source, dtype):
     source["net.mix.0.bias"] = np.ones(5, dtype)
-    expected = f"1 of another type (net.mix.0.bias: expected float32 or float64, got {np.dtype(dtype)})"
+    expected = f"net.mix.0.bias of another type: expected float32 or float64, got {np.dtype(dtype)}"
     assert expected in message(source)
     del source["net.mix.0.bias"]
     source["net.bn.num_batches_tracked"] = np.ones(3, dtype)  # ignored, whatever it is
-    assert message(source) == "keys do not fit the network: 1 missing (mix.0.bias)"
-
-
-@pytest.mark.parametrize(
-    ("name", "prefix"),
-    [("{}", None), ("module.{}", " module."), ("state.model.{}", " state.model."), ("{}.renamed", None)],
-)
-def test_a_prefix_is_recognized(name, prefix):
-    message = resemblance([name.format(key) for key in d2net_shapes()], NETWORKS["d2_tf"])
-    assert message is None if prefix is None else prefix in message
-
-
-def test_other_networks_are_recognized():
-    text = "expected the keys of another network, got those of {}"
-    assert resemblance(list(mixvpr_shapes()), NETWORKS["d2_tf"]) == text.format("mixvpr")
-    assert resemblance(list(d2net_shapes()), NETWORKS["aliked-n16"]) == text.format("d2net")
-    assert resemblance(list(mixvpr_shapes(64, 2)), NETWORKS["mixvpr_4096"]) is None  # its shapes tell
-    assert resemblance(["posenc.Wr.weight", "layers.0.bias"], NETWORKS["aliked-n16"]) is None
+    assert message(source) == "keys do not fit the network in 1 places: mix.0.bias missing"
 
 
 def test_a_blueprint_can_be_filled_twice(folder, arrays):
@@ -171,23 +153,23 @@ def test_biases_of_places365_may_have_more_axes():
               for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)}  # fmt: skip
     np.testing.assert_array_equal(places365(source)["vgg.conv1_1.bias"], np.arange(64))
     source["conv1_1.bias"] = np.zeros((8, 8))
-    with pytest.raises(InputError, match=r"1 .*\(conv1_1.bias: expected \(64,\), got \(8, 8\)\)"):
+    with pytest.raises(InputError, match=r"conv1_1.bias .*: expected \(64,\), got \(8, 8\)"):
         places365(source)
 
 
 @pytest.mark.parametrize("change", [lambda source: source, with_names_of_torchvision])
 def test_vgg16_of_other_classes_is_not_that_of_places365(change):
     source = change(vacant(places365_shapes("weight") | {"fc8a_1.weight": (1000, 4096), "fc8a_1.bias": (1000,)}))
-    with pytest.raises(InputError, match=r"weight: expected \(365, 4096\), got \(1000, 4096\)"):
+    with pytest.raises(InputError, match=r"weight .*: expected \(365, 4096\), got \(1000, 4096\)"):
         places365(source)
 
 
 def test_unknown_layers_of_places365_are_refused():
     source = vacant(places365_shapes() | {"conv6_1.weights": (2, 2), "conv1_1.scale": (64,)})
-    with pytest.raises(InputError, match=r"2 unknown \(conv6_1.weights\)"):
+    with pytest.raises(InputError, match=r"conv6_1.weights unknown"):
         places365(source)
     both = vacant(places365_shapes()) | vacant(places365_shapes("weight"))
-    with pytest.raises(InputError, match=r"12 twice \(conv1_1.weight and conv1_1.weights\)"):
+    with pytest.raises(InputError, match=r"in 12 places: conv1_1\.weight twice"):
         places365(both)
 
 

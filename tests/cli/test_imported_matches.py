@@ -108,7 +108,7 @@ def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsy
         (["matching.matches={tools}/kapture", "matching.query_prefix=other/"], "matching.query_prefix"),
         (["matching.matches={tools}/kapture", "matching.verified=true"], "matching.verified=true"),
         (["matching.matches={tools}/kapture", "scorer=histogram", "scorer.weight=ratio"], "scorer.weight=unit"),
-        (["matching.matches={tools}"], "expected files .npz or .torch"),
+        (["matching.matches={tools}"], "expected a file .npz or .torch"),
         (["matching.matches={tools}/kapture", "matching.max_distance=1"], "max_distance"),
     ],
 )

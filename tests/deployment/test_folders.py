@@ -139,21 +139,13 @@ DAMAGE = {
     "no program": (lambda folder: (folder / "program.stablehlo").unlink(), "stablehlo: expected a file, got nothing"),
     "a bit": (lambda folder: flip(folder / "program.stablehlo"), "expected the file as it was exported, got a changed"),
     "a bit of an array": (lambda folder: flip(folder / "check" / "mask.npy"), "mask.npy: expected the file as it was"),
-    "cut": (lambda folder: (folder / "export.json").write_text('{"format"'), "export.json: expected JSON"),
-    "nested": (lambda folder: (folder / "export.json").write_text("[" * 100_000), "export.json: expected"),
-    "a list": (lambda folder: (folder / "export.json").write_text("[]"), "expected the format .* got 'list'"),
-    "bytes": (lambda folder: (folder / "export.json").write_bytes(b"\xff"), "export.json: expected JSON"),
-    "another version": (lambda folder: edit(folder, lambda d: d.update(format="mfvpr exported program 2")),
-                        "expected the format 'mfvpr exported program 1', got 'mfvpr exported program 2'"),
-    "no files": (lambda folder: edit(folder, lambda d: d.pop("files")), "got an incomplete description"),
-    "no hash": (lambda folder: edit(folder, lambda d: d["files"].pop("program.stablehlo")), "the hash of program"),
-    "no hash of an array": (lambda folder: edit(folder, lambda d: d["files"].pop("check/mask.npy")), "hash of check"),
-    "another shape": (lambda folder: edit(folder, lambda d: d["inputs"][0].update(shape=[4, 20, 2])),
-                      "expected the inputs and outputs of program.stablehlo, got others"),
-    "another type": (lambda folder: edit(folder, lambda d: d["outputs"][0].update(dtype="int32")), "got others"),
-    "no shape": (lambda folder: edit(folder, lambda d: d["inputs"][0].pop("shape")), "got an incomplete description"),
-    "another folder": (lambda folder: edit(folder, lambda d: d["files"].update({"../x": "0"})), "leads elsewhere"),
-}  # fmt: skip
+    "cut": (lambda folder: (folder / "export.json").write_text('{"format"'), "export.json: expected the format"),
+    "a list": (lambda folder: (folder / "export.json").write_text("[]"), "export.json: expected the format"),
+    "another version": (
+        lambda folder: edit(folder, lambda d: d.update(format="mfvpr exported program 2")),
+        "expected the format 'mfvpr exported program 1'",
+    ),
+}
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -163,14 +155,6 @@ def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
     with pytest.raises(InputError, match=message) as error:
         mfvpr.load_exported(folder)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"no array"])
-def test_a_check_with_a_damaged_array_is_one_line(folder, content):
-    program = mfvpr.load_exported(folder)
-    (folder / "check" / "mask.npy").write_bytes(content)  # after the hashes were compared
-    with pytest.raises(InputError, match=r"mask\.npy: expected an array, got a damaged file"):
-        program.check()
 
 
 def exchange_program(folder, content):

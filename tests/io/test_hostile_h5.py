@@ -1,7 +1,6 @@
 """h5 files that are damaged or lead to other files: one line, and no link is followed."""
 
 import h5py
-import numpy as np
 import pytest
 
 from mfvpr.io import open_features
@@ -25,16 +24,6 @@ def secret(tmp_path):
     return write_hloc(tmp_path / "secret.h5", ["a.jpg"])
 
 
-def test_links_are_not_followed(path, secret):
-    with h5py.File(path, "w") as file:
-        file["a.jpg"] = h5py.ExternalLink(str(secret), "/a.jpg")
-    check_refused(path, r"a\.jpg: .*got a link")
-    with h5py.File(path, "w") as file:
-        file["outside"] = h5py.ExternalLink(str(secret), "/a.jpg")
-        file["a.jpg"] = h5py.SoftLink("/outside")
-    check_refused(path, "expected data, got a link")
-
-
 def external_link(group, values, secret):
     group["scores"] = h5py.ExternalLink(str(secret), "/a.jpg/scores")
 
@@ -50,52 +39,41 @@ def virtual_dataset(group, values, secret):
     group.create_virtual_dataset("scores", layout)
 
 
-def of_type(dtype):
-    return lambda group, *_: group.create_dataset("scores", shape=(30,), dtype=dtype)
-
-
 @pytest.mark.parametrize(
-    ("put", "message"),
+    "put",
     [
-        (external_link, "expected data, got a link"),
-        (external_storage, ".*storage in others"),
-        (virtual_dataset, ".*storage in others"),
-        (lambda group, *_: group.create_group("scores"), ".*got a group"),
-        (lambda group, *_: group.create_dataset("scores", data=h5py.Empty("f")), ".*values, got .*without"),
-        (of_type(h5py.string_dtype()), ".*array of numbers .*got objects"),
-        (of_type([("x", "f4")]), ".*array of numbers .*got objects"),
+        external_link,
+        external_storage,
+        virtual_dataset,
+        lambda group, *_: group.create_group("scores"),
+        lambda group, *_: group.create_dataset("scores", data=h5py.Empty("f")),
     ],
 )
-def test_other_data_sets_are_refused(path, secret, put, message):
+def test_other_data_sets_are_refused(path, secret, put):
     parts = hloc_parts(feature(0))
     scores = parts.pop("scores")
     append_hloc(path, "a.jpg", parts)
     with h5py.File(path, "a", libver="latest") as file:
         put(file["a.jpg"], scores, secret)
-    check_refused(path, rf"a\.jpg/scores: {message}")
+    check_refused(path, r"a\.jpg/scores: expected data in this file")
 
 
-def test_a_group_that_holds_itself(path):
-    with h5py.File(path, "w") as file:
-        group = file.create_group("a")
-        group["b"] = group
-    check_refused(path, "a/b: .*one name.* several")
+def test_what_leads_to_another_file_is_no_image(path, secret):
+    append_hloc(path, "b.jpg", hloc_parts(feature(0)))
+    with h5py.File(path, "a") as file:
+        file["a.jpg"] = h5py.ExternalLink(str(secret), "/a.jpg")
+        file["b.jpg/a"] = file["b.jpg"]  # a circle
+    check_refused(path, r"got 0; the first without is a\.jpg")
 
 
-def test_values_that_were_not_all_written(path):
+def test_values_that_were_not_written(path):
     """HDF5 would make them up."""
     parts = hloc_parts(feature(0))
+    scores = parts.pop("scores")
     append_hloc(path, "a.jpg", parts)
     with h5py.File(path, "a") as file:
-        for name in ("b.jpg", "c.jpg"):
-            for part, array in parts.items():
-                chunked = {"chunks": (1,) * array.ndim} if name == "b.jpg" else {"compression": "gzip", "chunks": True}
-                file.create_dataset(f"{name}/{part}", data=array, **chunked)
-        del file["b.jpg/scores"]
-        file["b.jpg"].create_dataset("scores", shape=(30,), dtype="f2", chunks=(10,))[:20] = 1
-    [_, (_, features)] = open_features(path, ["a.jpg", "c.jpg"]).read()
-    np.testing.assert_array_equal(features.scores, parts["scores"])
-    check_refused(path, r"b\.jpg/scores: .*not written", "b.jpg")
+        file["a.jpg"].create_dataset("scores", shape=scores.shape, dtype="f2", chunks=(10,))
+    check_refused(path, r"a\.jpg/scores: .*not written")
 
 
 def test_no_images(path):

@@ -1,7 +1,6 @@
 """Shortlists: pairs of hloc and kapture, predictions in npz."""
 
 import os
-import time
 
 import numpy as np
 import pytest
@@ -10,11 +9,11 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError, Ranking, Shortlist
 from mfvpr.io import read_shortlist, reranked_shortlist, write_shortlist
-from tests.io.checks import memory_below, one_line_error
+from tests.io.checks import one_line_error
 
-QUERIES = ["q/1.jpg", "q/2.jpg", "q/my query.jpg"]
-DATABASE = ["d/1.jpg", "d/2.jpg", "d/my place.jpg", "d/x, y.jpg"]
-HLOC = ["q/1.jpg d/2.jpg", "q/1.jpg d/1.jpg", "q/my query.jpg d/my place.jpg"]
+QUERIES = ["q/1.jpg", "q/2.jpg", "q/3.jpg"]
+DATABASE = ["d/1.jpg", "d/2.jpg", "d/3.jpg", "d/4.jpg"]
+HLOC = ["q/1.jpg d/2.jpg", "q/1.jpg d/1.jpg", "q/3.jpg d/3.jpg"]
 EXPECTED = [[1, 0], [-1, -1], [2, -1]]
 
 
@@ -43,8 +42,8 @@ def test_pairs_of_hloc(tmp_path, text):
 def test_pairs_of_kapture_and_of_patch_netvlad(tmp_path):
     """Patch-NetVLAD writes full paths without scores."""
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"]
-    scored = ["q/1.jpg, d/2.jpg, 0.75", "q/my query.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/x, y.jpg,0.5"]
-    shortlist = read(tmp_path, "\n".join(lines + scored))
+    scored = ["q/1.jpg, d/2.jpg, 0.75", "q/3.jpg, d/my place.jpg, -1e-3", "q/1.jpg,d/4.jpg,0.5"]
+    shortlist = read(tmp_path, "\n".join(lines + scored), database=[*DATABASE[:2], "d/my place.jpg", "d/4.jpg"])
     assert shortlist.indices.tolist() == [[1, 3], [-1, -1], [2, -1]]
     np.testing.assert_array_equal(shortlist.scores, np.float32([[0.75, 0.5], [0, 0], [-1e-3, 0]]))
     full_paths = ["/data/set/q/1.jpg, /data/set/d/2.jpg", "/data/set/q/1.jpg, /data/set/d/1.jpg\n"]
@@ -61,10 +60,10 @@ def write_predictions(folder, number, query, predictions, positives=()):
     return folder
 
 
-@pytest.mark.parametrize("positives", [(), ("/set/d/x, y.jpg",)])
+@pytest.mark.parametrize("positives", [(), ("/set/d/4.jpg",)])
 def test_predictions_of_vpr_methods_evaluation(tmp_path, positives):
     """Only wrongly predicted queries may have a file."""
-    write_predictions(tmp_path / "preds", 2, "/set/q/my query.jpg", ["/set/d/my place.jpg"], positives)
+    write_predictions(tmp_path / "preds", 2, "/set/q/3.jpg", ["/set/d/3.jpg"], positives)
     folder = write_predictions(tmp_path / "preds", 0, "/set/q/1.jpg", ["/set/d/2.jpg", "/set/d/1.jpg"], positives)
     (folder / "000.jpg").write_bytes(b"a picture of the predictions")
     assert read_shortlist(folder, QUERIES, DATABASE).indices.tolist() == EXPECTED
@@ -88,14 +87,6 @@ def test_other_folders_are_one_line(tmp_path, texts, words):
         (tmp_path / f"{number:03d}.txt").write_text(text)
     with one_line_error(None, words):
         read_shortlist(tmp_path, QUERIES, DATABASE)
-
-
-def test_names_are_told_apart_by_those_that_there_are(tmp_path):
-    queries, database = ["a", "a b", "#c"], ["c", "b c d", "d"]
-    shortlist = read(tmp_path, "a b c d\n#c d\na b d", queries, database)
-    assert shortlist.indices.tolist() == [[1], [2], [2]]
-    with pytest.raises(InputError, match=r"line 1: .*got several ways to read 'a b c d'"):
-        read(tmp_path, "a b c d", queries, [*database, "c d"])
 
 
 def test_as_many_candidates_as_asked_for(tmp_path):
@@ -123,11 +114,12 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("q/1.jpg d/9.jpg", r"line 1: .*names .*'q/1"),
+        ("q/1.jpg d/9.jpg", r"database image, got 'd/9\.jpg'"),
         ("q/1.jpg d/1.jpg\nd/1.jpg q/1.jpg", r"query image, got 'd/1\.jpg'"),
-        ("q/1.jpg", "line 1: expected the names"),
-        ("q/1.jpg d/1.jpg 0.5", "line 1: expected the names"),
-        ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected the names"),
+        ("q/1.jpg", "line 1: expected 'query database'"),
+        ("q/1.jpg d/1.jpg 0.5", "line 1: expected 'query database'"),
+        ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected 'query database'"),
+        ("q/1.jpg, d/1, 2.jpg", "line 1: expected 'query database'"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend.*distances"),
         ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
@@ -136,7 +128,7 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
         ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg'.* 3 .*full path"),
         ("# nothing but a comment", "3 queries, got none"),
         ("", "got none at all"),
-        ("x" * 500, r"got names of none in 'x{40}\.\.\. \(500 characters\)'"),
+        ("x" * 500, r"got 'x{40}\.\.\. \(500 characters\)'"),
     ],
 )
 def test_lines_that_are_no_pairs(tmp_path, text, message):
@@ -147,39 +139,26 @@ def test_lines_that_are_no_pairs(tmp_path, text, message):
 @pytest.mark.parametrize(
     "arrays, message",
     [
-        ({}, r"predictions \[2, K\].* got none"),
+        ({}, r"predictions \[2, K\].* got float64\[0\]"),
         ({"predictions": np.zeros((2, 2))}, r"got float64\[2, 2\]"),
         ({"predictions": np.zeros(2, int)}, r"got int64\[2\]"),
-        ({"predictions": np.zeros((3, 2), int)}, "predictions .*2 queries, got 3"),
-        ({"predictions": [[0, 1], [4, 0]]}, "query 1: .*0 to 3, .*-1 .*got 4"),
-        ({"predictions": [[0, -2], [0, 0]]}, "query 0: expected .* got -2"),
-        ({"predictions": np.array([[2**63], [0]], np.uint64)}, "query 0: expected .* got 9223372036854775808"),
+        ({"predictions": np.zeros((3, 2), int)}, r"predictions \[2, K\].*got int64\[3, 2\]"),
+        ({"predictions": [[0, 1], [4, 0]]}, "0 to 3, .*-1 .*got 0 to 4"),
+        ({"predictions": [[0, -2], [0, 0]]}, "got -2 to 0"),
+        ({"predictions": np.array([[2**63], [0]], np.uint64)}, "got 0 to 9223372036854775808"),
         ({"predictions": [[0], [1]], "scores": [[1.0, 2], [1, 2]]}, r"expected scores \[2, 1\] .* got float64\[2, 2\]"),
         ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"scores \[2, 1\] .*got <U1"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores, .* descend"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, np.nan], [1, 2]]}, "expected finite scores"),
         ({"predictions": np.full((2, 3), -1)}, "got none at all"),
         ({"predictions": np.zeros((2, 0), int)}, "got none at all"),
-        ({"predictions": np.array([[{}], [1]], object)}, "got objects"),
+        ({"predictions": np.array([[{}], [1]], object)}, "cannot be read"),
     ],
 )
 def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
     np.savez(tmp_path / "p.npz", **arrays)
     with one_line_error(message, "p.npz"):
         read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
-
-
-@pytest.mark.parametrize("line", ["a " * 20_000, "a," * 20_000, "q, " + "x " * 90 + " " * 9_000 + ",y z"])
-def test_a_long_line_takes_no_time(tmp_path, line):
-    """Every split of it is tried."""
-    (tmp_path / "p.txt").write_text(f"# {line}\n{line}\n")
-    start = time.perf_counter()
-    with (
-        one_line_error("line 2: expected the names of a query and a database image", "p.txt"),
-        memory_below(20_000_000),
-    ):
-        read_shortlist(tmp_path / "p.txt", QUERIES, DATABASE)
-    assert time.perf_counter() - start < 2
 
 
 def test_not_a_file(tmp_path):
@@ -230,9 +209,9 @@ def test_to_match_reads_what_is_written(tmp_path, positives):
     write_shortlist(tmp_path / "preds", shortlist, QUERIES, DATABASE, layout="preds", positives=positives)
     texts = {int(path.stem): path.read_text().splitlines() for path in (tmp_path / "preds").glob("*.txt")}
     predictions = {number: (lines[1], lines[4 : lines.index("", 4)]) for number, lines in texts.items()}
-    expected = {0: ("q/1.jpg", ["d/2.jpg", "d/1.jpg"]), 2: ("q/my query.jpg", ["d/my place.jpg"])}
+    expected = {0: ("q/1.jpg", ["d/2.jpg", "d/1.jpg"]), 2: ("q/3.jpg", ["d/3.jpg"])}
     assert predictions == expected
-    listed = [] if positives is None else ["Positives paths:", "d/my place.jpg", "d/x, y.jpg", ""]
+    listed = [] if positives is None else ["Positives paths:", "d/3.jpg", "d/4.jpg", ""]
     assert texts[0][7:] == listed
     assert texts[2][6:] == listed[::3]
 
@@ -252,8 +231,8 @@ def test_what_cannot_be_written(tmp_path):
     for names, message in (
         ((QUERIES, DATABASE), "1 queries, got 3"),
         ((QUERIES[:1], DATABASE[:3]), "rows below 3, got 3"),
-        ((["a\nb"], DATABASE), r"names .*got 'a\\nb'; .*\.npz"),
-        ((["a "], DATABASE), "without spaces around"),
+        *(((["a\nb"], DATABASE), "names that fit"), ((["a b"], DATABASE), "names that fit")),
+        *(((["#a"], DATABASE), "names that fit"), ((["a "], DATABASE), "names that fit")),
     ):
         with pytest.raises(InputError, match=message):
             write_shortlist(path, shortlist, *names)

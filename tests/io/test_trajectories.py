@@ -54,20 +54,20 @@ def test_what_is_written_is_read(tmp_path):
         ([], "expected a pose of each of the 3 images, got 0"),
         (["# a comment"], "got 0"),
         (TUM[:2], "expected a pose of each of the 3 images, got 2"),
-        ([*TUM, "14 1 2 3 0 0 0 1"], "got 4; take the pose"),
-        ([*TUM[:2], "13 1 2 3 0 0 0"], "line 3: expected 8 numbers, got 7"),
-        ([*KITTI[:2], KITTI[2] + " 1"], "line 3: expected 12 numbers, got 13"),
-        ([*KITTI[:2], TUM[0]], "line 3: expected 12 numbers, got 8"),
-        (["1 2 3"] * 3, r"line 1: expected 8 \(TUM\) or 12 \(KITTI\) numbers, got 3"),
-        ([line.replace(" ", ",") for line in TUM], r"line 1: expected 8 .* got 1"),
-        ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected finite numbers, got 'nan'"),
-        ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected finite numbers, got '1_0'"),
-        ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected finite numbers, got '1e999'"),
+        ([*TUM, "14 1 2 3 0 0 0 1"], "got 4"),
+        ([*TUM[:2], "13 1 2 3 0 0 0"], "line 3: expected 8 numbers .* got 7"),
+        ([*KITTI[:2], KITTI[2] + " 1"], "line 3: expected 8 numbers .* got 13"),
+        ([*KITTI[:2], TUM[0]], "line 3: expected 8 numbers .* got 8"),
+        (["1 2 3"] * 3, "line 1: expected 8 numbers .* got 3"),
+        ([line.replace(" ", ",") for line in TUM], "line 1: expected 8 numbers .* got 1"),
+        ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected finite numbers, got 'nan 2"),
+        ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected finite numbers, got '1_0 2"),
+        ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected finite numbers, .*1e999"),
         ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, got 12.750000000 after 13.000000000"),
         ([TUM[0], TUM[0], TUM[1]], "line 2: expected ascending timestamps"),
-        ([*TUM[:2], "nan 1 2 3 0 0 0 1"], "line 3: expected a timestamp in s first, got 'nan'"),
-        ([*TUM[:2], "-1 1 2 3 0 0 0 1"], "line 3: expected a timestamp in s first, got '-1'"),
-        ([*TUM[:2], "1e300 1 2 3 0 0 0 1"], "line 3: expected a timestamp"),
+        ([*TUM[:2], "nan 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got 'nan'"),
+        ([*TUM[:2], "-1 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got '-1'"),
+        ([*TUM[:2], "1e300 1 2 3 0 0 0 1"], "line 3: expected a time in s"),
     ],
 )
 def test_other_files_are_one_line(write, lines, message):
@@ -90,14 +90,12 @@ def test_poses_belong_to_the_times_of_the_images(write):
 @pytest.mark.parametrize(
     ("poses", "stamps", "message"),
     [
-        ([KITTI[0], None], None, "expected a place of all 2 images, .* none of 1, the first in row 1; write TUM"),
-        ([None, None], [1, 2], "expected at least one image with a place, got none"),
-        ([], None, "expected at least one image"),
-        (["1 2 3 0 0 0 1"] * 2, [5, 5], "expected different times, got 0.000000005 s twice"),
-        (["1 2 3 0 0 0 1"] * 2, [5], "expected times of 2 images, got 1"),
-        (["1 2 3 0 0 0 1"] * 2, None, "expected 12 numbers of each pose, got 7 in row 0"),
-        (KITTI[:2], [1, 2], "expected 7 numbers of each pose, got 12 in row 0"),
-        (["1 2 3 0 0 0 inf"], [1], "row 0: expected finite numbers, got 'inf'"),
+        ([KITTI[0], None], None, "a place of all images, .* write TUM, got 1 places of 2 images"),
+        ([None, None], [1, 2], "a place of at least one image, got 0 places of 2 images"),
+        ([], [], "at least one image"),
+        (["1 2 3 0 0 0 1"] * 2, [5, 5], "expected different times"),
+        (["1 2 3 0 0 0 1"] * 2, None, "expected poses of 12 numbers"),
+        (KITTI[:2], [1, 2], "expected poses of 7 numbers"),
     ],
 )
 def test_trajectories_that_cannot_be_written(tmp_path, poses, stamps, message):
@@ -148,9 +146,3 @@ def test_files_of_times(write):
         read_stamps(write(["1", "2"]), 3)
     with one_line_error("line 2: expected a time in s, .* got '2 3'"):
         read_stamps(write(["1", "2 3"]), 2)
-
-
-def test_times_before_0_are_refused(tmp_path):
-    with one_line_error("expected times from 0 ns, got -1"):
-        write_trajectory(tmp_path / "out.txt", ["0 0 0 0 0 0 1"] * 2, [-1, 5])
-    assert not (tmp_path / "out.txt").exists()

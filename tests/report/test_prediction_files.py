@@ -75,9 +75,9 @@ def test_trajectory_leaves_out_images_without_a_place(write, tmp_path):
     write_poses(tmp_path / "tum.txt", images, tmp_path / "poses.txt", DATABASE, STAMPS)
     expected = f"1403636579.800000000 {POSES[2]}\n1403636580.000000001 {POSES[1]}\n"
     assert (tmp_path / "tum.txt").read_text() == expected
-    with one_line_error("expected 12 numbers of each pose, got 7"):
+    with one_line_error("expected poses of 12 numbers"):
         write_poses(tmp_path / "kitti.txt", images[:1], tmp_path / "poses.txt", DATABASE, None)
-    with one_line_error("expected a place of all 4 images"):
+    with one_line_error("expected a place of all images, .* of 4 images"):
         write_poses(tmp_path / "kitti.txt", images, tmp_path / "poses.txt", DATABASE, None)
     with one_line_error("expected a database image with a pose, got 1.png; name the folder"):
         write_poses(tmp_path / "tum2.txt", images, tmp_path / "poses.txt", ["a", "b", "c"], STAMPS)

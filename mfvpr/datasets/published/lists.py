@@ -8,7 +8,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.ground_truth import FrameTruth
 from mfvpr.io.containers import reading
-from mfvpr.io.formats.numpy_objects import Array, read_objects
+from mfvpr.io.formats.pickles import PickledArray, read_objects
 from mfvpr.utils.errors import InputError
 
 _OBJECTS = b"'|O'"
@@ -77,7 +77,8 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         if _OBJECTS in file.read(128):
             file.seek(0)
             lists = read_objects(file, "lists of rows")
-            arrays = ((rows.numbers() if isinstance(rows, Array) else np.array(rows)).reshape(-1) for rows in lists)
+            lists = (rows.content if isinstance(rows, PickledArray) else rows for rows in lists)
+            arrays = (np.asarray(rows).reshape(-1) for rows in lists)
             per_query = (_require_integers(rows, path) if rows.size else rows for rows in arrays)
         else:
             per_query = map(np.atleast_1d, _require_integers(_read_array(path), path))

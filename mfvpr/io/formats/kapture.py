@@ -21,7 +21,7 @@ class KapturePairs(PairReader):
     pixel centers are at whole numbers from extractors such as R2D2, and at half pixels if kapture has them from COLMAP.
     """
 
-    by_number, has_confidences = True, True
+    by_number = True
 
     def __init__(self, path: Path) -> None:
         self.path = path

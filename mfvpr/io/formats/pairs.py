@@ -38,7 +38,6 @@ class PairReader:
         images: their names in the file.
         by_number: whether matches are numbers of keypoints.
         sided: whether the first name of a pair is always the query's, so that a name may also be a database image's.
-        has_confidences: whether matches have confidences: those of the first pair that has matches.
         in_image_files: whether points without sizes are in the px of the image files.
     """
 
@@ -46,7 +45,6 @@ class PairReader:
     images: tuple[str, ...]
     by_number: bool
     sided: bool = False
-    has_confidences: bool
     in_image_files: ClassVar[bool] = True
 
     def __contains__(self, pair: Pair) -> bool:
@@ -68,8 +66,3 @@ class PairReader:
     def spelling(self, name: str) -> str:
         """The name of an image in the spelling of the file."""
         return name
-
-    def find_confidences(self, pairs: Sequence[Pair]) -> bool:
-        """Whether the first of the pairs that has matches has confidences."""
-        real = (matches for matches in self.read(pairs) if matches.first.size)
-        return next((matches.confidence is not None for matches in real), False)

@@ -4,15 +4,13 @@ A folder has a text file for each query, and beside it a `.torch` file with a re
 """
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from mfvpr.io.containers import reading
-from mfvpr.io.formats.numpy_objects import ArrayUnpickler
 from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader
-from mfvpr.io.formats.pickles import natural_number, of_type
-from mfvpr.io.formats.result_files import plain_parts, result_matches
-from mfvpr.io.formats.torch_archives import open_torch_archive
+from mfvpr.io.formats.result_files import read_torch_result, result_matches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 
@@ -33,18 +31,19 @@ def read_predictions(path: Path) -> tuple[str, list[str]]:
         else:
             parts[heading].append(printable(line))
     if parts[""] or len(parts[QUERY]) != 1 or not parts[PREDICTIONS]:
-        raise InputError(f"{path}: expected one path below {QUERY!r}, and one or more below {PREDICTIONS!r}, as "
-                         "VPR-methods-evaluation writes them")  # fmt: skip
+        raise InputError(
+            f"{path}: expected one path below {QUERY!r}, and one or more below {PREDICTIONS!r}, as "
+            "VPR-methods-evaluation writes them"
+        )
     return parts[QUERY][0], parts[PREDICTIONS]
 
 
 def read_num_inliers(path: Path) -> list[float]:
     """Numbers of inliers of a query with its predictions, in their order; raises as `_read_results`."""
-    results = _read_results(path)
-    with reading(path, mend=_MEND):
-        if not all(_INLIERS in result for result in results):
-            raise InputError(f"expected {_INLIERS} of each prediction, got results without")
-        return [float(natural_number(result[_INLIERS])) for result in results]
+    counts: list[Any] = [result.get(_INLIERS) for result in _read_results(path)]
+    if not all(type(count) is int and 0 <= count < 2**31 for count in counts):
+        raise InputError(f"{path}: expected {_INLIERS} of each prediction, a whole number from 0; {_MEND}")
+    return list(map(float, counts))
 
 
 class PredictionPairs(PairReader):
@@ -57,13 +56,15 @@ class PredictionPairs(PairReader):
         self._places: dict[Pair, tuple[Path, int]] = {}
         for file in sorted(path.glob("*.torch")):
             query, predictions = read_predictions(file.with_suffix(".txt"))
-            for position in range(len(_read_results(file))):
-                if position >= len(predictions):
-                    raise InputError(f"{file}: expected results of at most {len(predictions)} predictions, as in the "
-                                     "text file, got more; match the predictions of this run")  # fmt: skip
-                self._places.setdefault((query, predictions[position]), (file, position))
+            results = _read_results(file)
+            if len(results) > len(predictions):
+                raise InputError(
+                    f"{file}: expected results of at most {len(predictions)} predictions, as in the text file, got "
+                    f"{len(results)}; match the predictions of this run"
+                )
+            for position, prediction in enumerate(predictions[: len(results)]):
+                self._places.setdefault((query, prediction), (file, position))
         self.images = tuple(dict.fromkeys(name for pair in self._places for name in pair))
-        self.has_confidences = self.find_confidences([*self._places])
 
     @staticmethod
     def fits(folder: Path) -> bool:
@@ -74,21 +75,15 @@ class PredictionPairs(PairReader):
         return pair in self._places
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
-        results: tuple[Path, list[dict[Any, Any]]] | None = None  # of the last file: pairs of a query share one
+        read_results = cache(_read_results)  # pairs of a query share a file
         for pair in pairs:
             file, position = self._places[pair]
-            if results is None or results[0] != file:
-                results = file, _read_results(file)
-            with reading(file, mend=_MEND):
-                parts = plain_parts(results[1][position])
-            yield result_matches(file, parts, self._verified)
+            yield result_matches(file, read_results(file)[position], self._verified)
 
 
 def _read_results(path: Path) -> list[dict[Any, Any]]:
     """A dictionary for each prediction; an InputError if the file is damaged, or holds other content."""
-    with (
-        reading(path, mend=_MEND),
-        path.open("rb") as file,
-        open_torch_archive(file) as archive,
-    ):
-        return [of_type(dict, result) for result in of_type(list, ArrayUnpickler(archive.pickle).load())]
+    results = read_torch_result(path, _MEND)
+    if not isinstance(results, list) or not all(isinstance(result, dict) for result in results):
+        raise InputError(f"{path}: expected a list of dictionaries; {_MEND}")
+    return results

@@ -1,12 +1,9 @@
 """Reading the files of a run folder."""
 
 import csv
-import functools
 import itertools
 import json
-import math
-import operator
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,19 +14,21 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from mfvpr.datasets.datasets import MEANS
-from mfvpr.datasets.ground_truth import Unit, middle, threshold_words
+from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.runs import LAST, file_names
 from mfvpr.report.tables import Table, read_csv
-from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.errors import InputError
 
-_KINDS_OF_A_ROW = {"system": str, "decides": bool, "parameters": dict, "recall_at": dict}
-_KINDS = {"dataset": str, "ground_truth": dict, "data_fingerprint": dict, "retrieval.name": str, "features.name": str,
-          "versions": dict, "seconds": dict, "queries": int, "database": int, "candidates": int,
-          "bytes_per_image": int | None}  # fmt: skip
-# Columns of text in front of the numbers; None = all.
-_TABLES = {"table.csv": 1, "differences.csv": 2, "confidence.csv": None, "rerank_share.csv": 0,
-           "precision_recall.csv": 2, "changes.csv": None, "skipped.csv": None}  # fmt: skip
+_TABLES = (
+    "table.csv",
+    "differences.csv",
+    "confidence.csv",
+    "rerank_share.csv",
+    "precision_recall.csv",
+    "changes.csv",
+    "skipped.csv",
+)
 
 
 @dataclass(frozen=True)
@@ -108,16 +107,16 @@ class Run:
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:
-        """Tables of the CSV files, by name; numbers are finite."""
-        return {name: read_table(self.folder / name, text) for name, text in _TABLES.items()
-                if (self.folder / name).exists()}  # fmt: skip
+        """Tables of the CSV files, by name."""
+        return {name: read_table(self.folder / name) for name in _TABLES if (self.folder / name).exists()}
 
     @cached_property
     def gains(self) -> Mapping[str, Gains]:
         """Gains by sequence; none without ground truth."""
-        paths = [sequence_folder(self.folder, self.sequences, place) for place in range(len(self.sequences))]
-        return {name: _gains(path / "gains.csv") for name, path in zip(self.sequences, paths, strict=True)
-                if (path / "gains.csv").exists()}  # fmt: skip
+        if not self.thresholds:
+            return {}
+        folders = (sequence_folder(self.folder, self.sequences, place) for place in range(len(self.sequences)))
+        return {name: _gains(folder / "gains.csv") for name, folder in zip(self.sequences, folders, strict=True)}
 
     @cached_property
     def all_gains(self) -> Gains:
@@ -154,76 +153,33 @@ def read_results(folder: Path, name: str = LAST) -> Any:
 
 
 def read_run(folder: Path) -> Run:
-    """Read and check the files of a run folder; InputError if they are not those of an evaluation."""
+    """Read the files of a run folder; InputError if they are not those of an evaluation."""
     results, about = read_results(folder), read_results(folder, "run.json")
     with errors_as_input_errors(folder):
-        _check(results, about)
         run = Run(folder, results, about)
-        if not run.sequences:
-            raise ValueError("results.json has no sequence")
-        if len(run.gains) != (len(run.sequences) if run.thresholds else 0):
-            raise ValueError("each sequence with ground truth has a gains.csv, and no other")
-        if any(not {*run.systems} <= {*part.ranks} for part in run.gains.values()):
-            raise ValueError("gains.csv lacks a system")
-        if "table.csv" in run.tables and not {row[0] for row in run.tables["table.csv"].rows} <= {*run.systems}:
-            raise ValueError("table.csv has another system")
+        if not (run.headline and run.sequences and run.gains.keys() <= {*run.sequences} and "settings" in about):
+            raise ValueError("no rows of an evaluation")
         return run
-
-
-def _check(results: Any, about: Any) -> None:
-    """Raise an error unless the values have what pages need."""
-    if not isinstance(results, list) or not results:
-        raise ValueError("results.json is of no evaluation")
-    for kinds, rows in ((_KINDS_OF_A_ROW, results), (_KINDS, results[:1]), ({"settings": dict}, [about])):
-        for row, (name, kind) in itertools.product(rows, kinds.items()):
-            value = functools.reduce(operator.getitem, name.split("."), row)
-            if not isinstance(value, kind):
-                raise ValueError(f"{name} is {type(value).__name__}")
-    if not any(row["decides"] for row in results):
-        raise ValueError("no system decides")
-    first, truth = results[0], results[0]["ground_truth"]
-    if not all(isinstance(name, str) for name in first.get("incomplete", [])):
-        raise ValueError("incomplete is no list of text")
-    _check_numbers("seconds", first["seconds"].values())
-    if thresholds := truth.get("thresholds", []):
-        _check_numbers("thresholds", thresholds)
-        _check_numbers("recall_at", map(int, first["recall_at"] or [""]))
-        require_word("unit", truth["unit"], Unit)
-    for row in results:
-        _check_numbers("recall_at", row["recall_at"].values())
-        if [*row["recall_at"]] != [*first["recall_at"]]:
-            raise ValueError("recall_at has other depths in some rows")
-        if len(thresholds) > 1:
-            _check_numbers("tolerance or radius", [row.get("tolerance", row.get("radius"))])
-        if not isinstance(row.get("sequence", ""), str) or ("sequence" in row) != ("sequence" in first):
-            raise ValueError("sequence is missing in some rows, or no text")
-
-
-def _check_numbers(name: str, values: Iterable[Any]) -> None:
-    for value in values:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError(f"{name} has {value!r} instead of a number")
 
 
 @contextmanager
 def errors_as_input_errors(folder: Path) -> Iterator[None]:
+    """Turn the errors of files that are not those of an evaluation into an InputError of one line."""
     try:
         yield
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, StopIteration, csv.Error) as error:
-        raise InputError(f"{folder}: expected the run folder of an evaluation of this version, got other files "
-                         f"({type(error).__name__}: {error})") from None  # fmt: skip
+    except (ValueError, LookupError, TypeError, AttributeError, OSError, StopIteration, csv.Error) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{folder}: expected the run folder of an evaluation of this version, got other files "
+            f"({type(error).__name__}: {' '.join(str(error).split())})"
+        ) from None
 
 
-def read_table(path: Path, num_texts: int | None) -> Table:
+def read_table(path: Path) -> Table:
+    """The table of a CSV file, all cells as text."""
     with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
         header, *rows = csv.reader(file)
-    if any(len(row) != len(header) for row in rows):
-        raise ValueError(f"{path.name} has lines of different lengths")
-    if num_texts is not None:
-        columns = range(num_texts + ("sequence" in header), len(header))
-        numbers = {header[place]: [float(row[place]) for row in rows] for place in columns}
-        numbers.pop("threshold", None)  # of scores, which may be infinite
-        _check_numbers(path.name, itertools.chain.from_iterable(numbers.values()))
     return Table(header, rows)
 
 

@@ -61,9 +61,11 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
             raise ValueError(f"results.json has no {', '.join(_SEARCH_TABLES)}")
         heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
         summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
-        figures = {file.stem: f"data:image/png;base64,{b64encode(file.read_bytes()).decode()}"
-                   for file in sorted((folder / "figures").glob("*.png"))}  # fmt: skip
-        tables = {caption: read_table(folder / "table.csv", None)}
+        figures = {
+            file.stem: f"data:image/png;base64,{b64encode(file.read_bytes()).decode()}"
+            for file in sorted((folder / "figures").glob("*.png"))
+        }
+        tables = {caption: read_table(folder / "table.csv")}
         about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
     title, _, words = heading.partition(": ")
     sections = [
