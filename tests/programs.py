@@ -21,7 +21,7 @@ from mfvpr.cli import programs
 from mfvpr.cli.inputs import prepare
 from mfvpr.cli.launch import exit_at_once, launch
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.storage.manifest import MATCHES, store_path
+from mfvpr.storage.match_files import MatchStore
 from mfvpr.systems.settings import CONF
 from mfvpr.utils import Stopwatch
 
@@ -87,7 +87,7 @@ def matches_path(settings):
     """The folder in which a program keeps the matches of its data set, and their recipe."""
     inputs = prepare(settings, Stopwatch())
     recipe = inputs.matches_recipe()
-    return store_path(inputs.cache.root, "matches", recipe, MATCHES), recipe
+    return MatchStore(inputs.cache.root, recipe | {"scale": 0}, len(inputs.dataset.queries)).folder, recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

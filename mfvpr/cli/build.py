@@ -59,10 +59,10 @@ def _ground_truth(settings: Mapping[str, Any]) -> IndexFile | LabelFiles | str:
     return kind
 
 
-def cache(folder: str | None, runtime: Runtime, *, on_bad_image: str, wait: bool = False) -> FeatureCache:
+def cache(folder: str | None, runtime: Runtime, *, on_bad_image: str) -> FeatureCache:
     """The cache of features, matches and all else that is computed from images."""
     root = None if folder is None else expand_user(folder)
-    return FeatureCache(root, skip_bad=on_bad_image == "skip", wait=wait, runtime=runtime)
+    return FeatureCache(root, skip_bad=on_bad_image == "skip", runtime=runtime)
 
 
 @contextmanager

@@ -71,8 +71,7 @@ def prepare(settings: Mapping[str, Any], watch: Stopwatch) -> Inputs:
     The pipeline comes first, since its errors should come before anything slow, unless it needs files about the images.
     """
     runtime = build.runtime(settings["devices"], settings["memory"], settings.get("cluster"))
-    wait = bool(settings.get("multirun"))
-    cache = build.cache(settings["cache"], runtime, on_bad_image=settings["on_bad_image"], wait=wait)
+    cache = build.cache(settings["cache"], runtime, on_bad_image=settings["on_bad_image"])
     names = {settings[group]["name"] for group in ("features", "retrieval", "matching")}
     pipeline = None if names & {"import", "pairs"} else assembly.pipeline(settings, None)
     with watch("data"):

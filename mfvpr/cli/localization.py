@@ -18,12 +18,11 @@ from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Located, Map, Route
 from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
 from mfvpr.report.runs import file_names
-from mfvpr.storage.disk import used_bytes
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
 from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import InputError, Runtime
-from mfvpr.utils.files import expand_user, printable
+from mfvpr.utils.files import expand_user, printable, used_bytes
 
 
 def build_map(settings: dict[str, Any]) -> None:

@@ -150,11 +150,18 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
             raise ValueError(f"format {content['format']!r}")
-        return {name: _confidence(**values) for name, values in content["systems"].items()}, dict(content["made"])
+        return {name: confidence_from_json(values) for name, values in content["systems"].items()}, dict(
+            content["made"]
+        )
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         fix = "evaluate images with ground truth to make one"
         raise InputError(f"{path}: expected {expected} ({reason}); {fix}") from error
+
+
+def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
+    """The confidence whose `vars` were written as JSON; a TypeError or ValueError for anything else."""
+    return _confidence(**values)
 
 
 def _confidence(

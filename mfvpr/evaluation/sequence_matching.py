@@ -1,10 +1,8 @@
 """Matches of a sequence: images -> features -> shortlist -> matches, kept in the folder of a cache, if any."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -20,11 +18,9 @@ from mfvpr.matchers.match_set import MatchSet
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.manifest import MATCHES, store_path
-from mfvpr.storage.matches import MatchStore, forecast_bytes, open_match_store
-from mfvpr.storage.rows import require_space
+from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils.files import write_text
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import Runtime
 
@@ -74,12 +70,12 @@ def match_sequence(
     cache = cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime)
     work = _Work.fit(dataset, sequence, pipeline, cache, watch or Stopwatch())
-    with _match_stores(work) as stores:
-        matched = _read_matches(work, stores)
-        if matched is None:
-            retrieved = _find_candidates(work)
-            matches, remarks = _match(work, retrieved, stores)
-            matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
+    stores = _match_stores(work)
+    matched = _read_matches(work, stores)
+    if matched is None:
+        retrieved = _find_candidates(work)
+        matches, remarks = _match(work, retrieved, stores)
+        matched = Matched(sequence, retrieved.candidates, matches, remarks["queries"], remarks["database"])
     if work.pipeline.image_source is not None:
         for line in empty_pairs_warning(sequence.name, matched):
             cache.warn(line)
@@ -96,9 +92,9 @@ def match_rows(
 ) -> None:
     """Match some queries of a sequence, and leave the matches in the folder of the cache for `match_sequence`."""
     work = _Work.fit(dataset, sequence, pipeline, cache, Stopwatch())
-    with _match_stores(work, rows) as stores:
-        if not all(store.done[list(rows)].all() for store in stores):
-            _match(work, _find_candidates(work), stores, rows)
+    stores = _match_stores(work)
+    if not all(store.has_all(rows) for store in stores):
+        _match(work, _find_candidates(work), stores, rows)
 
 
 def _find_candidates(work: _Work) -> RetrievalResult:
@@ -157,7 +153,7 @@ def _by_row(*reasons: Mapping[Any, str]) -> dict[int, str]:
 
 def _read_matches(work: _Work, stores: Sequence[MatchStore]) -> Matched | None:
     """Matches of all scales from the stores; None if some are missing."""
-    if not stores or not all(store.done.all() for store in stores):
+    if not stores or not all(store.has_all(range(store.num_queries)) for store in stores):
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
@@ -165,7 +161,12 @@ def _read_matches(work: _Work, stores: Sequence[MatchStore]) -> Matched | None:
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None  # so images are read again, but not matched
     with work.watch("matches read"):
-        scales = [stages.stored_matches(store, memory=work.cache.runtime.memory) for store in stores]
+        scales = [
+            scale for store in stores if (scale := stages.stored_matches(store, memory=work.cache.runtime.memory))
+        ]
+    if len(scales) < len(stores):
+        work.cache.warn(f"{stores[0].folder}: has damaged files; their queries are matched again")
+        return None
     match_sets, shortlists = zip(*scales, strict=True)
     if any((shortlist.indices != shortlists[0].indices).any() for shortlist in shortlists):
         return None  # scales with different shortlists: matching will raise
@@ -193,32 +194,14 @@ def matches_recipe(
     }
 
 
-@contextmanager
-def _match_stores(work: _Work, rows: Sequence[int] | None = None) -> Iterator[list[MatchStore]]:
-    """One store per scale of the matches of all queries or those in `rows`, locked while some are missing.
-
-    There are none if the cache is in memory.
-    """
-    cache, scales, number = work.cache, work.pipeline.scales, len(work.sequence.images)
-    if cache.root is None:
-        yield []
-        return
-    recipe = matches_recipe(work.dataset, work.sequence, work.pipeline, cache)
-    share = 1 if recipe["matching"].get("cross_check") in ("none", "candidate") else 3
-    lock = partial(cache.lock, None if rows is None else fingerprint(list(rows)))
-    sizes = {"num_queries": number, "num_candidates": recipe["candidates"]}
-    with ExitStack() as stack:
-        stores = []
-        for place, scale in enumerate(scales):
-            of_scale = {**recipe, "scale": place} if len(scales) > 1 else recipe
-            path = store_path(cache.root, "matches", of_scale, MATCHES)
-            stores.append(store := stack.enter_context(open_match_store(path, of_scale, **sizes, lock=lock)))
-            if missing := sum(not store.done[row] for row in (range(number) if rows is None else rows)):
-                needed = forecast_bytes(missing, recipe["candidates"], scale.typical_count // share)
-                require_space(store.folder, needed)
-                line = (f"{missing} of {number} queries to match with {recipe['candidates']} candidates: about "
-                        f"{needed / 1e6:.1f} MB in {store.folder}")  # fmt: skip
-            else:
-                line = f"{'all' if store.done.all() else 'its part of'} {number} queries from {store.folder}"
-            cache.log(f"{work.sequence.name} matches: {line}")
-        yield stores
+def _match_stores(work: _Work) -> list[MatchStore]:
+    """One store per scale of the matches; none if the cache is in memory, or a part of the pipeline has no recipe."""
+    cache, number = work.cache, len(work.sequence.images)
+    recipe = cache.recipe(lambda: matches_recipe(work.dataset, work.sequence, work.pipeline, cache))
+    if recipe is None or cache.root is None:
+        return []
+    stores = [MatchStore(cache.root, recipe | {"scale": scale}, number) for scale in range(len(work.pipeline.scales))]
+    is_done = all(store.has_all(range(number)) for store in stores)
+    line = f"all {number} queries from" if is_done else f"{number} queries with {recipe['candidates']} candidates, in"
+    cache.log(f"{work.sequence.name} matches: {line} {stores[0].folder}")
+    return stores

@@ -4,7 +4,7 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,10 +25,9 @@ from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.storage.matches import MatchStore, StoredMatches
+from mfvpr.storage.match_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
-from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
@@ -43,9 +42,15 @@ Limits = tuple[float | None, Sequence[Device] | None]  # of memory, GB, and devi
 
 
 def match(
-    queries: Side, database: Side, candidates: Shortlist, matcher: Matcher | PairSource = NEIGHBORS, *,
-    store: MatchStore | None = None, rows: Sequence[int] | None = None, runtime: Runtime = DEFAULT_RUNTIME,
-) -> MatchSet:  # fmt: skip
+    queries: Side,
+    database: Side,
+    candidates: Shortlist,
+    matcher: Matcher | PairSource = NEIGHBORS,
+    *,
+    store: MatchStore | None = None,
+    rows: Sequence[int] | None = None,
+    runtime: Runtime = DEFAULT_RUNTIME,
+) -> MatchSet:
     """Match every query with its candidates. Matches of compiled matchers include their ratio, which some weights use.
 
     Args:
@@ -53,58 +58,57 @@ def match(
         database: likewise, of M images.
         candidates: `[Q, C]` rows of the database.
         matcher: of one pair; one that runs on the host takes no part in a cluster.
-        store: of these features, candidates and matcher. Queries that it lacks are matched and written in small
-            batches; the result is read from it.
+        store: of these features, candidates and matcher. Queries that it lacks, or has with other candidates, are
+            matched and written in small batches; the result is read from it.
         rows: of the queries that are matched and returned; None = all.
         runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
-        InputError: the two sides' descriptors have different lengths; or the store cannot be used or has other
-            candidates, and then nothing is written.
+        InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
     """
     if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
         _require_same_dimensions(queries, database)
     sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
+    limits = runtime.memory, runtime.devices
     if store is None:
-        pairs = _match_queries(sides, requested, matcher, (runtime.memory, runtime.devices))
-        matched = [query for _, query in runtime.progress("matching")(pairs, len(requested))]
+        results = replace(runtime, cluster=None).map(
+            _match_queries, (*sides, matcher, limits), requested, "matching", batched.QUERIES
+        )
+        matched = [query for _, query in results]
         shape = len(matched), candidates.indices.shape[1]
         counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
         return MatchSet.of([query.matches for query in matched], counts)
-    if missing := [row for row in requested if not store.done[row]]:
-        stored = {row: query.indices for row, query in store.read()}
-        _require_candidates(store, candidates, stored)  # before anything is written
-        runtime = replace(runtime, cluster=None) if isinstance(matcher, PairSource) else runtime
-        here, at_workers = (runtime.memory, runtime.devices), (runtime.memory or WORKER_MEMORY, None)
-        shared = sides, matcher, here if runtime.cluster is None else at_workers, store
-        for block, counts in runtime.map(_match_rows, shared, missing, "matching", batched.QUERIES):
-            store.counts[block] = counts
-    match_set, shortlist = stored_matches(store, rows, memory=runtime.memory)
-    if not missing:
-        _require_candidates(store, candidates, dict(zip(requested, shortlist.indices, strict=True)))
-    return match_set
-
-
-def _match_rows(
-    sides: tuple[Side, Side, Shortlist], matcher: Matcher | PairSource, limits: Limits, store: MatchStore,
-    rows: Sequence[int], track: Track = no_progress,
-) -> tuple[Sequence[int], np.ndarray]:  # fmt: skip
-    """Write the matches of queries to a store within limits of memory and devices; returns rows and numbers."""
-    missing = [row for row in rows if not store.done[row]]
-    tracked = iter(track(_match_queries(sides, missing, matcher, limits), len(missing)))
-    together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # on the host, a query may take minutes
-    while batch := dict(itertools.islice(tracked, together)):
-        store.write(batch)
-    return rows, store.counts[rows]
+    missing = [
+        row
+        for row, query in store.read(requested)
+        if query is None or not np.array_equal(query.indices, candidates.indices[row])
+    ]
+    if missing:
+        if isinstance(matcher, PairSource):
+            runtime = replace(runtime, cluster=None)
+        if runtime.cluster is not None:
+            limits = runtime.memory or WORKER_MEMORY, None
+        results = runtime.map(_match_queries, (*sides, matcher, limits), missing, "matching", batched.QUERIES)
+        together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # on the host, a query may take minutes
+        while batch := dict(itertools.islice(results, together)):
+            store.write(batch)
+    if (stored := stored_matches(store, rows, memory=runtime.memory)) is None:
+        raise InputError(f"{store.folder}: matches were removed or damaged meanwhile; run again")
+    return stored[0]
 
 
 def _match_queries(
-    sides: tuple[Any, Any, Shortlist], rows: Sequence[int], matcher: Matcher | PairSource, limits: Limits
+    queries: Any,
+    database: Any,
+    candidates: Shortlist,
+    matcher: Matcher | PairSource,
+    limits: Limits,
+    rows: Sequence[int],
 ) -> Iterator[tuple[int, QueryMatches]]:
-    """(row, matches) of queries, in the order of `rows`."""
+    """(row, matches) of queries, in the order of `rows`, within limits of memory and devices."""
+    sides, (memory, devices) = (queries, database, candidates), limits
     if isinstance(matcher, PairSource):
         return host.match_queries(*sides, rows, matcher)
-    memory, devices = limits
     return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
 
 
@@ -114,37 +118,25 @@ def _require_same_dimensions(queries: FeatureSet, database: FeatureSet) -> None:
                          f"and {database.dimension} (database); extract all images alike")  # fmt: skip
 
 
-def _require_candidates(store: MatchStore, candidates: Shortlist, stored: Mapping[int, np.ndarray]) -> None:
-    """Raise unless the candidates of the stored rows are `candidates`."""
-    same_shape = candidates.indices.shape == tuple(store.sizes.values())
-    if not same_shape or any((indices != candidates.indices[row]).any() for row, indices in stored.items()):
-        raise InputError(
-            f"{store.folder}: expected matches of these candidates, got those of another shortlist; choose another "
-            "path, or delete this folder"
-        )
-
-
 def stored_matches(
     store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
-) -> tuple[MatchSet, Shortlist]:
-    """Matches and shortlist from a store, NumPy; more than `memory` GB (None: a third of what is free) stay on disk."""
-    rows = range(len(store.done)) if rows is None else rows
-    if not (done := store.done[[*rows]]).all():
-        raise InputError(
-            f"{store.folder}: expected the matches of all {len(done)} queries, got {done.sum()}; finish the matching "
-            "first"
-        )
-    left, matches = memory_budget(memory, jax.local_devices(backend="cpu")[:1]), []
-    shape = len(rows), store.sizes["num_candidates"]
-    counts, indices, scores = (np.zeros(shape, dtype) for dtype in (np.int32, np.int32, np.float32))
-    for place, (_, row) in enumerate(store.read(rows)):
-        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(row.matches))
-        matches.append(row.matches)
+) -> tuple[MatchSet, Shortlist] | None:
+    """Matches and shortlist from a store, NumPy; None if some are missing or damaged.
+
+    Matches of more than `memory` GB (None: a third of what is free) stay on disk.
+    """
+    rows, matches, shortlist = range(store.num_queries) if rows is None else rows, list[Matches](), list[Any]()
+    left = memory_budget(memory, jax.local_devices(backend="cpu")[:1])
+    for _, query in store.read(rows):
+        if query is None:
+            return None
+        left -= sum(leaf.nbytes for leaf in jax.tree.leaves(query.matches))
+        matches.append(query.matches)
         if left < 0:
             matches.clear()
-        counts[place], indices[place], scores[place] = row.counts, row.indices, row.filter_scores
-    shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-    return MatchSet.of(matches or StoredMatches(store, rows), counts), shortlist
+        shortlist.append((query.counts, query.indices, query.filter_scores))
+    counts, indices, scores = (np.stack(values) for values in zip(*shortlist, strict=True))
+    return MatchSet.of(matches or StoredMatches(store, rows), counts), Shortlist(indices, scores, indices >= 0)
 
 
 @dataclass(frozen=True)

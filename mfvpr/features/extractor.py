@@ -17,7 +17,7 @@ class Scale(NamedTuple):
     """One scale of an extractor's local features."""
 
     dimension: int  # D of the descriptors
-    typical_count: int  # usual number of features in an image, for forecasts of disk space
+    typical_count: int  # usual number of features in an image
     weight: float = 1.0  # weight of the scale's score when the scores of several scales are fused
 
 
@@ -58,7 +58,7 @@ def local_features(
 class Extractor(Protocol):
     """Images, uint8 RGB -> a Description of each.
 
-    A cache needs the extractor's recipe, see `mfvpr.utils.fingerprints.recipe_of`; every frozen dataclass has one.
+    A cache on disk needs the `recipe` of an extractor of your own, see `mfvpr.utils.recipe_of`.
     """
 
     @property

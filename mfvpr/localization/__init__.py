@@ -7,9 +7,9 @@
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map (localize one image), images (the images of a map, and how they are added), predictions. Then their
-parts: vocabulary, describing, vectors, matching, resident (features in memory), strength (of a map's images),
-declaration and calibration (what a map keeps in its folder), route (a drive through a map).
+Read first: map (localize one image), map_images (the images of a map, and how they are added), predictions. Then their
+parts: describing, vectors, matching, declaration and map_calibration (what a map keeps in its file), route (a drive
+through a map).
 """
 
 import lazy_loader

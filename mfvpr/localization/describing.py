@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,9 +16,8 @@ from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.features.extractor import Aggregation, Description, Extractor
 from mfvpr.features.feature_extraction import describe_folder, describe_images
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.features import round_as_stored
+from mfvpr.storage.packing import round_as_stored
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import as_array
 from mfvpr.utils.progress import Track, no_progress
 
@@ -33,11 +32,6 @@ class Describing:
 
     extractor: Extractor  # of local features of one scale
     describer: Extractor | Aggregation  # of global descriptors; may be the same extractor
-
-    @property
-    def recipe(self) -> dict[str, Any]:
-        """JSON values that determine the features and descriptors."""
-        return {"extractor": recipe_of(self.extractor), "describer": recipe_of(self.describer)}
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
@@ -71,14 +65,15 @@ class Describing:
         """Describe images by way of a cache, which extracts what it lacks; it may skip bad ones."""
         [features] = cache.local(images, self.extractor, rows)
         describer = self.describer if isinstance(self.describer, Extractor) else None
-        vectors = None if describer is None else cache.vectors(images, describer, images)
+        vectors = None if describer is None else cache.vectors(images, describer, images, rows)
         bad, size = {**features.bad, **(vectors.bad if vectors else {})}, self.extractor.batch_size
         for reason in bad.values():
             cache.warn(reason)
         used = [row for row in rows if row not in bad]
         for start in range(0, len(used), size):
-            batch = {row: round_as_stored(local) if cache.root is None else local
-                     for row, local in features.read(used[start : start + size])}  # fmt: skip
+            batch = dict(features.read(used[start : start + size]))
+            if cache.root is None:
+                batch = {row: round_as_stored(local) for row, local in batch.items()}
             values = self._vectors([*batch.values()], []) if vectors is None else vectors.values[[*batch]]
             yield dict(zip(batch, zip(batch.values(), values, strict=True), strict=True))
 

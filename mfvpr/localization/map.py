@@ -29,10 +29,10 @@ from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.system import System, noise_image
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.calibration import fit_on_drive, read_confidence, write_confidence
-from mfvpr.localization.declaration import check_declaration, fit_to_map, read_system
+from mfvpr.localization.declaration import fit_to_map, read_system
 from mfvpr.localization.describing import Described, Image, is_file, load
-from mfvpr.localization.images import DescribedMap, MapImages, exclusive
+from mfvpr.localization.map_calibration import fit_on_drive, read_confidence, write_confidence
+from mfvpr.localization.map_images import MapImages, exclusive
 from mfvpr.localization.matching import match_and_score, padded_size, shift_of
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
@@ -87,8 +87,8 @@ class Map(MapImages):
         """
         system = fit_to_map(Path(folder), system, None, runtime.log)
         extractor, describer = _extractor(system), _describer(system)
-        check_declaration(Path(folder), system)
-        self.confidence = confidence or read_confidence(Path(folder), system)
+        super().__init__(folder, system, extractor, describer, memory=runtime.memory)
+        self.confidence = confidence or read_confidence(self._file, system)
         if threshold is not None and not 0 <= threshold <= 1:
             raise InputError(f"threshold={threshold}: expected a number from 0 to 1, or None")
         if threshold is not None and self.confidence is None:
@@ -97,7 +97,6 @@ class Map(MapImages):
         self._noise_scores: dict[int, float] = {}  # by the number of rows
         self._typical = extractor.scales[0].typical_count
         keep_compiled_programs()
-        super().__init__(folder, system, extractor, describer, memory=runtime.memory)
 
     @classmethod
     def open(cls, folder: Path | str, *, threshold: float | None = None, runtime: Runtime = DEFAULT_RUNTIME) -> "Map":
@@ -149,7 +148,7 @@ class Map(MapImages):
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
         self.confidence, data = fit_on_drive(dataset, self.system, cache)
-        write_confidence(self.folder, self.system, self.confidence, data)
+        write_confidence(self._file, self._parts(), self.system, self.confidence, data)
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0, route: Route | None = None) -> Prediction:
@@ -179,13 +178,13 @@ class Map(MapImages):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
         recent = _whole_number("recent", recent)
         before = None if before is None else _whole_number("before", before)
-        described = self._refresh_images()
-        pixels, total = load(image), self._vectors.total
-        resized = described.describing.resize(pixels)
-        description = described.describing.resized(resized, str(image) if is_file(image) else "image")
+        self._refresh_images()
+        pixels, total = load(image), len(self)
+        resized = self.describing.resize(pixels)
+        description = self.describing.resized(resized, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
         reason = reason_against_image(resized[0])
-        localized = self._localize(described, description, end, pixels.shape[1::-1], reason)
+        localized = self._localize(description, end, pixels.shape[1::-1], reason)
         if route is None:
             return localized
         refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -201,44 +200,40 @@ class Map(MapImages):
 
         An empty map raises an `InputError`.
         """
-        described = self._refresh_images()
-        described.describing.image(noise_image())
+        self._refresh_images()
+        self.describing.image(noise_image())
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
-        counts = enumerate(described.rows.counts(range(self._vectors.total)).tolist())
-        rows = {padded_size(count, self._typical): row for row, count in counts if count >= 0}  # one of each size
-        images = described.resident.read([*rows.values()])
+        rows = {padded_size(count, self._typical): row for row, count in enumerate(self._counts())}  # one of each size
+        images = self._read_features([*rows.values()])
         for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
             match_and_score(features, images, matcher, self.system.scorers, self._typical)
             description = features, self._vectors[row]
-            self._localize(described, description, self._vectors.total, self.extractor.image_size, None)
+            self._localize(description, len(self), self.extractor.image_size, None)
 
-    def _refresh_images(self) -> DescribedMap:
+    def _refresh_images(self) -> None:
         self.refresh()
-        if not len(self) or self._described is None:
+        if not len(self):
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
-        return self._described
 
-    def _localize(
-        self, described: DescribedMap, description: Described, end: int, size: tuple[int, int], reason: Reason | None
-    ) -> Localization:
+    def _localize(self, description: Described, end: int, size: tuple[int, int], reason: Reason | None) -> Localization:
         """Localize a described image of (width, height) px among the rows before `end`, if no reason is against it."""
-        if strength(description[0]) < LEAST_STRENGTH * described.strength(end):
+        if strength(description[0]) < LEAST_STRENGTH * self._mean_strength(end):
             reason = "too few features"
         if reason is not None:
             return refusal(reason, description, size[0])
-        matched = self._match(described, description, end, self.system.scorers)
+        matched = self._match(description, end, self.system.scorers)
         if matched is None:
             return refusal("no candidates", description, size[0])
         rows, similarities, matches, scores = matched
         ranking, by_retrieval = self._rank(rows, similarities, scores)
         best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
-        [score], noise = evidence_scores(best), self._noise_score(described, end)
+        [score], noise = evidence_scores(best), self._noise_score(end)
         if reason := reason_against(best.mask.sum(), score, noise):
             return refusal(reason, description, size[0])
         p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
         p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
-            Alternative(row, self._entries[row].name, self._entries[row].place, score)
+            Alternative(row, self._names[row], self._places[row], score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
         shift = shift_of(self.system.scorers.values(), best, size)
@@ -250,7 +245,7 @@ class Map(MapImages):
         return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _match(
-        self, described: DescribedMap, description: Described, end: int, scorers: Mapping[str, Scorer]
+        self, description: Described, end: int, scorers: Mapping[str, Scorer]
     ) -> tuple[np.ndarray, np.ndarray, list[Matches], dict[str, np.ndarray]] | None:
         """Candidates before `end`, their similarities, matches and scores; None without candidates."""
         features, vector = description
@@ -258,15 +253,15 @@ class Map(MapImages):
         if not len(rows):
             return None
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
-        candidates = described.resident.read(rows.tolist())
+        candidates = self._read_features(rows.tolist())
         return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
 
-    def _noise_score(self, described: DescribedMap, end: int) -> float:
+    def _noise_score(self, end: int) -> float:
         """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
         end = 1 << max(0, end.bit_length() - 1)
         if end not in self._noise_scores:
-            descriptions = map(described.describing.image, noise_images(self.extractor.image_size))
-            parts = [self._match(described, description, end, {}) for description in descriptions]
+            descriptions = map(self.describing.image, noise_images(self.extractor.image_size))
+            parts = [self._match(description, end, {}) for description in descriptions]
             scores = [evidence_scores(pair)[0] for _, _, matches, _ in filter(None, parts) for pair in matches]
             self._noise_scores[end] = float(np.max(scores, initial=0))
         return self._noise_scores[end]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -93,8 +93,6 @@ class HostMatcher:
     image_size: tuple[int, int] | None = None
     interpolation: Interpolation = "pil_bilinear"
     batch_size: int | None = field(default=None, metadata={"recipe": False})
-
-    recipe_name: ClassVar[str] = "HostMatching"  # in stored recipes
 
     def __post_init__(self) -> None:
         require_word("inputs", self.inputs, Inputs)

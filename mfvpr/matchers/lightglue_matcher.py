@@ -1,7 +1,7 @@
 """LightGlue as a matcher: a network, trained for certain features, that predicts matches and their confidence."""
 
 from dataclasses import field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,6 @@ class LightGlueMatcher:
             of `width_confidence=-1`.
         chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
-
-    recipe_name: ClassVar[str] = "LightGlueMatching"  # in stored recipes
 
     weights: Packed
     network: str = field(metadata={"static": True})

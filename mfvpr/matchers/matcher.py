@@ -2,7 +2,7 @@
 
 from dataclasses import field, replace
 from functools import partial
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +26,8 @@ class Matcher(Protocol):
 
     It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
     included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
-    needs its recipe, see `mfvpr.utils.fingerprints.recipe_of`. An optional field `chunk_size` is the number of pairs
-    that are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
+    on disk needs a `recipe`, see `mfvpr.utils.recipe_of`. An optional field `chunk_size` is the number of pairs that
+    are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
 
     An optional method `prepare(queries, candidates, chunk_size)` does once per query what would be done for each of its
     pairs. It takes Features `[B, N0]` and `[S, N1]`, and returns what the matcher then takes in place of a query's
@@ -47,8 +47,6 @@ class NearestNeighborMatcher:
     `chunk_size` and `product` are those of `match_candidates`; they change only time, memory, and
     which of two neighbors is taken whose products differ by less than the rounding of float32.
     """
-
-    recipe_name: ClassVar[str] = "Matching"  # in stored recipes
 
     cross_check: CrossCheck = field(default="mutual", metadata={"static": True})
     max_distance: float | None = None

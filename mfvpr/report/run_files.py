@@ -20,7 +20,6 @@ from mfvpr.report.evaluation_files import write_changes, write_gains, write_rank
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.runs import write_about, write_json, write_table, writing
 from mfvpr.report.tables import format_number, write_csv
-from mfvpr.storage.extraction import open_sinks
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.versions import versions
 
@@ -233,4 +232,5 @@ def _bytes_per_image(report: EvaluationReport) -> int | None:
     extractor = report.ranked.system.pipeline.extractor
     if isinstance(extractor, Source):
         return None
-    return sum(sink.forecast(1) for sink in open_sinks(None, extractor, {}, []))
+    local = sum(scale.typical_count * (2 * scale.dimension + 16) for scale in extractor.scales)
+    return local + 4 * extractor.vector_size

@@ -1,8 +1,6 @@
 """Learn the parts of extractors and retrievals that depend on the database, and store them."""
 
-import json
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -11,14 +9,9 @@ import numpy as np
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
-from mfvpr.storage.disk import lock_store
+from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.arrays import read_arrays, write_arrays
-from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.whitening import Whitening
-
-FORMAT = "mfvpr whitening 1"
-_MB = 1e6
 
 Tool = TypeVar("Tool")
 
@@ -28,10 +21,10 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
 
         cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
 
-    If the cache has a root, a learned part is stored there as one `.npz` file, named by a hash of the images' content
-    and of all settings; this hash is part of the recipe of everything that is computed with it. Parts that are learned
-    already stay the same, even if they were learned from another database. Images that cannot be read, are too few or
-    too many, and a stored file that is damaged or of another kind raise an `InputError`.
+    If the cache has a root, a learned part is stored there as one `.npz` file, named by the images' content and all
+    settings; its content is part of the recipe of everything that is computed with it. Parts that are learned already
+    stay the same, even if they were learned from another database. Images that cannot be read, are too few or too many
+    raise an `InputError`.
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
         fitting = tool.whitening
@@ -49,34 +42,37 @@ def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
     return replace(whole, **changed) if changed else whole
 
 
-def whitening_recipe(
-    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
-) -> dict[str, Any]:
-    """Recipe of a whitening: images, network and its input, windows, and samples."""
+def whitening_recipe(extractor: WindowExtractor, fitting: WindowFitting, cache: FeatureCache) -> dict[str, Any]:
+    """Recipe of a whitening but for the database: network and its input, windows, and samples."""
     parts = {"windows": cache.recipes.of(extractor.windows), "whitening": cache.recipes.of(fitting)}
-    return {"format": FORMAT} | cache.recipes.of_folder(database, extractor.maps) | parts
+    return cache.recipes.of_features(extractor.maps) | parts
 
 
 def _whitening(
     extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
 ) -> Whitening:
     """Whitening from the cache, learned and stored there if it is missing."""
-    if cache.root is None:
+    recipe = cache.recipe(lambda: whitening_recipe(extractor, fitting, cache))
+    if recipe is None or cache.root is None:
         return _learn(extractor, fitting, database, cache)
-    recipe = whitening_recipe(extractor, fitting, database, cache)
-    about, name = fingerprint(recipe), type(extractor).__name__
-    path = cache.root / f"{name}-whitening-{about}.npz"
-    cache.root.mkdir(parents=True, exist_ok=True)
-    with lock_store(cache.root, "whitening", cache.log) if not path.exists() else nullcontext():
-        if not path.exists():  # never replaced, because bits may differ between machines
-            learned = _learn(extractor, fitting, database, cache)
-            arrays = {"mean": learned.mean, "components": learned.components, "recipe": np.array(json.dumps(recipe))}
-            write_arrays(path, arrays, about)
-            cache.log(
-                f"{name}: whitening of {learned.dimension} dimensions: {path.stat().st_size / _MB:.1f} MB in {path}"
-            )
-    arrays = read_arrays(path, about)
-    return Whitening(arrays["mean"], arrays["components"], origin(extractor))
+    name, key = f"{type(extractor).__name__}-whitening", cache.recipes.contents(database).fingerprint
+    files = CacheFiles(
+        cache.root,
+        name,
+        recipe,
+        pack=lambda whitening: {"mean": whitening.mean, "components": whitening.components},
+        unpack=lambda arrays: Whitening(arrays["mean"], arrays["components"], origin(extractor)),
+    )
+    whitening = files.get(key)
+    if whitening is None:
+        is_damaged = key in files
+        if is_damaged:
+            cache.warn(f"{files.path(key)}: is damaged; learned again")
+        whitening = _learn(extractor, fitting, database, cache)
+        files.update({key: whitening}, once=not is_damaged)  # the first of several counts: bits may differ
+        cache.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
+        whitening = files.get(key) or whitening
+    return whitening
 
 
 def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache) -> Whitening:

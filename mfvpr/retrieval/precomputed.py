@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -46,8 +46,6 @@ class File:
 @dataclass(frozen=True)
 class FeatureFiles:
     """Local features of another program, see `mfvpr.io.open_features`."""
-
-    recipe_name: ClassVar[str] = "FeatureFiles, without scores of 0"  # in stored recipes
 
     files: Mapping[Path, File]  # by the root of the folder of images
     lengths: Lengths = "unit"  # of descriptors

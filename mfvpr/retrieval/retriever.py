@@ -22,7 +22,7 @@ class RetrievalResult(NamedTuple):
 
 
 class Retriever(Protocol):
-    """Interface of a retrieval, a frozen dataclass or an object with a recipe, see `mfvpr.utils.recipe_of`."""
+    """Interface of a retrieval; one of your own needs a `recipe` for a cache on disk, see `mfvpr.utils.recipe_of`."""
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache

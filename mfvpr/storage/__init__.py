@@ -1,7 +1,7 @@
-"""The cache of features and matches on disk, and its file formats.
+"""The cache of features and matches on disk, and the file of a map.
 
-Read first: feature_cache (what is cached for a folder of images), rows (a store: one file per image), features,
-matches, map_entries and maps (formats of rows), manifest (what a store belongs to).
+Read first: feature_cache (what is cached for a folder of images), cache_files (one file for each image), match_files,
+packing (features and matches as arrays), recipes, maps (a map: one SQLite file).
 """
 
 import lazy_loader

@@ -8,28 +8,35 @@ The content of an image and the recipe of the extractor name its features, not t
 several data sets or maps share is extracted once.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extractor import Aggregated, Aggregation, Extractor, Source
+from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source
+from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
-from mfvpr.storage.disk import lock_store
-from mfvpr.storage.extraction import Extraction, describe_rows, open_sinks
-from mfvpr.storage.manifest import LOCKS
+from mfvpr.storage.cache_files import CacheFiles, has_earlier_files
+from mfvpr.storage.packing import pack_features, unpack_features
 from mfvpr.storage.recipes import Memo, Recipes, Value, states
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Stopwatch
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
+from mfvpr.utils.threads import ordered_map
 
 AGGREGATED = 16  # images at a time
+THREADS = 4  # that read ahead
+
+Items = CacheFiles[Any] | MutableMapping[str, Any]  # one part of descriptions by key
 
 
 @dataclass(frozen=True)
@@ -46,20 +53,114 @@ class Vectors:
 
 
 @dataclass
-class FeatureCache:
-    """Features, global descriptors and matches in stores below a folder, or in the memory of this process.
+class Descriptions:
+    """Descriptions of a folder's images by one extractor, each part in files or in memory.
 
     Attributes:
-        root: folder of all stores; None = in memory.
+        parts: the global descriptor, if the extractor gives one, and each scale of its local features.
+        keys: of the images.
+        states: of the files before they were hashed, see `states`.
+        counts: `[parts, M]` keypoints of each image, 1 for a global descriptor; -1 = not looked at yet, or not there.
+        bad: row -> reason, for images without a usable description.
+    """
+
+    folder: ImageFolder
+    extractor: Extractor
+    parts: list[Items]
+    keys: Sequence[str]
+    states: Sequence[str]
+    counts: np.ndarray
+    bad: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def scales(self) -> range:
+        """Numbers of the parts that are local features."""
+        return range(len(self.parts) - len(self.extractor.scales), len(self.parts))
+
+    def missing(self, parts: Iterable[int], rows: Iterable[int]) -> tuple[list[int], list[Path]]:
+        """Rows of which a part is not here, without bad ones, and files that are damaged."""
+        missing, damaged = set[int](), list[Path]()
+        for part in parts:
+            items = self.parts[part]
+            unknown = [row for row in rows if self.counts[part, row] < 0 and row not in self.bad]
+            found = ordered_map(lambda row, items=items: items.get(self.keys[row]), unknown, workers=THREADS)
+            for row, item in zip(unknown, found, strict=True):
+                if item is not None:
+                    self.counts[part, row] = _count(item)
+                    continue
+                missing.add(row)
+                if isinstance(items, CacheFiles) and self.keys[row] in items:
+                    damaged.append(items.path(self.keys[row]))
+        return sorted(missing), damaged
+
+    def write(self, batch: Mapping[int, Description | str]) -> None:
+        """Write the descriptions of a batch; with files, they are on disk when this returns."""
+        described = {row: each for row, each in batch.items() if isinstance(each, Description)}
+        self.bad |= {row: each for row, each in batch.items() if isinstance(each, str)}
+        if changed := [row for row in described if states(self.folder, [row]) != [self.states[row]]]:
+            path = self.folder.paths[changed[0]]
+            raise InputError(f"{path}: changed while it was described; run again when it is complete")
+        for part, items in enumerate(self.parts):
+            scale = part - self.scales.start
+            of_part = {row: each.vector if scale < 0 else each.local[scale] for row, each in described.items()}
+            items.update({self.keys[row]: item for row, item in of_part.items()})
+            self.counts[part, list(of_part)] = [_count(item) for item in of_part.values()]
+
+    def read(self, part: int, rows: Iterable[int]) -> Iterator[tuple[int, Any]]:
+        """(row, item) of rows that are here, in their order; threads read ahead."""
+        rows, items = list(rows), self.parts[part]
+        keys = [self.keys[row] for row in rows]
+        for row, item in zip(rows, ordered_map(items.get, keys, workers=THREADS), strict=True):
+            if item is None:
+                name = self.folder.paths[row]
+                raise InputError(f"{name}: its features in the cache were removed or damaged meanwhile; run again")
+            yield row, item
+
+
+@dataclass(frozen=True)
+class _LocalFeatures:
+    """One scale of descriptions as a source of features."""
+
+    descriptions: Descriptions
+    part: int
+
+    @property
+    def counts(self) -> np.ndarray:
+        return self.descriptions.counts[self.part]
+
+    def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
+        rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else rows
+        return self.descriptions.read(self.part, rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for workers of a cluster, which need no extractor."""
+        reader = replace(self.descriptions, extractor=_Scales(self.descriptions.extractor.scales))
+        return {"descriptions": reader, "part": self.part}
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """What is left of an extractor in a worker that only reads."""
+
+    scales: tuple[Any, ...]
+
+
+@dataclass
+class FeatureCache:
+    """Features, global descriptors and matches in files below a folder, or in the memory of this process.
+
+    What an extractor, retriever or matcher of your own makes stays in memory, unless it names its `recipe`, see
+    `mfvpr.utils.recipe_of`.
+
+    Attributes:
+        root: folder of all files; None = in memory.
         skip_bad: list images that cannot be read as bad, and go on, instead of raising.
-        wait: wait for another process that does the same work, instead of raising.
         runtime: progress and messages; `mfvpr.evaluate(runtime=)` replaces it.
         watch: counts the extraction of local features as the stage `features`.
     """
 
     root: Path | None = None
     skip_bad: bool = False
-    wait: bool = False
     runtime: Runtime = DEFAULT_RUNTIME
     watch: Stopwatch | None = None
     _memo: Memo = field(default_factory=Memo, repr=False)
@@ -69,6 +170,9 @@ class FeatureCache:
         self.root = None if self.root is None else Path(self.root)
         if self.root is None and self.runtime.cluster is not None:
             raise InputError("cluster: expected a cache with a root, a folder that all workers share")
+        if self.root is not None and has_earlier_files(self.root):
+            self.warn(f"{self.root}: has files of an earlier version, which are not used; you may delete its folders "
+                      "with a manifest.json")  # fmt: skip
 
     @property
     def recipes(self) -> Recipes:
@@ -89,6 +193,16 @@ class FeatureCache:
             self._warned.add(line)
             self.log(f"warning: {line}")
 
+    def recipe(self, compute: Callable[[], dict[str, Any]]) -> dict[str, Any] | None:
+        """The recipe that `compute` gives; None, with a warning, if nothing may be kept on disk."""
+        if self.root is None:
+            return None
+        try:
+            return compute()
+        except TypeError as error:
+            self.warn(f"{error}: what it makes is not kept on disk")
+            return None
+
     def local(
         self,
         folder: ImageFolder,
@@ -102,58 +216,83 @@ class FeatureCache:
         `label` names the images in messages.
 
         Raises:
-            InputError: an image cannot be read (unless `skip_bad`), or none can; or a store cannot be used.
+            InputError: an image cannot be read (unless `skip_bad`), or none can; or the disk cannot be used.
         """
         if isinstance(extractor, Source):
             source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
-        state = self.describe(folder, extractor, rows, label=f"{label} features")
-        _require_images(folder, state.bad)
-        return tuple(FeatureSet(sink.source, dict(state.bad)) for sink in state.of_scales)
+        state = self._open(folder, extractor)
+        self._describe(state, state.scales, rows, f"{label} features")
+        _require_images(state)
+        return tuple(FeatureSet(_LocalFeatures(state, part), dict(state.bad)) for part in state.scales)
 
-    def vectors(self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *,
-                label: str = "image") -> Vectors:  # fmt: skip
-        """Global descriptors of all images; an aggregation is fitted on the `database`.
+    def vectors(
+        self,
+        folder: ImageFolder,
+        describer: Extractor | Aggregated,
+        database: ImageFolder,
+        rows: Iterable[int] | None = None,
+        *,
+        label: str = "image",
+    ) -> Vectors:
+        """Global descriptors of all images, or of those in `rows`; an aggregation is fitted on the `database`.
 
         `label` and errors are those of `local`.
         """
-        if not isinstance(describer, Aggregated) and not describer.vector_size:
+        if isinstance(describer, Aggregated):
+            compute = partial(self._aggregate, folder, describer, database, label)
+        elif describer.vector_size:
+            compute = partial(self._vectors, folder, describer, rows, label)
+        else:
             raise InputError(f"{type(describer).__name__}: gives no global descriptor; expected one that does, or "
                              "Aggregated(extractor, VladFitting())")  # fmt: skip
-        compute = partial(self._vectors, folder, describer, database, label)
-        return self.once("vectors", compute, folder, describer) if folder == database else compute()
+        is_kept = folder == database and rows is None
+        return self.once("vectors", compute, folder, describer) if is_kept else compute()
 
     def describe(
         self, folder: ImageFolder, extractor: Extractor, rows: Iterable[int] | None = None, *, label: str = "image"
-    ) -> Extraction:
+    ) -> Descriptions:
         """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages."""
-        requested = range(len(folder)) if rows is None else [*rows]
-        state = self.once("extraction", lambda: self._open(folder, extractor), folder, extractor)
-        with ExitStack() as stack:
-            if self.watch is not None and extractor.scales:
-                stack.enter_context(self.watch("features"))
-            if state.missing(requested):
-                for store in state.stores:
-                    stack.enter_context(store)  # finds the rows that were written meanwhile
-            missing = state.missing(requested)
-            for line in state.announcement(missing, len(requested)):
-                self.log(f"{label}: {line}")
-            shared = folder, state if self.runtime.cluster is None else state.without_programs(), self.skip_bad
-            blocks = self.runtime.map(describe_rows, shared, missing, label, extractor.batch_size) if missing else ()
-            for block, counts, bad in blocks:
-                state.bad |= bad
-                for store, numbers in zip(state.stores, counts, strict=True):
-                    store.counts[block] = numbers
-            for line in state.size_lines() if missing else ():
-                self.log(f"{label}: {line}")
+        state = self._open(folder, extractor)
+        self._describe(state, range(len(state.parts)), rows, label)
         return state
 
-    def lock(self, part: str | None, folder: Path, content: str) -> AbstractContextManager[None]:
-        """The lock of a part of a store, or of all of it; it waits for another process, or refuses."""
-        folder = folder if part is None else folder / LOCKS / part
-        folder.mkdir(parents=True, exist_ok=True)
-        return lock_store(folder, content, self.log if self.wait else None)
+    def _describe(self, state: Descriptions, parts: Iterable[int], rows: Iterable[int] | None, label: str) -> None:
+        folder, extractor = state.folder, state.extractor
+        with self.watch("features") if self.watch is not None and extractor.scales else nullcontext():
+            missing, damaged = state.missing(parts, range(len(folder)) if rows is None else [*rows])
+            for path in damaged:
+                self.warn(f"{path}: is damaged; made again")
+            if missing:
+                where = [f" in {items.folder}" for items in state.parts if isinstance(items, CacheFiles)][:1]
+                self.log(f"{label}: {len(missing)} of {len(folder)} images to do{''.join(where)}")
+                if self.runtime.cluster is not None and hasattr(extractor, "__dataclass_fields__"):
+                    extractor = replace(extractor)  # pyright: ignore[reportArgumentType]  # without compiled programs
+                shared = folder, extractor, self.skip_bad
+                results = self.runtime.map(_describe_rows, shared, missing, label, extractor.batch_size)
+                while batch := dict(islice(results, extractor.batch_size)):
+                    state.write(batch)
+
+    def _open(self, folder: ImageFolder, extractor: Extractor) -> Descriptions:
+        return self.once("descriptions", lambda: self._open_parts(folder, extractor), folder, extractor)
+
+    def _open_parts(self, folder: ImageFolder, extractor: Extractor) -> Descriptions:
+        keys = before = states(folder)
+        names = ["vector"] if extractor.vector_size else []
+        names += [f"scale {number}" for number in range(len(extractor.scales))]
+        recipe = self.recipe(lambda: self.recipes.of_features(extractor))
+        if recipe is None or self.root is None:
+            parts: list[Items] = self._memo.once("memory", lambda: [{} for _ in names], None, extractor)
+        else:
+            keys = self.recipes.contents(folder).keys
+            of_vectors = lambda vector: {"vector": np.asarray(vector, np.float32)}, itemgetter("vector")
+            of_scales, root, name = (pack_features, unpack_features), self.root, type(extractor).__name__
+            parts = [
+                CacheFiles(root, name, recipe | {"part": part}, *(of_vectors if part == "vector" else of_scales))
+                for part in names
+            ]
+        return Descriptions(folder, extractor, parts, keys, before, np.full((len(names), len(folder)), -1))
 
     def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
         opened = source.open(folder, partial=self.skip_bad)
@@ -162,28 +301,13 @@ class FeatureCache:
         self.log(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
         return opened
 
-    def _open(self, folder: ImageFolder, extractor: Extractor) -> Extraction:
-        before = states(folder)
-        if self.root is not None:
-            contents, recipe = self.recipes.contents(folder), self.recipes.of_features(extractor)
-            lock = partial(self.lock, contents.fingerprint)
-            return Extraction(extractor, open_sinks(self.root, extractor, recipe, contents.keys, lock=lock), before)
-        sinks = open_sinks(None, extractor, {}, before)
-        memory = self._memo.once("memory", lambda: [sink.items for sink in sinks], None, extractor)
-        for sink, items in zip(sinks, memory, strict=True):
-            sink.items = items
-        return Extraction(extractor, sinks, before)
-
-    def _vectors(
-        self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
-    ) -> Vectors:
-        if isinstance(describer, Aggregated):
-            return self._aggregate(folder, describer, database, label)
-        state = self.describe(folder, describer, label=f"{label} descriptors")
-        _require_images(folder, state.bad)
+    def _vectors(self, folder: ImageFolder, describer: Extractor, rows: Iterable[int] | None, label: str) -> Vectors:
+        state = self._open(folder, describer)
+        self._describe(state, [0], rows, f"{label} descriptors")
+        _require_images(state)
         values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
-        for row, vector in state.sinks[0].read():
-            values[row] = vector
+        for row, vector in state.read(0, np.flatnonzero(state.counts[0] > 0).tolist()):
+            values[row] = np.reshape(vector, -1)
         return Vectors(values, dict(state.bad))
 
     def _aggregate(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
@@ -202,6 +326,21 @@ class FeatureCache:
         return Vectors(values, features.bad)
 
 
-def _require_images(folder: ImageFolder, bad: Mapping[int, str]) -> None:
-    if len(bad) == len(folder):
-        raise InputError(f"{folder.root}: none of {len(folder)} images can be used; the first: {bad[min(bad)]}")
+def _describe_rows(
+    folder: ImageFolder, extractor: Extractor, skip_bad: bool, rows: Sequence[int]
+) -> Iterator[tuple[int, Description | str]]:
+    """(row, description) of images, in batches, and at last (row, reason) of the images that are not used."""
+    bad: dict[int, str] = {}
+    for batch in describe_folder(folder, extractor, rows, bad, skip_bad=skip_bad):
+        yield from batch.items()
+    yield from bad.items()
+
+
+def _require_images(state: Descriptions) -> None:
+    if len(state.bad) == len(state.folder):
+        reason = state.bad[min(state.bad)]
+        raise InputError(f"{state.folder.root}: none of {len(state.folder)} images can be used; the first: {reason}")
+
+
+def _count(item: Any) -> int:
+    return len(item.mask) if isinstance(item, Features) else 1

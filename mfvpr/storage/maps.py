@@ -1,295 +1,258 @@
-"""The rows of a map on disk: for every image its features, its global descriptor, its name and its place.
+"""A map on disk: one SQLite file with a write-ahead log, which many processes read while one writes.
 
-    rows = MapRows(folder, recipe)
-    with lock_map(folder):
-        write_settings(folder, settings)
-        with rows.adding() as add:
-            add([(features, Entry(name, place, vector)), ...])
-    for row, entry in rows.new():  # since the last time, whoever added them
-        ...
-
-One process adds at a time, any number read. Rows lie in segments of `SEGMENT`, so that no folder holds too many files.
-A segment has two row stores (`mfvpr.storage.rows`) and a file of tokens: a random number of each row, which the files
-of both stores know as well. So features and entries that were not written together are noticed. A row exists when its
-token does, which is written last: no process sees half a row, and the next reader notices if a file is removed
-later. A process that is killed leaves out row numbers.
-
-The file of tokens grows before the files of a row are written: a row beyond its end shows that the file was cut. Until
-the tokens are written it lacks one byte: its size changes with every new row, even where the clock stands still.
-
-A map of format 1 has no tokens, and no manifest beside its segments. It can be read, but not added to.
+A row is in the file whole or not at all, also after a kill or on a full disk, and rows keep their order. Its features
+and the vocabulary have a checksum, and so have name, place and global descriptor together.
 """
 
+import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
-from functools import partial
+import sqlite3
+import time
+import uuid
+import weakref
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float
 
 from mfvpr.core.types import Features
-from mfvpr.storage.disk import disk_errors_as_input_errors, lock_store
-from mfvpr.storage.features import FeatureStore, open_store
-from mfvpr.storage.manifest import (
-    FEATURES,
-    MANIFEST,
-    Kind,
-    has_manifest,
-    manifest_of,
-    remove_store_leftovers,
-    write_manifest,
-)
-from mfvpr.storage.map_entries import Entry, EntryStore, open_entry_store
+from mfvpr.storage.cache_files import disk_errors_as_input_errors, full_disk_error
+from mfvpr.storage.packing import pack_features, unpack_features
+from mfvpr.utils.arrays import pack_arrays, unpack_arrays
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import clip_middle
+from mfvpr.utils.locks import lock_folder
 
-SEGMENT = 4096  # rows
-MAP = Kind("map", 2, "places", "images", None, compress=False)
-_MAP_1, _FEATURES = replace(MAP, version=1), replace(FEATURES, remake=None)
-_TOKENS, _TOKEN = "tokens", np.dtype("<u8")
-
-MapImage = tuple[Features, Entry]
-
-
-@contextmanager
-def lock_map(folder: Path) -> Iterator[None]:
-    """Lock a map, which may be missing: no other process learns its vocabulary or adds images."""
-    with disk_errors_as_input_errors(folder, MAP.content):
-        folder.mkdir(parents=True, exist_ok=True)
-    with lock_store(folder, MAP.content):
-        yield
+FILE = "map.sqlite"  # in the folder of the map
+DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
+_FORMAT = 3
+_WAIT = 60  # seconds for another process that writes
+_AT_ONCE = 500  # rows of a query, whose number of parameters is limited
+_SCHEMA = """
+CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL);
+CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,
+                      vector BLOB NOT NULL, checksum INTEGER NOT NULL);
+CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL);
+"""
 
 
-def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a map within `lock_map`; an InputError if it has other settings, or format 1."""
-    if _is_old(folder):
-        raise InputError(f"{folder}: expected {MAP.format!r}, got {_MAP_1.format!r}, which can only be read. Build the "
-                         "map anew in another folder.")  # fmt: skip
-    with disk_errors_as_input_errors(folder, MAP.content):
-        remove_store_leftovers(folder)
-        write_manifest(folder, MAP, manifest_of(MAP, settings, {}))
+class Entry(NamedTuple):
+    """The data of an image in a map, without its features; the place is any JSON value."""
+
+    name: str
+    place: Any
+    vector: Float[np.ndarray, " dimensions"]
 
 
-def has_settings(folder: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether the settings of a map are written; raises `InputError` if the map has other settings."""
-    with disk_errors_as_input_errors(folder, MAP.content):
-        return has_manifest(folder, MAP, manifest_of(MAP, settings, {}))
+class MapFile:
+    """The file of the map in a folder, which may be missing until something is written.
 
+    Used by one thread at a time. `lock` keeps others from building and adding meanwhile.
+    """
 
-def has_rows(folder: Path) -> bool:
-    """Whether rows were ever added to a map."""
-    return _segment_folder(folder, 0).is_dir()
+    def __init__(self, folder: Path) -> None:
+        """Open nothing yet; an InputError for a map of an earlier version, or a folder of something else."""
+        self.folder, self._path = folder.absolute(), folder.absolute() / FILE
+        self._database: sqlite3.Connection | None = None
+        self._stamp: tuple[int, int] | None = None  # of the file that is open
+        self._id: bytes | None = None  # of the map that is open: every map has another one
+        with disk_errors_as_input_errors(self.folder):
+            names = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.exists() else set()
+        if FILE not in names and names & {"0000", "settings.json", "vocabulary.npz"}:
+            raise InputError(f"{folder}: expected a map of this version, got one of an earlier version. Build it again "
+                             "in another folder.")  # fmt: skip
+        if names and FILE not in names:
+            raise InputError(f"{folder}: expected a new or empty folder, or a map; name another")
 
+    def part(self, name: str) -> bytes | None:
+        """A part that was written: settings, vocabulary or confidence; None if it was not."""
+        with self._reading() as database:
+            found = database and database.execute("SELECT value FROM parts WHERE name = ?", [name]).fetchone()
+        return found[0] if found else None
 
-def _is_old(folder: Path) -> bool:
-    """Whether a map is of format 1."""
-    return has_rows(folder) and not ((folder / MANIFEST).exists() or (_segment_folder(folder, 0) / _TOKENS).exists())
-
-
-def _segment_folder(folder: Path, number: int) -> Path:
-    return folder / f"{number:04d}"
-
-
-@dataclass
-class _Segment:
-    """Both stores of a segment, and its tokens, when they were opened."""
-
-    features: FeatureStore
-    entries: EntryStore
-    tokens: np.ndarray  # [SEGMENT] of the rows that exist; 0 = no row
-    stamp: tuple[int, ...] | None  # of the file of tokens
-    known: np.ndarray  # [SEGMENT] bool, rows that `MapRows.new` gave
-
-    @property
-    def folder(self) -> Path:
-        return self.entries.folder.parent
-
-    @property
-    def done(self) -> np.ndarray:
-        """`[SEGMENT]` bool, rows that exist."""
-        return (self.tokens > 0) & self.entries.done
-
-    @property
-    def taken(self) -> np.ndarray:
-        """`[SEGMENT]` bool, rows that exist, or were begun, or are gone."""
-        return (self.tokens > 0) | self.features.done | self.entries.done
-
-    @property
-    def is_current(self) -> bool:
-        """Whether nothing was added or replaced since: that changes the file of tokens."""
-        return self.entries.is_writable or self.stamp == file_stamp(self.folder / _TOKENS)
-
-    @property
-    def first_free(self) -> int:
-        """The row behind those that are taken."""
-        return int(np.max(np.flatnonzero(self.taken), initial=-1)) + 1
-
-    def add(self, images: Sequence[MapImage]) -> None:
-        """Write images to disk, behind the rows that are taken."""
-        first = self.first_free
-        rows = range(first, first + len(images))
-        new = np.random.default_rng().integers(1, 2**64 - 1, len(images), np.uint64)
-        self.tokens[first : rows.stop] = new
+    def arrays(self, name: str) -> dict[str, np.ndarray] | None:
+        """Arrays that were written as a part; an InputError if they are damaged."""
+        content = self.part(name)
         try:
-            features = self.features.pack({row: features for row, (features, _) in zip(rows, images, strict=True)})
-            entries = self.entries.pack({row: entry for row, (_, entry) in zip(rows, images, strict=True)})
-            with disk_errors_as_input_errors(self.folder, MAP.content), (self.folder / _TOKENS).open("r+b") as file:
-                file.truncate(rows.stop * _TOKEN.itemsize - 1)
-                os.fsync(file.fileno())  # a row must not be on disk before
-                self.features.write_parts(features)
-                self.entries.write_parts(entries)
-                file.seek(first * _TOKEN.itemsize)
-                file.write(new.astype(_TOKEN).tobytes())
-                file.flush()
-                os.fsync(file.fileno())
-        except BaseException:  # also Ctrl-C: the rows are not there
-            self.tokens[first : rows.stop] = 0
-            raise
-        self.stamp = file_stamp(self.folder / _TOKENS)
+            return None if content is None else unpack_arrays(content, name)
+        except InputError:
+            raise InputError(f"{self._path}: the {name} is damaged. Put back a copy, or build the map again.") from None
 
-    def check(self) -> None:
-        """Raise `InputError` if one of the two files of a row is gone, or the file of tokens is gone or was cut."""
-        path = self.folder / _TOKENS
-        stamp = file_stamp(path)  # the rows were listed earlier, and an add grows this file before it writes rows
-        if self.entries.done.any() and stamp is None:
-            raise InputError(f"{path}: expected a file, got none. Put it back.")
-        rows = np.flatnonzero(self.features.done & self.entries.done)
-        if stamp and len(lost := rows[(rows + 1) * _TOKEN.itemsize - 1 > stamp[0]]):
-            raise InputError(f"{path}: expected tokens of rows up to {lost[-1]}, got a file that was cut to {stamp[0]} "
-                             f"bytes. Put it back, or delete the files of {len(lost)} rows from {lost[0]} on in "
-                             f"{self.features.folder} and {self.entries.folder}, which leaves them out.")  # fmt: skip
-        halves = np.flatnonzero((self.tokens > 0) & (self.features.done != self.entries.done))
-        if len(halves):
-            row = halves[0]
-            stores = self.features, self.entries
-            missing, other = stores if self.entries.done[row] else stores[::-1]
-            raise InputError(f"{missing.folder}: expected a file of row {row}, got none ({len(halves)} rows lack one). "
-                             f"Put it back, or delete {other.folder}/{row}-{other.counts[row]}.npz as well, which "
-                             "leaves the row out.")  # fmt: skip
+    def entries(self, start: int) -> Iterator[tuple[int, Entry]]:
+        """(row, entry) of all rows from `start` on, in their order; an InputError if one is damaged or missing."""
+        query = "SELECT row, name, place, vector, checksum FROM entries WHERE row >= ? ORDER BY row"
+        with self._reading() as database:
+            for row, name, place, vector, checksum in database.execute(query, [start]) if database else ():
+                if row != start or _checksum(name, place, vector) != checksum:
+                    raise self._damage(start)
+                start += 1
+                yield row, Entry(json.loads(name), json.loads(place), np.frombuffer(vector, np.float32))
 
-
-@dataclass(eq=False)
-class MapRows:
-    """The rows of the map in a folder, which may be missing until the first is added, within `lock_map`."""
-
-    folder: Path  # absolute
-    recipe: Mapping[str, Any]  # of the rows (JSON values): a map with another recipe is refused
-    _segments: list[_Segment] = field(default_factory=list, repr=False)
-
-    def new(self) -> Iterator[tuple[int, Entry]]:
-        """(row, entry) of new rows in their order; an InputError for a map of another recipe, damaged or replaced."""
-        if self._segments:
-            self._open(0)  # all maps have this segment: it shows whether the map was replaced
-        growing = (number for number, segment in enumerate(self._segments) if not segment.known.all())
-        number = next(growing, len(self._segments))
-        while self._open(number):
-            segment = self._segments[number]
-            for row, entry in segment.entries.read(np.flatnonzero(segment.done & ~segment.known).tolist()):
-                segment.known[row] = True
-                yield number * SEGMENT + row, entry
-            if not segment.taken[-1]:
-                break
-            number += 1
-
-    def counts(self, rows: Iterable[int]) -> Int[np.ndarray, " rows"]:
-        """Numbers of keypoints of rows, -1 = no such row."""
-        row_numbers = np.fromiter(rows, int)
-        counts = np.full(len(row_numbers), -1)
-        for number in np.unique(row_numbers // SEGMENT):
-            segment, is_here = self._segments[number], row_numbers // SEGMENT == number
-            counts[is_here] = np.where(segment.done, segment.features.counts, -1)[row_numbers[is_here] % SEGMENT]
-        return counts
+    def counts(self) -> np.ndarray:
+        """`[M]` numbers of keypoints of all rows."""
+        with self._reading() as database:
+            rows = database.execute("SELECT count FROM features ORDER BY row").fetchall() if database else []
+        return np.array(rows, int).reshape(-1)
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """(row, features) of existing rows, in no order; raises `InputError` if rows are damaged or were removed."""
-        segments: dict[int, list[int]] = {}
-        for row in rows:
-            segments.setdefault(row // SEGMENT, []).append(row % SEGMENT)
-        for number, segment_rows in segments.items():
-            segment = self._segments[number]
-            if gone := [row for row in segment_rows if not (segment.done & segment.features.done)[row]]:
-                raise InputError(f"{self.folder}: expected features of row {number * SEGMENT + gone[0]}, got none. "
-                                 "Open the map again, without rows that were deleted.")  # fmt: skip
-            for row, features in segment.features.read(segment_rows):
-                yield number * SEGMENT + row, features
+        """(row, features) of existing rows, in no order; an InputError if one is damaged."""
+        for start in range(0, len(rows), _AT_ONCE):
+            part = rows[start : start + _AT_ONCE]
+            query = f"SELECT row, content FROM features WHERE row IN ({','.join('?' * len(part))})"
+            with self._reading() as database:
+                found: dict[int, bytes] = dict(database.execute(query, part)) if database else {}
+            for row in part:
+                try:
+                    yield row, unpack_features(unpack_arrays(found.get(row, b""), str(row)))
+                except InputError:
+                    raise self._damage(row) from None
 
     @contextmanager
-    def adding(self) -> Iterator[Callable[[Sequence[MapImage]], None]]:
-        """Lock the rows; yields a function that writes images to disk, behind all other rows, which stay."""
-        with ExitStack() as stack:
-            self._lock_last(stack)
-            yield partial(self._add, stack)
+    def lock(self) -> Iterator[None]:
+        """Hold the map for a process that learns, builds or adds; an InputError if another one does."""
+        with disk_errors_as_input_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        busy = InputError(f"{self.folder}: another process adds images; wait until it ends, or stop it")
+        with lock_folder(self.folder, busy):
+            yield
 
-    def _add(self, stack: ExitStack, images: Sequence[MapImage]) -> None:
-        while images:
-            segment = self._lock_last(stack)
-            number = SEGMENT - segment.first_free
-            segment.add(images[:number])
-            images = images[number:]
+    def write(self, parts: Mapping[str, bytes], images: Sequence[tuple[Features, Entry]] = ()) -> None:
+        """Write parts, which replace earlier ones, and images behind all rows: all of it, or nothing.
 
-    def _lock_last(self, stack: ExitStack) -> _Segment:
-        """Lock the last segment, or a new one if it is full."""
-        number = max(0, len(self._segments) - 1)
-        while (segment := self._reopen(number)).taken[-1]:
-            number += 1
-        if not segment.entries.is_writable:
-            for store in (segment.features, segment.entries):
-                stack.enter_context(store)
-            with disk_errors_as_input_errors(segment.folder, MAP.content):
-                (segment.folder / _TOKENS).touch()
-        return segment
+        When this returns it is on disk. An InputError if the disk is full or cannot be written.
+        """
+        packed = list[tuple[Mapping[str, np.ndarray], Entry]]()
+        for features, entry in images:
+            try:
+                packed.append((pack_features(features), entry))
+            except ValueError as error:
+                raise InputError(f"{entry.name}: {error}") from None
+        with self._errors():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            database = self._connect(create=True)
+            database.execute("BEGIN IMMEDIATE")
+            try:
+                self._write(database, parts, packed)
+                database.execute("COMMIT")
+            except BaseException:
+                if database.in_transaction:  # SQLite may have ended it
+                    database.execute("ROLLBACK")
+                raise
 
-    def _open(self, number: int) -> bool:
-        """Open a segment, unless it is current; False if there never was one."""
-        is_open = number < len(self._segments)
-        if is_open and self._segments[number].is_current:
-            return True
-        if exists := is_open or _segment_folder(self.folder, number).is_dir():
-            self._reopen(number)
-        return exists
+    def _write(
+        self,
+        database: sqlite3.Connection,
+        parts: Mapping[str, bytes],
+        images: Sequence[tuple[Mapping[str, np.ndarray], Entry]],
+    ) -> None:
+        if database.execute("PRAGMA user_version").fetchone()[0] == 0:
+            for statement in filter(str.strip, _SCHEMA.split(";")):
+                database.execute(statement)
+            database.execute(f"PRAGMA user_version = {_FORMAT}")
+            parts = {"id": uuid.uuid4().bytes, **parts}
+        self._check_id(database)
+        database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?)", parts.items())
+        [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
+        for row, (arrays, entry) in enumerate(images, first):
+            name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # ASCII: names may be no UTF-8
+            vector = np.asarray(entry.vector, np.float32).tobytes()
+            values = row, name, place, time.time(), vector, _checksum(name, place, vector)
+            database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
+            content = pack_arrays(arrays, str(row))
+            database.execute("INSERT INTO features VALUES (?, ?, ?)", (row, len(arrays["scores"]), content))
 
-    def _reopen(self, number: int) -> _Segment:
-        """Read the state of a segment on disk."""
-        before = self._segments[number] if number < len(self._segments) else None
-        if before is not None and before.entries.is_writable:
-            return before
-        folder, is_old = _segment_folder(self.folder, number), _is_old(self.folder)
-        tokens, stamp = _read_tokens(folder / _TOKENS)  # before the names of files, which come first on disk
-        options: dict[str, Any] = {"tokens": None if is_old else tokens}
-        kind = _MAP_1 if is_old else MAP
-        entries = open_entry_store(folder / "entries", self.recipe, num_images=SEGMENT, kind=kind, **options)
-        features = open_store(folder / "features", self.recipe, num_images=SEGMENT, kind=_FEATURES, **options)
-        known = np.zeros(SEGMENT, bool) if before is None else before.known
-        segment = _Segment(features, entries, tokens, stamp, known)
-        if is_old:
-            tokens[entries.done] = 1
-        else:
-            segment.check()
-        if before is not None and (before.tokens != tokens)[known].any():
-            raise InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
-                             "none. Open the map again.")  # fmt: skip
-        self._segments[number : number + 1] = [segment]
-        return segment
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection | None]:
+        """The database, None if there is no map yet."""
+        with self._errors():
+            if not self._path.exists():
+                if self._id is not None:
+                    raise self._replaced()
+                yield None
+                return
+            database = self._connect(create=False)
+            version = database.execute("PRAGMA user_version").fetchone()[0]
+            if version not in (0, _FORMAT):
+                raise InputError(f"{self._path}: expected a map of format {_FORMAT}, got {version}. Build it again.")
+            if version:
+                self._check_id(database)
+            yield database if version else None
 
+    def _check_id(self, database: sqlite3.Connection) -> None:
+        found = database.execute("SELECT value FROM parts WHERE name = 'id'").fetchone()
+        if self._id is not None and found != (self._id,):
+            raise self._replaced()
+        self._id = found and found[0]
 
-def file_stamp(path: Path) -> tuple[int, ...] | None:
-    """Size in bytes, inode and time of a file, which change when the file is replaced; None = no file."""
-    with disk_errors_as_input_errors(path.parent, MAP.content):
+    def _connect(self, *, create: bool) -> sqlite3.Connection:
+        """The connection, a new one if the file was replaced."""
+        status = self._path.stat() if self._path.exists() else None
+        if self._database is None or status is None or (status.st_dev, status.st_ino) != self._stamp:
+            if not create and not os.access(self.folder, os.W_OK):
+                how = "?mode=ro&immutable=1"  # without the files of a log beside it
+            else:
+                how = "?mode=rwc" if create else "?mode=rw"
+            self._database = sqlite3.connect(
+                self._path.as_uri() + how, uri=True, timeout=_WAIT, isolation_level=None, check_same_thread=False
+            )
+            weakref.finalize(self, self._database.close)
+            if create:
+                self._database.execute("PRAGMA journal_mode = WAL")
+            status = self._path.stat()
+            self._stamp = status.st_dev, status.st_ino
+        return self._database
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Raise errors of SQLite and of the file system as an InputError of one line."""
         try:
-            status = path.stat()
-        except FileNotFoundError:
-            return None
-    return status.st_size, status.st_ino, status.st_mtime_ns
+            with disk_errors_as_input_errors(self.folder):
+                yield
+        except sqlite3.Error as error:
+            code = getattr(error, "sqlite_errorcode", 0)
+            if code & 0xFF == sqlite3.SQLITE_FULL or code == sqlite3.SQLITE_IOERR_SHMSIZE:
+                raise full_disk_error(self.folder) from None
+            if code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+                reason = f"is damaged ({error}). Put back a copy, or build the map again"
+            else:
+                reason = f"cannot be used ({error}). Check the path, its permissions and its disk"
+            raise InputError(f"{self._path}: {reason}.") from None
+
+    def _damage(self, row: int) -> InputError:
+        return InputError(f"{self._path}: row {row} is damaged. Put back a copy, or build the map again.")
+
+    def _replaced(self) -> InputError:
+        return InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
+                          "none. Open the map again.")  # fmt: skip
 
 
-def _read_tokens(path: Path) -> tuple[np.ndarray, tuple[int, ...] | None]:
-    """`[SEGMENT]` tokens, 0 beyond the end of the file, and the `file_stamp` of the file."""
-    tokens, stamp = np.zeros(SEGMENT, _TOKEN), file_stamp(path)  # the stamp first: later changes are noticed
-    with disk_errors_as_input_errors(path.parent, MAP.content):
-        content = path.read_bytes() if stamp else b""
-    stored = np.frombuffer(content, _TOKEN, len(content) // _TOKEN.itemsize)
-    tokens[: len(stored)] = stored
-    return tokens, stamp
+def _checksum(name: str, place: str, vector: bytes) -> int:
+    return zlib.crc32(vector, zlib.crc32(f"{name} {place}".encode()))
+
+
+def check_entry(name: Any, place: Any) -> None:
+    """Refuse a name that is no text, and a place that is None or that JSON would change: a tuple becomes a list."""
+    if not isinstance(name, str):
+        raise InputError(f"name: expected text, got {clip_middle(repr(name), 80)}. Use `str(name)`.")
+    try:
+        text = json.dumps(place, allow_nan=False)
+        if place is None or json.loads(text) != place:
+            raise ValueError(f"{clip_middle(repr(place), 80)}, which JSON gives back as {clip_middle(text, 80)}")
+        if _levels(place) > DEEPEST:
+            raise RecursionError
+    except RecursionError:
+        message = f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
+        raise InputError(message) from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
+                         "lists, and dictionaries by text") from None  # fmt: skip
+
+
+def _levels(place: Any) -> int:
+    """Depth of nested lists and dictionaries."""
+    parts = place.values() if isinstance(place, dict) else place
+    return 1 + max(map(_levels, parts), default=0) if isinstance(place, dict | list) else 0

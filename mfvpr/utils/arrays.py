@@ -23,10 +23,28 @@ _DIGEST = hashlib.sha256().digest_size
 _PARSING = threading.Lock()
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> None:
-    """Write arrays of numbers, flags or text by name. When this returns they are on disk; until then, the file stays.
+def write_arrays(
+    path: Path, arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False, once: bool = False
+) -> None:
+    """Write `pack_arrays`. When this returns they are on disk; until then, the file stays. `once`: see `replacing`."""
+    with replacing(path, once=once) as temporary, temporary.open("wb") as file:
+        file.write(pack_arrays(arrays, about, compress=compress))
+        file.flush()
+        os.fsync(file.fileno())
 
-    `read_arrays` must get the same label `about`, so exchanged files are noticed; `compress` is for repeated values.
+
+def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
+    """Read the arrays of `write_arrays`; errors are those of `unpack_arrays`, and an `OSError` without a file."""
+    try:
+        return unpack_arrays(path.read_bytes(), about)
+    except InputError as error:
+        raise InputError(f"{path}: {error}; delete it") from None
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray], about: str = "", *, compress: bool = False) -> bytes:
+    """The content of a file of arrays of numbers, flags or text by name.
+
+    `unpack_arrays` must get the same label `about`, so exchanged files are noticed; `compress` is for repeated values.
     """
     buffer = io.BytesIO()
     kind = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
@@ -36,19 +54,14 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: str = "", 
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
     content = buffer.getbuffer()[:-_DIGEST]
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(content)
-        file.write(_digest(content, about))
-        file.flush()
-        os.fsync(file.fileno())
+    return bytes(content) + _digest(content, about)
 
 
-def read_arrays(path: Path, about: str = "") -> dict[str, np.ndarray]:
-    """Read the arrays of `write_arrays`; an `InputError` if a bit or the label differs, an `OSError` without a file."""
-    content = path.read_bytes()
+def unpack_arrays(content: bytes, about: str = "") -> dict[str, np.ndarray]:
+    """The arrays of `pack_arrays`; an `InputError` if a bit or the label differs."""
     view = memoryview(content)
     if view[-_DIGEST:] != _digest(view[:-_DIGEST], about):
-        raise InputError(f"{path}: expected arrays as they were written here, got others or damaged ones; delete it")
+        raise InputError("expected arrays as they were written here, got others or damaged ones")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return {
             member.filename.removesuffix(".npy"): _array(_bytes_of(archive, member, view))

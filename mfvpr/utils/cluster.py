@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, round_up
-from mfvpr.utils.progress import Track
 from mfvpr.utils.versions import versions
 
 BLOCK = 32  # rows of a task at most, which a killed worker loses
@@ -32,7 +31,7 @@ Result = TypeVar("Result")
 
 
 class Cluster:
-    """Workers that describe images and match queries in blocks, and write the results to the folder of one cache.
+    """Workers that describe images and match queries in blocks; this process writes the results to a cache.
 
         with Cluster.local(4) as cluster:
             mfvpr.evaluate(dataset, system, cache=FeatureCache("features"), runtime=Runtime(cluster=cluster))
@@ -117,27 +116,22 @@ class Cluster:
                 _run_slurm("scancel", job)
 
     def map(
-        self, function: Callable[..., Result], shared: tuple[Any, ...], rows: Sequence[int], track: Track, multiple: int
-    ) -> list[Result]:
+        self, function: Callable[..., Iterator[Result]], shared: tuple[Any, ...], rows: Sequence[int], multiple: int
+    ) -> Iterator[Result]:
         """Results of `Runtime.map` from workers, in the order in which blocks finish; an InputError if workers die."""
         size = round_up(min(BLOCK, len(rows) // _BLOCKS), multiple)
         blocks = [rows[start : start + size] for start in range(0, len(rows), size)]
-        client, distributed, results = self._client, _distributed(), list[Result]()
+        client, distributed, futures = self._client, _distributed(), set[Any]()
         again = "finished blocks are in the cache; run again to go on"
-        futures: dict[Any, Sequence[int]] = {}
-
-        def finished_rows() -> Iterator[int]:
-            for future in distributed.as_completed(list(futures), loop=client.loop):
-                results.append(future.result())
-                yield from futures.pop(future)  # Dask would repeat the block if its worker died while the future exists
-
         try:
             client.wait_for_workers(1)
             packed = distributed.protocol.pickle.dumps(shared)  # once: networks in use cannot pass between workers
             value = client.submit(bytes, packed, pure=False)  # Dask repeats a task if its worker dies; not `scatter`
-            futures |= {client.submit(_run, versions(), function, value, block, pure=False): block for block in blocks}
-            for _ in track(finished_rows(), len(rows)):
-                pass
+            futures |= {client.submit(_run, versions(), function, value, block, pure=False) for block in blocks}
+            for future in distributed.as_completed(list(futures), loop=client.loop):
+                results = future.result()
+                futures.remove(future)  # Dask would repeat the block if its worker died while the future exists
+                yield from results
         except distributed.KilledWorker as error:
             number = error.allowed_failures + 1
             raise InputError(f"cluster: {number} workers died in one block; give them more memory; {again}") from None
@@ -148,13 +142,12 @@ class Cluster:
         finally:
             for future in futures:
                 future.release()
-        return results
 
 
-def _run(expected: dict[str, str], function: Callable[..., Any], packed: bytes, block: Sequence[int]) -> Any:
+def _run(expected: dict[str, str], function: Callable[..., Any], packed: bytes, block: Sequence[int]) -> list[Any]:
     if (installed := versions()) != expected:
         raise InputError(f"cluster: expected workers with {expected}, got {installed}; install the same versions")
-    return function(*_unpack(packed), block)
+    return list(function(*_unpack(packed), block))
 
 
 @lru_cache(maxsize=1)  # so that all blocks share compiled programs

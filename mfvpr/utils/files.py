@@ -59,6 +59,15 @@ def remove_leftovers(folder: Path) -> None:
             path.unlink()
 
 
+def used_bytes(folder: Path) -> int:
+    """Bytes on disk of all files below a folder, except those that another process removes meanwhile."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):
+            total += path.stat().st_blocks * 512
+    return total
+
+
 def printable(text: str) -> str:
     """`text` for UTF-8: characters that it lacks, of names in other encodings, as \\udcXX, which JSON reads back."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")

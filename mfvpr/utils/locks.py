@@ -1,11 +1,10 @@
 """Locks of files and folders by `flock` of a handle: they end with their process, and hold within one, too."""
 
+import fcntl
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-
-from filelock import lock_descriptor
 
 
 @contextmanager
@@ -16,9 +15,11 @@ def lock(path: Path, flags: int, on_conflict: Callable[[int], None]) -> Iterator
     """
     handle = os.open(path, flags, 0o644)
     try:
-        if not lock_descriptor(handle, blocking=False):
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             on_conflict(handle)
-            lock_descriptor(handle)
+            fcntl.flock(handle, fcntl.LOCK_EX)
         yield handle
     finally:
         os.close(handle)

@@ -1,7 +1,7 @@
 """Settings of a call that change no result: devices, memory, progress, messages and a cluster."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ class Runtime:
         memory: GB that features of the database may take on the devices, and matches in memory; None = a third of what
             is free, or 2 GB in each worker of a cluster. Not above 0 raises an `InputError`.
         progress: label -> progress bar of the next loop.
-        log: called with one line: the work to be done and the disk space it takes, or a warning.
+        log: called with one line: the work to be done, or a warning.
         cluster: describes images and matches queries; None = this process. Retrieval and scores stay in this process.
     """
 
@@ -37,16 +37,21 @@ class Runtime:
             raise InputError(f"memory={self.memory!r}: expected GB above 0, or None")
 
     def map(
-        self, function: Callable[..., Result], shared: tuple[Any, ...], rows: Sequence[int], label: str, multiple: int
-    ) -> list[Result]:
-        """The result of `function(*shared, rows, track)`; with a cluster, of `function(*shared, block)` for each block.
+        self,
+        function: Callable[..., Iterator[Result]],
+        shared: tuple[Any, ...],
+        rows: Sequence[int],
+        label: str,
+        multiple: int,
+    ) -> Iterator[Result]:
+        """Results of `function(*shared, rows)`, one for each row; with a cluster, of `function(*shared, block)`.
 
-        `track` is the progress with this label. The rows of a block are a multiple of `multiple`, but for the last.
+        With a cluster, results come block by block, as blocks finish; the rows of a block are a multiple of `multiple`,
+        but for the last. The progress has this label.
         """
-        track = self.progress(label)
-        if self.cluster is None:
-            return [function(*shared, rows, track)]
-        return self.cluster.map(function, shared, rows, track, multiple)
+        cluster = self.cluster
+        results = function(*shared, rows) if cluster is None else cluster.map(function, shared, rows, multiple)
+        return iter(self.progress(label)(results, len(rows)))
 
 
 DEFAULT_RUNTIME = Runtime()

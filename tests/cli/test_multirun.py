@@ -1,13 +1,8 @@
 """Hydra's multirun: many jobs, one after the other or at the same time."""
 
-import os
-import threading
-
 import pytest
 
-from mfvpr.cli import console
-from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, composed, csv_rows, matches_path, results, run, small
+from tests.programs import csv_rows, results, run, small
 
 pytestmark = pytest.mark.thorough
 
@@ -67,37 +62,6 @@ def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, s
     monkeypatch.chdir(tmp_path)
     succeed("sweep", "-m", *small(root), SIGMA, f"out={outs}")
     assert results(tmp_path / "a b") == results(tmp_path / "it's")
-
-
-def test_a_job_waits_for_the_matches_of_another_and_a_single_run_does_not(root, tmp_path, monkeypatch, succeed, call):
-    overrides = *small(root), SIGMA
-    settings = composed(*overrides, config="sweep")
-    path, recipe = matches_path(settings)
-    succeed("sweep", *overrides, f"out={tmp_path}/first")
-    with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES) as complete:
-        assert complete.done.all()  # so others read it at the same time
-        succeed("sweep", *overrides, f"out={tmp_path}/second")
-    next(path.glob("3-*.npz")).unlink()
-    taken, announced = threading.Event(), threading.Event()
-
-    def another():
-        with match_store.open_match_store(path, recipe, num_queries=QUERIES, num_candidates=CANDIDATES):
-            taken.set()
-            announced.wait(timeout=60)
-
-    other, tell = threading.Thread(target=another), console.tell
-    monkeypatch.setattr(console, "tell", lambda text: (tell(text), "waiting until" in text and announced.set()))
-    other.start()
-    assert taken.wait(timeout=60)
-    code, _, stderr = call("sweep", *overrides, f"out={tmp_path}/single")
-    assert (code, announced.is_set()) == (2, False)
-    assert stderr.startswith(f"error: {path}: in use by process {os.getpid()}; ")
-    assert stderr.count("\n") == 1
-    monkeypatch.chdir(tmp_path)
-    _, stderr = succeed("sweep", "-m", *overrides, f"out={tmp_path}/job")
-    other.join(timeout=60)
-    assert f"{path}: in use by process {os.getpid()}; waiting" in stderr
-    assert {place.name for place in tmp_path.iterdir()} == {"runs", "first", "second", "job"}
 
 
 @pytest.mark.slow

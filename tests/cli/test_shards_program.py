@@ -116,19 +116,19 @@ def test_killed_shards_go_on(settings, plain, tmp_path):
 
 def test_ctrl_c_leaves_no_worker_and_the_next_run_goes_on(settings, plain, evaluate, tmp_path):
     process = start(settings, tmp_path, "cluster=local", "cluster.workers=3")
-    wait_until(lambda: any(tmp_path.rglob("*-*.npz")))
+    wait_until(lambda: any(tmp_path.rglob("[0-9a-f]*.npz")))
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
     assert stderr.splitlines()[-1].startswith("interrupted")
     assert "Traceback" not in stderr
     wait_until(lambda: not processes(process.pid))
-    stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-*.npz")}
+    stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("[0-9a-f]*.npz")}
     code, _, stderr = evaluate("cluster=local", "cluster.workers=3", f"out={tmp_path}/out")
     assert code == 0
     assert "cluster: 3 workers at tls://127.0.0.1:" in stderr
     assert tables(tmp_path / "out") == tables(plain)
-    assert stored.items() <= {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-*.npz")}.items()
+    assert stored.items() <= {path: path.stat().st_mtime_ns for path in tmp_path.rglob("[0-9a-f]*.npz")}.items()
 
 
 def test_slurm_starts_the_workers_and_ends_them(settings, plain, evaluate, tmp_path, monkeypatch):

@@ -12,8 +12,7 @@ import pytest
 from PIL import Image
 
 from mfvpr.cli import axes, evaluation, launch, sweeping
-from mfvpr.storage import matches as match_store
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, matches_path, small, snapshot
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, small
 
 pytestmark = pytest.mark.thorough
 
@@ -215,25 +214,6 @@ def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_p
     line = refused(2 * 10**5, SIGMA, "chunk.queries=24")
     assert "chunk: 2 settings x 24 queries " in line
     assert "chunk.settings or chunk.queries" in line
-
-
-@pytest.mark.parametrize("change", ["candidates=7", "retrieval.num_words=9", "features.max_keypoints=61"])
-def test_matches_of_something_else_are_refused(root, swept, tmp_path, call, change):
-    """A store that was moved to where another one belongs."""
-
-    def place(*changes):
-        return matches_path(composed(*small(root), *changes, config="sweep"))[0]
-
-    matching_place, foreign = place(f"cache={tmp_path}/store"), place(change)
-    with match_store.open_match_store(matching_place, {"other": 1}, num_queries=24, num_candidates=8):
-        pass
-    matching_place.parent.joinpath(foreign.name).symlink_to(matching_place)
-    before = snapshot(tmp_path)
-    folders = (f"cache={tmp_path}/store", f"out={tmp_path}/out")
-    code, stdout, stderr = call("sweep", *small(root), change, SIGMA, *folders)
-    assert (code, stdout, stderr.count("\n")) == (2, "", 1)
-    assert "these matches were made with" in stderr
-    assert snapshot(tmp_path) == before
 
 
 @pytest.mark.slow

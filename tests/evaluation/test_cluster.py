@@ -37,6 +37,7 @@ class FatalSift(Sift):
     """Kills the first worker that describes images, or without a flag every worker; in use, it cannot be pickled."""
 
     flag: str | None = None
+    recipe = "fatal"
 
     def __call__(self, images):
         self.__dict__["program"] = threading.Lock()
@@ -49,6 +50,7 @@ class FatalMatcher:
     """Kills the first worker that matches."""
 
     flag: str
+    recipe = "fatal"
 
     def __call__(self, features0, features1):
         die_once(self.flag)
@@ -127,7 +129,7 @@ def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(datas
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
     with pytest.raises(InputError, match="cluster: 4 workers died in one block"):
         cache.describe(dataset.database, extractor)
-    assert cache.describe(dataset.database, SIFT).missing(range(10)) == []
+    assert (cache.describe(dataset.database, SIFT).counts > 0).all()
 
 
 def test_a_cluster_needs_a_folder(dataset, cluster):

@@ -23,7 +23,8 @@ from mfvpr.report.evaluation_files import differences, write_gains, write_rankin
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
-from mfvpr.storage import FeatureCache, extraction
+from mfvpr.storage import FeatureCache
+from mfvpr.storage import feature_cache as cache_module
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
@@ -116,8 +117,9 @@ def test_only_candidates_are_extracted(dataset, tmp_path):
     matched = match_sequence(dataset, few, mfvpr.Pipeline(SIFT, Retrieval(Mean()), candidates=3), cache=cache)
     wanted = np.unique(matched.candidates.indices)
     assert len(wanted) < 7
-    [features] = FeatureCache(tmp_path).local(dataset.database, SIFT, [])
-    assert np.flatnonzero(features.counts).tolist() == wanted.tolist()
+    [files] = FeatureCache(tmp_path).describe(dataset.database, SIFT, []).parts
+    keys = FeatureCache(tmp_path).recipes.contents(dataset.database).keys
+    assert [row for row, key in enumerate(keys) if key in files] == wanted.tolist()
     assert f"database features: {len(wanted)} of 10 images to do" in "\n".join(lines)
 
 
@@ -310,7 +312,7 @@ def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatc
         clock[0] += 10
         yield from describe_folder(*arguments, **options)
 
-    monkeypatch.setattr(extraction, "describe_folder", slow)
+    monkeypatch.setattr(cache_module, "describe_folder", slow)
     seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2).seconds
     assert seconds.pop("features") >= 20
     assert {*seconds.values()} == {0}

@@ -33,7 +33,7 @@ def row_hashes(root):
     """Hashes of rows; those of features are named by image."""
     return {
         (path.relative_to(root).parts[0], path.name): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in root.rglob("[0-9a-f]*-*.npz")
+        for path in root.rglob("[0-9a-f]*.npz")
     }
 
 

@@ -1,5 +1,7 @@
 """The way over a data set, stage by stage, on a synthetic street and on broken images."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from mfvpr.matchers import match_set as match_sets
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.matches import StoredMatches, open_match_store
+from mfvpr.storage.match_files import MatchStore, StoredMatches
 from mfvpr.tuning.sweeps import rank_settings
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -51,19 +53,16 @@ def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
     assert few.capacity == 64
 
 
-def open_store(folder, num_queries=10, num_candidates=6):
-    sizes = {"num_queries": num_queries, "num_candidates": num_candidates}
-    return open_match_store(folder / "store", {"name": "street"}, **sizes)
+def open_store(folder, num_queries=10):
+    return MatchStore(folder / "store", {"name": "street"}, num_queries)
 
 
 def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, tmp_path, monkeypatch):
-    with open_store(tmp_path) as store:
-        first = stages.match(features[1], features[0], candidates, store=store)
-    with open_store(tmp_path) as store:
-        runtime = mfvpr.Runtime(progress=lambda label: lambda *_: pytest.fail("again"))
-        again = stages.match(features[1], features[0], candidates, store=store, runtime=runtime)
-        alone, stored = stages.stored_matches(store)
-        read_again, _ = stages.stored_matches(store, memory=1e-5)
+    first, store = stages.match(features[1], features[0], candidates, store=open_store(tmp_path)), open_store(tmp_path)
+    runtime = mfvpr.Runtime(progress=lambda label: lambda *_: pytest.fail("again"))
+    again = stages.match(features[1], features[0], candidates, store=store, runtime=runtime)
+    alone, stored = stages.stored_matches(store)
+    read_again, _ = stages.stored_matches(store, memory=1e-5)
     assert isinstance(read_again.matches, StoredMatches)
     assert len(read_again.matches) == len(first)
     assert_same_match_sets(first, matches)
@@ -81,6 +80,18 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     jax.tree.map(np.testing.assert_array_equal, one_by_one, fresh)
     rows = [rank_settings(scorers["h"], [{"sigma": 9.0}], match_set, candidates) for match_set in (matches, read_again)]
     np.testing.assert_array_equal(*rows)
+
+
+def test_matches_of_another_shortlist_or_that_are_damaged_are_made_again(features, candidates, matches, tmp_path):
+    store, other = open_store(tmp_path), replace(candidates, indices=candidates.indices[:, ::-1].copy())
+    stages.match(features[1], features[0], candidates, store=store, rows=range(5))
+    assert stages.stored_matches(store) is None
+    stages.match(features[1], features[0], other, store=store)
+    np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, other.indices)
+    assert_same_match_sets(stages.match(features[1], features[0], candidates, store=store), matches)
+    next(store.folder.rglob("*3.npz")).write_bytes(b"damaged")
+    assert stages.stored_matches(store) is None
+    assert_same_match_sets(stages.match(features[1], features[0], candidates, store=store), matches)
 
 
 def test_skipped_images_are_listed_and_never_shortlisted(small_street, tmp_path):
@@ -102,9 +113,9 @@ def test_skipped_images_are_listed_and_never_shortlisted(small_street, tmp_path)
     np.testing.assert_array_equal(candidates.indices[0], [0, 4, 3, -1, -1])
     np.testing.assert_array_equal(candidates.indices[1], [-1] * 5)
     matches = stages.match(features, features, candidates)
-    with open_store(tmp_path, 5, 5) as store:
-        assert_same_match_sets(stages.match(features, features, candidates, store=store), matches)
-        np.testing.assert_array_equal(stages.stored_matches(store)[1].mask, candidates.mask)
+    store = open_store(tmp_path, 5)
+    assert_same_match_sets(stages.match(features, features, candidates, store=store), matches)
+    np.testing.assert_array_equal(stages.stored_matches(store)[1].mask, candidates.mask)
     scores = stages.score({"h": mfvpr.HistogramOfShifts(), "a": mfvpr.AnchorPoints()}, matches, candidates)
     for values in scores.values():
         assert values[0, 0] == values[0, 1] > 0

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from mfvpr import Features, InputError
 from mfvpr.features import FeatureSet, InMemory
 from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
-from mfvpr.storage.features import open_store
 from tests.builders import make_features
 
 DEVICE = jax.devices()[0]
@@ -243,13 +242,3 @@ def test_rows_are_written_by_one_program_for_each_capacity(compilations):
         use([50] * 40 + [310] * 33, 37, budget)
         use([64] * 38 + [320] * 35, 9, budget)
         assert compilations.count == 0
-
-
-def test_a_damaged_row_is_told(tmp_path):
-    images = images_of([30] * 20)
-    with open_store(tmp_path / "s", {}, num_images=20) as store:
-        store.write(dict(enumerate(images)))
-    (tmp_path / "s" / "3-30.npz").write_bytes(b"")
-    slots = Slots(FeatureSet(store, {}), np.arange(20), 0, DEVICE)
-    with pytest.raises(InputError, match="damaged on disk, the first in row 3"):
-        slots.stage(np.arange(10))

@@ -34,8 +34,7 @@ def store_names(tmp_path):
 def test_the_papers_system_runs_and_is_read_from_its_stores_ever_after(evaluate, tmp_path):
     first = evaluate("system=mix_hist_comb_10", *SMALL, out="first")
     assert store_names(tmp_path) == ["D2NetFeatures", "MixVprDescriptor", "matches"]
-    assert "10 of 10 images to do, about 163 features of 512 dimensions each" in first
-    assert "as the paper stores them" in first
+    assert "10 of 10 images to do" in first
     rows = read_rows(tmp_path / "first")
     assert list(dict.fromkeys(row["system"] for row in rows)) == ["retrieval", "histogram", "histogram + retrieval"]
     assert rows[0]["features"]["weights"] == "d2_tf"
@@ -58,7 +57,7 @@ def test_ssm_vpr_runs_on_what_it_learned_from_the_database(evaluate, tmp_path):
     stderr = evaluate("system=ssm_vpr", *SMALL, *more)
     stores = [name for kind in ("SsmCells", "SsmWindows") for name in (kind, f"{kind}-whitening")]
     assert store_names(tmp_path) == [*stores, "matches"]
-    assert "SsmWindows: whitening of 30 dimensions: " in stderr
+    assert "SsmWindows-whitening of 30 dimensions in " in stderr
     rows = read_rows(tmp_path / "out")
     parameters = {row["system"]: row["parameters"] for row in rows}
     assert list(parameters) == ["retrieval", "grid", "grid + retrieval", "grid + frames"]

@@ -53,7 +53,7 @@ def test_images_stay_and_adding_goes_on(tmp_path):
     report = json.loads(process.stdout)
     for line, number, place in report["errors"]:
         assert line.startswith(f"{tmp_path}/disk/map")
-        assert "free disk space, got 0.0 MB; free some space and run again" in line
+        assert line.endswith("the disk is full; free some space and run again, which goes on from here")
         assert "\n" not in line
         assert 2 <= number < 12
         assert place == "0000.png"

@@ -15,7 +15,9 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_image
 from mfvpr.features import VladFitting
+from mfvpr.localization.declaration import read_declaration
 from mfvpr.storage import FeatureCache
+from mfvpr.storage.maps import MapFile
 from tests.builders import map_system
 from tests.storage.extractors import SIFT, Counted
 
@@ -49,7 +51,7 @@ def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(sm
         Map(tmp_path / "map", system)
     known, query = Map.create(tmp_path / "map", small_street / "database", system), small_street / "queries/0003.png"
     assert known.extractor.image_size == (388, 291)
-    assert json.loads((tmp_path / "map/settings.json").read_text())["features"]["image_size"] == [388, 291]
+    assert read_declaration(tmp_path / "map")["features"]["image_size"] == [388, 291]
     prediction = known.localize(query)
     assert prediction.shift is not None
     for again in (Map.open(tmp_path / "map"), Map(tmp_path / "map", system)):
@@ -109,7 +111,7 @@ def test_settings_that_were_removed_are_errors_unless_they_changed_nothing(tmp_p
 
 
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
-    """The scores are those of `system=mfvpr` in 0.2.0; its maps and runs open, since they hold settings."""
+    """The scores are those of `system=mfvpr` in 0.2.0; its runs open, since they hold settings."""
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
     weights = {"fusion.c": "zscore", "fusion.weights": "{retrieval: 0.5, anchor: 1}", "final": "combined"}
     more = {"scorer": "ratio", "retrieval": {"num_words": 8}, "candidates": 5}
@@ -119,8 +121,6 @@ def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
     dataset = mfvpr.datasets.folder(small_street / "database", small_street / "database", ground_truth="none")
     result = mfvpr.evaluate(dataset, system, cache=FeatureCache(tmp_path / "cache"))
     Map.create(tmp_path / "map", dataset.database, fused)
-    declaration = tmp_path / "map" / "settings.json"
-    declaration.write_text(json.dumps(with_scales(json.loads(declaration.read_text()), [1.0])))
     known = Map.open(tmp_path / "map")
     assert system.headline == "histogram + anchor + retrieval"
     [ranked] = result.only.systems[system.headline]
@@ -138,7 +138,7 @@ def test_images_that_a_cache_knows_are_not_described_again(small_street, tmp_pat
     seen = extractor.seen
     known = Map.create(tmp_path / "map", dataset.database, system, cache=cache)
     assert extractor.seen == seen
-    assert not (tmp_path / "map" / "learning").exists()
+    assert [path.name for path in (tmp_path / "map").iterdir() if "sqlite" not in path.name] == []
     plain = Map.create(tmp_path / "plain", dataset.database, map_system(SIFT, VladFitting(num_words=8), candidates=5))
     for path in dataset.queries.paths[:3]:
         assert known.localize(path) == plain.localize(path)
@@ -152,14 +152,13 @@ def test_a_system_of_ones_own_opens_its_map(small_street, tmp_path):
     assert len(Map(tmp_path, system)) == 10
 
 
-@pytest.mark.parametrize(
-    "change", [{"format": "mfvpr map 9"}, {"candidates": 0}, {"features": {"name": "no"}}, {"scorer": 3}]
-)
-def test_damaged_settings_are_named(street, tmp_path, change):
-    content = json.loads((street.folder / "settings.json").read_text())
-    (tmp_path / "settings.json").write_text(json.dumps(content | change))
-    with pytest.raises(InputError, match=str(tmp_path)):
-        Map.open(tmp_path)
+@pytest.mark.parametrize("name", ["0000", "settings.json", "vocabulary.npz"])
+def test_a_map_of_an_earlier_version_is_to_be_built_again(tmp_path, small_street, name):
+    (tmp_path / name).mkdir()
+    for use in (lambda: Map.open(tmp_path), lambda: Map.create(tmp_path, small_street / "database", small("steering"))):
+        with pytest.raises(InputError, match="got one of an earlier version"):
+            use()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_folder_of_something_else_is_refused(small_street):
@@ -215,8 +214,8 @@ def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
     with pytest.warns(UserWarning, match="calibrate on a longer drive"):
         known.calibrate(small_street / "database", small_street / "queries")
-    settings = json.loads((tmp_path / "settings.json").read_text())
+    settings = read_declaration(tmp_path)
     settings["scorer"]["sigma"] = 30.0
-    (tmp_path / "settings.json").write_text(json.dumps(settings))
+    MapFile(tmp_path).write({"system": json.dumps(settings).encode()})
     with pytest.raises(InputError, match="got that of another system"):
         Map.open(tmp_path)

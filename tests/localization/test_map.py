@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -23,11 +22,9 @@ from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.localization import matching as map_matching
-from mfvpr.localization.resident import Resident
 from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
-from mfvpr.storage import maps as map_store
-from mfvpr.storage.map_entries import DEEPEST, check_entry
+from mfvpr.storage.maps import DEEPEST, MapFile, check_entry
 from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
@@ -232,18 +229,6 @@ def test_a_map_goes_on_where_it_was(dataset, tmp_path):
         again.build(dataset.database, [1])
 
 
-def test_segments_follow_each_other(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(map_store, "SEGMENT", 3)
-    known, other = opened(tmp_path / "map"), opened(tmp_path / "map")
-    known.build(dataset.database)
-    other.refresh()
-    assert other.names == known.names == list(dataset.database.names)
-    files = sorted(path.name for path in (tmp_path / "map").iterdir())
-    assert files == ["0000", "0001", "0002", "0003", "lock", "manifest.json", "vocabulary.npz"]
-    for row, path in enumerate(dataset.database.paths):
-        assert other.localize(path).alternatives[0].row == row
-
-
 @pytest.mark.parametrize(("extractor", "describer", "difference"), [
     (replace(SIFT, image_size=(120, 120)), VLAD, "recipe.extractor.image_size[0]=160, expected 120"),
     (replace(SIFT, max_keypoints=50), VLAD, "recipe.extractor.max_keypoints=60, expected 50"),
@@ -257,91 +242,34 @@ def test_a_map_of_other_settings_is_refused(folder, extractor, describer, differ
     assert "delete" not in str(error.value)
 
 
-def test_a_vocabulary_that_is_damaged_or_gone_is_to_be_put_back(dataset, folder, tmp_path):
-    shutil.copytree(folder, tmp_path / "map")
-    path = tmp_path / "map/vocabulary.npz"
-    content = path.read_bytes()
-    for damage in (lambda: path.write_bytes(content[:-50]), path.unlink):
-        damage()
-        with pytest.raises(InputError, match=r"vocabulary\.npz: expected the vocabulary .*back") as error:
-            opened(tmp_path / "map")
-        assert "delete" not in str(error.value)
-    path.write_bytes(content)
-    assert opened(tmp_path / "map").names == list(dataset.database.names)
-
-
-def test_rows_of_another_vocabulary_are_refused(dataset, folder, tmp_path):
-    """Both maps have the same settings, but vocabularies that were learned from other images."""
-    shutil.copytree(folder, tmp_path / "map")
-    Map(tmp_path / "other", map_system(SIFT, VLAD)).learn(dataset.sequences[0].images)
-    shutil.copy(tmp_path / "other/vocabulary.npz", tmp_path / "map")
-    with pytest.raises(InputError, match=r"recipe\.describer\.centers"):
-        opened(tmp_path / "map")
-
-
-@pytest.mark.parametrize("part", ["entries", "features"])
-def test_damaged_rows_are_told_and_stay(dataset, folder, tmp_path, part):
-    shutil.copytree(folder, tmp_path / "map")
-    [path] = (tmp_path / f"map/0000/{part}").glob("8-*.npz")
-    content = path.read_bytes()
-    path.write_bytes(content[:-50])
-    for _ in range(2):
-        with pytest.raises(InputError, match="damaged on disk, the first in row 8"):
-            opened(tmp_path / "map", candidates=2).localize(dataset.database.paths[8])
-    path.write_bytes(content)
-    assert opened(tmp_path / "map").localize(dataset.database.paths[8]).place == 8
-
-
-class Unsteady:
-    """Rows of one keypoint that says which; those that are bad cannot be read."""
-
-    bad = ()
-
-    def counts(self, rows):
-        return np.ones(len(rows), int)
-
-    def features(self, rows):
-        for row in rows:
-            if row in self.bad:
-                raise InputError(f"row {row}")
-            point, ones = np.full((1, 2), row, np.float32), np.ones(4, np.float32)
-            yield row, Features(point, ones[None], point[:, 0], np.ones(1, bool), ones[:2])
-
-
-@pytest.mark.parametrize("memory", [None, 120e-9])  # of three rows
-def test_rows_that_cannot_be_read_do_not_change_other_rows(memory):
-    rows = Unsteady()
-    resident = Resident(rows, memory)
-    resident.read([0, 1])
-    rows.bad = (2,)
-    with pytest.raises(InputError, match="row 2"):
-        resident.read([3, 2])
-    for wanted in ([3, 1], [0, 3], [0, 1, 3, 4]):
-        assert [features.scores[0] for features in resident.read(wanted)] == wanted
-
-
-def test_the_least_recently_used_features_make_room():
-    rows, read = Unsteady(), []
-    resident, features = Resident(rows, 120e-9), rows.features  # three rows of 37 bytes
-    rows.features = lambda wanted: (read.extend(wanted), features(wanted))[1]
-    for wanted in ([0, 1, 2], [0, 3], [0], [1], [2, 3]):
-        resident.read(wanted)
+def test_the_least_recently_used_features_make_room(folder, monkeypatch):
+    read, features = [], MapFile.features
+    known = opened(folder)
+    monkeypatch.setattr(MapFile, "features", lambda self, rows: (read.extend(rows), features(self, rows))[1])
+    known._free_bytes = 3.5 * sum(leaf.nbytes for leaf in jax.tree.leaves(known._read_features([0])[0]))
+    known._features.clear()
+    read.clear()
+    for rows in ([0, 1, 2], [0, 3], [0], [1], [2, 3]):
+        assert [len(each.scores) for each in known._read_features(rows)] == [60] * len(rows)
     assert read == [0, 1, 2, 3, 1, 2]
 
 
-def test_a_row_that_is_added_while_its_segment_is_opened_comes_whole_or_later(dataset, folder, tmp_path, monkeypatch):
-    shutil.copytree(folder, tmp_path / "map")
-    adding, number, open_entry_store = opened(tmp_path / "map"), len(dataset.database), map_store.open_entry_store
+def test_rows_that_cannot_be_read_do_not_change_other_rows(dataset, folder, monkeypatch):
+    known, features = opened(folder), MapFile.features
 
-    def add_and_open(*arguments, **options):
-        monkeypatch.undo()
-        adding.add(dataset.queries.paths[0], "new", name="new")
-        return open_entry_store(*arguments, **options)
+    def fail_at_2(self, rows):
+        for row in rows:
+            if row == 2:
+                raise InputError("row 2")
+            yield from features(self, [row])
 
-    monkeypatch.setattr(map_store, "open_entry_store", add_and_open)
-    other = opened(tmp_path / "map")
-    assert len(other) == number
-    assert other.localize(dataset.queries.paths[0]).place == "new"
+    monkeypatch.setattr(MapFile, "features", fail_at_2)
+    with pytest.raises(InputError, match="row 2"):
+        known._read_features([3, 2])
+    monkeypatch.undo()
+    for rows in ([3, 1], [0, 3], [0, 1, 2, 3]):
+        for row, read in zip(rows, known._read_features(rows), strict=True):
+            np.testing.assert_array_equal(read.scores, next(MapFile(folder).features([row]))[1].scores)
 
 
 @pytest.mark.parametrize(
@@ -400,7 +328,7 @@ def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
     first, second = opened(tmp_path / "map"), opened(tmp_path / "map")
     first.learn(dataset.database)
     second.refresh()
-    with map_store.lock_map(first.folder), pytest.raises(InputError, match="in use by process"):
+    with MapFile(first.folder).lock(), pytest.raises(InputError, match="another process adds images"):
         second.add(dataset.database.paths[0], 0)
     second.add(dataset.database.paths[0], 0)
     assert first.localize(dataset.database.paths[0]).place == 0
@@ -445,6 +373,7 @@ def test_images_may_be_what_numpy_converts(dataset, folder):
 class Constant:
     """Both features and a global descriptor, of few pixels."""
 
+    recipe = "constant"
     image_size: tuple[int, int] = (16, 12)
     interpolation: str = "pil_bilinear"
     batch_size: int = 4

@@ -20,7 +20,7 @@ from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
 from mfvpr.localization.declaration import read_declaration
-from mfvpr.storage.maps import lock_map
+from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
@@ -174,7 +174,7 @@ def test_an_image_that_cannot_be_read_stops_no_other(folder, small_street, queri
 @pytest.mark.parametrize(("arguments", "words"), [
     (["map=/no/such", "images=/no"], "/no/such: expected a folder with a map, got none"),
     (["map=MAP", "images=/no"], "images=/no: expected an image"),
-    (["map=MAP", "images=MAP/settings.json", "watch=true"], "watch=true: expected images=DIR, one folder"),
+    (["map=MAP", "images=MAP/map.sqlite", "watch=true"], "watch=true: expected images=DIR, one folder"),
     (["map=MAP", "images=MAP", "figures=3"], "figures=3: expected out=DIR"),
     (["map=MAP", "images=MAP", "figures=1", "out=MAP/figures", "root=/no"], "root=/no: expected the folder of the map"),
 ])  # fmt: skip
@@ -367,15 +367,15 @@ def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
 
 
 def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
-    with lock_map(folder):
+    with MapFile(folder).lock():
         lines, stderr = localize(twice, "add=true", code=2)
     assert [(line["image"], "added" in line) for line in lines] == [(f"{twice}/00.png", False)]
-    assert "in use by process" in stderr
+    assert "another process adds images" in stderr
     assert stderr.count("\n") == 1
 
 
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):
-    settings = json.loads((folder / "settings.json").read_text())
+    settings = read_declaration(folder)
     for candidates, absent in ((settings["candidates"], 0), (settings["candidates"] + 1, 7)):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {

@@ -8,10 +8,10 @@ import pytest
 from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.system import noise_image
 from mfvpr.features import Description
-from mfvpr.localization import Map, Prediction
-from mfvpr.localization.strength import MapStrength
+from mfvpr.localization import Map, Prediction, map_images
+from mfvpr.storage.maps import MapFile
 from tests.builders import map_system
-from tests.localization.test_map import SURE, Constant, Unsteady, opened
+from tests.localization.test_map import SURE, Constant, opened
 
 pytestmark = pytest.mark.thorough
 
@@ -48,17 +48,14 @@ def test_noise_has_no_place_whatever_the_confidence(folder, grain):
     assert prediction == without_place("no better than noise", image)
 
 
-def test_the_strength_of_a_map_is_of_a_few_of_its_rows():
-    rows, read = Unsteady(), []
-    mean = MapStrength(rows)
-    rows.features = lambda wanted: (read.extend(wanted), Unsteady().features(wanted))[1]
-    assert mean(0) == 0
-    assert mean(50) == np.mean(range(50))
-    assert mean(1000) == np.mean(range(0, 1000, 16))
+def test_the_strength_of_a_map_is_of_a_few_of_its_rows(folder, monkeypatch):
+    known, read = opened(folder), []
+    monkeypatch.setattr(MapFile, "features", lambda _, rows: (read.extend(rows), ((row, row) for row in rows))[1])
+    monkeypatch.setattr(map_images, "strength", float)
+    assert known._mean_strength(0) == 0
+    assert known._mean_strength(50) == np.mean(range(50))
+    assert known._mean_strength(1000) == np.mean(range(0, 1000, 16))
     assert len(read) == len({*read}) < 110
-    count, rows.counts = len(read), lambda wanted: np.where(np.array(wanted) == 16, -1, 1)
-    assert mean(1000) == np.mean([0, *range(32, 1000, 16)])  # a row that was damaged, and is gone
-    assert len(read) == count
 
 
 @dataclass(frozen=True)

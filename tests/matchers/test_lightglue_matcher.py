@@ -14,7 +14,7 @@ from mfvpr.evaluation import Pipeline, stages
 from mfvpr.features import FeatureSet, Scale, Sift
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.retrieval import ShortlistFiles
-from mfvpr.storage.matches import open_match_store
+from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils import ragged, recipe_of
 from tests.builders import make_shortlist, stack
 from tests.golden.make_lightglue import SIZES, SMALL, pair
@@ -121,8 +121,7 @@ SHORTLIST = make_shortlist([[0, 2], [1, 0], [-1, -1], [0, 1]])
 def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
     queries, database = sets()
     in_memory = stages.match(queries, database, SHORTLIST, matcher())
-    with open_match_store(tmp_path / "m", {"of": "any"}, num_queries=4, num_candidates=2) as store:
-        stored = stages.match(queries, database, SHORTLIST, matcher(), store=store)
+    stored = stages.match(queries, database, SHORTLIST, matcher(), store=MatchStore(tmp_path, {"of": "any"}, 4))
     for match_set in (in_memory, stored):
         assert match_set.counts[:2].all()
         assert not match_set.counts[2:].any()

@@ -30,6 +30,8 @@ class Counted:
 class Mean:
     """A global descriptor: the mean color, of unit length."""
 
+    recipe = "mean color"
+
     image_size, interpolation, batch_size, vector_size, scales = (16, 16), "pil_bilinear", 4, 3, ()
 
     def __call__(self, images):

@@ -1,33 +1,18 @@
-"""Small stores of features and of matches, for tests."""
+"""Small features and matches, and damage to files, for tests."""
 
 import hashlib
 import itertools
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import pytest
 
 from mfvpr import Features, Matches
 from mfvpr.matchers import MatchSet
-from mfvpr.storage import manifest as store_manifest
-from mfvpr.storage.features import open_store, round_as_stored
-from mfvpr.storage.matches import QueryMatches, open_match_store
+from mfvpr.matchers.match_set import QueryMatches
 from tests.builders import make_features
-
-ROOT = Path(__file__).parents[2]
-RECIPE = {
-    "weights": {"sha256": "ab" * 32},
-    "extractor": {"name": "d2net", "max_keypoints": 800, "image_size": (336, 336), "sigma": 1.6},
-    "images": [{"name": f"{row}.png", "sha256": f"{row:064x}"} for row in range(3)],
-}
-MATCH_RECIPE = {"features": "0123", "shortlist": {"name": "mixvpr", "candidates": 4}, "cross_check": "mutual"}
 
 
 def features_of(row: int, count: int = 40, dimension: int = 16) -> Features:
@@ -85,50 +70,6 @@ def matches_of(row: int, counts: tuple[int, ...] = (30, 0, 25, 5), **more: Any) 
     return QueryMatches(Matches(**flat | more), np.array(counts, np.int32), indices, numbers(len(counts)))
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A kind of store, for tests of what all kinds have in common."""
-
-    open: Callable[[Path, int], AbstractContextManager[Any]]
-    row_of: Callable[..., Any]
-    round_as_stored: Callable[[Any], Any]
-    kind: store_manifest.Kind
-
-
-FEATURES = Subject(
-    lambda folder, rows: open_store(folder, RECIPE, num_images=rows),
-    features_of,
-    round_as_stored,
-    store_manifest.FEATURES,
-)
-MATCHES = Subject(
-    lambda folder, rows: open_match_store(folder, MATCH_RECIPE, num_queries=rows, num_candidates=4),
-    matches_of,
-    lambda row: row,
-    store_manifest.MATCHES,
-)
-of_both_kinds = pytest.mark.parametrize("subject", [FEATURES, MATCHES], ids=["features", "matches"])
-
-
-def fill(folder: Path, num_rows: int = 3, batch: int = 2, subject: Subject = FEATURES) -> list[int]:
-    """Do what is not done; the rows that were not."""
-    with subject.open(folder, num_rows) as store:
-        todo = np.flatnonzero(~store.done).tolist()
-        for start in range(0, len(todo), batch):
-            store.write({row: subject.row_of(row) for row in todo[start : start + batch]})
-    return todo
-
-
-def read_all(folder: Path, num_rows: int = 3, subject: Subject = FEATURES) -> dict[int, Any]:
-    with subject.open(folder, num_rows) as store:
-        return dict(store.read())
-
-
-def file_of(folder: Path, row: int = 1) -> Path:
-    [path] = folder.glob(f"{row}-*.npz")
-    return path
-
-
 def flip(path: Path, position: int) -> None:
     content = bytearray(path.read_bytes())
     content[position] ^= 1 << position % 8
@@ -142,19 +83,10 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
     "flipped": lambda path: flip(path, path.stat().st_size // 2),
     "gone": lambda path: path.unlink(),
-    "another's": lambda path: path.write_bytes(file_of(path.parent, 0).read_bytes()),
 }
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file but the lock; leftovers would be seen."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+    """SHA-256 of every file; leftovers would be seen."""
+    files = (path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def run_here(call: str, *, prefix: tuple[str, ...] = ()) -> str:
-    """Standard output of a call of test_faults' functions in a process of its own."""
-    command = [*prefix, sys.executable, "-c", f"from tests.storage.test_faults import *; {call}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done.stdout

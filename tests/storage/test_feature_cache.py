@@ -12,12 +12,11 @@ from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.image_reading import resize
 from mfvpr.features import Aggregated, Description, VladFitting
-from mfvpr.storage import FeatureCache, extraction, recipes
-from mfvpr.storage.features import forecast_bytes, forecast_vector_bytes
+from mfvpr.storage import FeatureCache, feature_cache, recipes
 from mfvpr.storage.recipes import Recipes
 from mfvpr.utils import InputError
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
-from tests.storage.synthetic_features import assert_same
+from tests.storage.synthetic_features import DAMAGE, assert_same
 
 pytestmark = pytest.mark.thorough
 
@@ -67,6 +66,7 @@ def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path,
 class Fewer:
     """SIFT's first features, as many as somebody may change at any time."""
 
+    recipe = "fewer"
     number: int
     image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, SIFT.batch_size
     vector_size, scales = SIFT.vector_size, SIFT.scales
@@ -245,8 +245,7 @@ def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_pat
         FeatureCache(tmp_path / "s", runtime=Runtime(log=lines.append)).local(images, extractor, label=label)
     assert extractor.seen == len(folder)
     [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
-    assert lines[0].startswith("summer features: 10 of 10 images to do, about 60 features of 128 dimensions each: ")
-    assert lines[2] == f"winter features: all 10 images from {path}"
+    assert lines == [f"summer features: 10 of 10 images to do in {path}"]
 
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):
@@ -259,24 +258,51 @@ def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path)
         np.testing.assert_allclose(cache.vectors(images, describer, folder).values, vlad(all_of(features)), atol=1e-6)
 
 
-@pytest.mark.parametrize(("images", "features", "paper", "readme"), [(220, 686, 304, 155), (1415, 681, 1942, 989)])
-def test_the_papers_databases_take_about_half(images, features, paper, readme):
-    ours = (forecast_bytes(images, features, 512) + forecast_vector_bytes(images, 4096)) / 2**20
-    assert ours <= 0.55 * paper
-    assert round(ours) == readme
+def test_a_damaged_file_is_made_again_with_a_warning(folder, tmp_path):
+    lines, extractor = [], Counted()
+    [before] = FeatureCache(tmp_path).local(folder, extractor)
+    [path] = (tmp_path / "Counted-0").parent.glob(f"Counted-*/*/{before.source.descriptions.keys[3][2:]}.npz")
+    DAMAGE["flipped"](path)
+    [again] = FeatureCache(tmp_path, runtime=Runtime(log=lines.append)).local(folder, extractor)
+    assert lines[0] == f"warning: {path}: is damaged; made again"
+    assert extractor.seen == len(folder) + 1
+    assert_same_features(again, before)
+
+
+def test_what_has_no_recipe_is_kept_in_memory_alone_which_is_said_once(folder, tmp_path):
+    extractor, lines = Counted(), []
+    del extractor.recipe
+    cache = FeatureCache(tmp_path, runtime=Runtime(log=lines.append))
+    for _ in range(2):
+        [features] = cache.local(folder, extractor)
+    assert extractor.seen == len(folder)
+    assert [line for line in lines if "warning" in line] == [
+        "warning: Counted names no `recipe`: what it makes is not kept on disk"
+    ]
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["contents"])
+    assert_same(features[0], FeatureCache().local(folder, SIFT)[0][0])
+
+
+def test_files_of_earlier_versions_are_left_alone(folder, tmp_path):
+    (tmp_path / "Sift-0").mkdir()
+    (tmp_path / "Sift-0/manifest.json").write_text("{}")
+    lines = []
+    FeatureCache(tmp_path, runtime=Runtime(log=lines.append)).local(folder, SIFT)
+    assert lines[0].startswith(f"warning: {tmp_path}: has files of an earlier version, which are not used")
+    assert [path.name for path in (tmp_path / "Sift-0").iterdir()] == ["manifest.json"]
 
 
 def test_an_image_that_changes_while_it_is_described_is_refused(folder, tmp_path, monkeypatch):
     """Otherwise its features would be those of the content that it had before."""
     root = tmp_path / "images"
     shutil.copytree(folder.root, root)
-    copied, plain = image_folder(root), extraction.describe_folder
+    copied, plain = image_folder(root), feature_cache.describe_folder
 
     def describe(*arguments, **options):
         shutil.copy(root / "0001.png", root / "0005.png")
         yield from plain(*arguments, **options)
 
-    monkeypatch.setattr(extraction, "describe_folder", describe)
+    monkeypatch.setattr(feature_cache, "describe_folder", describe)
     with pytest.raises(InputError, match=r"0005\.png: changed while it was described"):
         FeatureCache(tmp_path / "s").local(copied, SIFT)
     monkeypatch.undo()

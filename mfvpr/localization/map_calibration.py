@@ -1,8 +1,9 @@
-"""The confidence of a map: fitted on a drive whose places are known, and kept in the folder of the map."""
+"""The confidence of a map: fitted on a drive whose places are known, and kept in the file of the map."""
 
+import json
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,18 +15,17 @@ from mfvpr.evaluation.confidence_calibration import (
     CalibrationData,
     absent_rankings,
     calibration_data,
-    read_confidences,
-    write_confidences,
+    confidence_from_json,
 )
 from mfvpr.evaluation.dataset_ranking import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.system import System
 from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.storage.maps import MapFile
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
-_FILE = "confidence.json"
 _USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
 _LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
 
@@ -76,28 +76,37 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     return confidence, data
 
 
-def write_confidence(folder: Path, system: System, confidence: Confidence, data: CalibrationData) -> None:
-    """Keep the confidence of the ranking that decides in the folder of a map."""
-    origin = {"system": _fingerprint(system), "queries": len(data.correct), "absent_queries": data.num_absent}
-    write_confidences(folder / _FILE, {system.headline: confidence}, origin)
+def write_confidence(
+    file: MapFile, parts: Mapping[str, bytes], system: System, confidence: Confidence, data: CalibrationData
+) -> None:
+    """Keep the confidence of the ranking that decides in a map, whose other `parts` are written first."""
+    try:
+        made = _fingerprint(system)
+    except TypeError as error:
+        warnings.warn(f"{error}: the confidence is not kept on disk", stacklevel=3)
+        return
+    content = {"system": made, "queries": len(data.correct), "absent_queries": data.num_absent}
+    content["confidence"] = vars(confidence)
+    file.write({**parts, "confidence": json.dumps(content).encode()})
 
 
-def read_confidence(folder: Path, system: System) -> Confidence | None:
+def read_confidence(file: MapFile, system: System) -> Confidence | None:
     """The confidence of a map, None if it was never calibrated; an InputError if it is of another system."""
-    if not (folder / _FILE).exists():
+    if (part := file.part("confidence")) is None:
         return None
-    confidences, origin = read_confidences(folder / _FILE)
-    if system.headline not in confidences or origin.get("system") != _fingerprint(system):
-        raise InputError(f"{folder / _FILE}: expected the confidence of this map's system, got that of another "
-                         "system or version; remove the file, then calibrate again")  # fmt: skip
-    return confidences[system.headline]
+    content = json.loads(part)
+    try:
+        made = _fingerprint(system)
+    except TypeError:
+        made = None
+    if content["system"] != made:
+        raise InputError(f"{file.folder}: expected the confidence of this map's system, got that of another system or "
+                         "version; calibrate again")  # fmt: skip
+    return confidence_from_json(content["confidence"])
 
 
-def _fingerprint(system: System) -> str | None:
-    """A hash of everything that scores depend on; None if a part has no recipe."""
+def _fingerprint(system: System) -> str:
+    """A hash of everything that scores depend on; a TypeError if a part has no recipe."""
     pipeline = system.pipeline
     parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
-    try:
-        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
-    except TypeError:
-        return None
+    return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))

@@ -1,0 +1,209 @@
+"""Files of a cache: what comes back, kills, damage and full disks."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mfvpr import InputError, Matches
+from mfvpr.core.types import per_match, per_pair
+from mfvpr.storage.cache_files import CacheFiles
+from mfvpr.storage.match_files import MatchStore
+from mfvpr.storage.packing import pack_features, pack_matches, round_as_stored, unpack_features, unpack_matches
+from mfvpr.utils.fingerprints import fingerprint
+from tests.builders import make_features
+from tests.programs import ROOT
+from tests.small_disks import UNSHARE, mount, need_small_disks
+from tests.storage.synthetic_features import DAMAGE, assert_same, digests, features_of, matches_of
+
+pytestmark = pytest.mark.thorough
+
+KEYS = [fingerprint(row) * 2 for row in range(60)]
+
+
+def opened(root, recipe=1):
+    return CacheFiles(Path(root), "Sift", {"number": recipe}, pack_features, unpack_features)
+
+
+# What comes back
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 2500])
+def test_all_but_the_descriptors_is_exact(count):
+    original = features_of(7, count)
+    features = unpack_features(pack_features(original))
+    for name in ("keypoints", "scores", "mask", "image_size"):
+        np.testing.assert_array_equal(getattr(features, name), getattr(original, name))
+    assert {getattr(features, part.name).dtype.name for part in fields(features)} == {"float32", "bool"}
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=2e-7)
+    assert np.linalg.norm(features.descriptors - original.descriptors, axis=1).max(initial=0) < 5e-4
+
+
+def test_descriptors_keep_their_length():
+    """A projected descriptor need not be of unit length; float16 alone would lose or overflow the last of these."""
+    lengths = np.array([1, 6.3, 0.1, 1e-9, 70000, 1e12], np.float32)
+    original = features_of(0, len(lengths))
+    original.descriptors[:] *= lengths[:, None]
+    features = round_as_stored(original)
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), lengths, rtol=3e-7)
+    assert (np.linalg.norm(features.descriptors - original.descriptors, axis=1) < 5e-4 * lengths).all()
+
+
+def test_zero_descriptors_stay_zero_and_padding_is_left_out():
+    padded = make_features(np.random.default_rng(0), 5, capacity=9)
+    padded.descriptors[2] = 0
+    features = round_as_stored(padded)
+    assert features.mask.shape == (5,)
+    np.testing.assert_array_equal(features.descriptors[2], 0)
+
+
+@pytest.mark.parametrize("name", ["keypoints", "descriptors", "scores", "image_size"])
+def test_features_that_are_not_finite_are_refused(name):
+    features = features_of(0)
+    getattr(features, name).flat[1] = np.nan
+    with pytest.raises(ValueError, match="must be finite"):
+        pack_features(features)
+
+
+def with_all(row, counts=(30, 0, 25, 5)):
+    """Every field that Matches may have, those that it will gain included."""
+    rng, present = np.random.default_rng(row), {*per_match(matches_of(row).matches), *per_pair(matches_of(row).matches)}
+    optional = [part.name for part in fields(Matches) if part.default is None and part.name not in present]
+    return matches_of(row, counts, **{name: rng.random(sum(counts), np.float32) for name in optional})
+
+
+@pytest.mark.parametrize("counts", [(30, 0, 25, 5), (0, 0, 0, 0), (16_000, 9000, 0, 16_000)])
+@pytest.mark.parametrize("make", [matches_of, with_all])
+def test_matches_come_back_to_the_bit(tmp_path, make, counts):
+    """Also infinities, NaN, denormal numbers and both zeros."""
+    original = make(7, counts)
+    special = np.resize(np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1e-45], np.float32), sum(counts))
+    original = replace(original, matches=replace(original.matches, distance=special))
+    MatchStore(tmp_path, {"of": "any"}, 3).write({1: original})
+    (_, missing), (row, got) = MatchStore(tmp_path, {"of": "any"}, 3).read([0, 1])
+    assert (missing, row) == (None, 1)
+    assert_same(got, original)
+    assert_same(unpack_matches(pack_matches(original)), original)
+
+
+# Files
+
+
+def test_files_are_named_by_recipe_and_key(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    files = opened("ünï code/s @1%20?#|")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    files.update({KEYS[0]: features_of(0)})
+    assert KEYS[0] in files
+    assert KEYS[1] not in files
+    assert_same(files.get(KEYS[0]), round_as_stored(features_of(0)))
+    path = tmp_path / "ünï code/s @1%20?#|" / files.folder.name / KEYS[0][:2] / f"{KEYS[0][2:]}.npz"
+    assert files.path(KEYS[0]) == path
+    with np.load(path) as archive:
+        np.testing.assert_array_equal(archive["keypoints"], features_of(0).keypoints)
+    assert json.loads((files.folder / "recipe.json").read_text())["recipe"] == {"number": 1}
+    assert opened(tmp_path, recipe=2).folder.name != files.folder.name
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_file_is_none_and_is_made_again(tmp_path, damage):
+    files = opened(tmp_path)
+    files.update({key: features_of(row) for row, key in enumerate(KEYS[:3])})
+    before = digests(tmp_path)
+    DAMAGE[damage](files.path(KEYS[1]))
+    assert [files.get(key) is None for key in KEYS[:3]] == [False, True, False]
+    assert (KEYS[1] in files) == (damage != "gone")
+    files.update({KEYS[1]: features_of(1)})
+    assert digests(tmp_path) == before
+
+
+def test_files_that_were_exchanged_are_noticed(tmp_path):
+    files, other = opened(tmp_path), opened(tmp_path, recipe=2)
+    for each in (files, other):
+        each.update({key: features_of(row) for row, key in enumerate(KEYS[:2])})
+    shutil.copy(files.path(KEYS[0]), files.path(KEYS[1]))
+    assert files.get(KEYS[1]) is None
+    shutil.copy(other.path(KEYS[1]), files.path(KEYS[1]))
+    assert files.get(KEYS[1]) is None
+
+
+def make(root):
+    """A process that makes the files that are not there, in batches."""
+    files = opened(root)
+    missing = [row for row, key in enumerate(KEYS) if files.get(key) is None]
+    for start in range(0, len(missing), 4):
+        files.update({KEYS[row]: features_of(row, 200, 64) for row in missing[start : start + 4]})
+
+
+def kill_rounds(root, rounds):
+    """Kill processes that write at random times, finish their work, and print what happened. Forks, to save imports."""
+    rng, killed = np.random.default_rng(0), 0
+    make(f"{root}/whole")
+    expected = digests(Path(root, "whole"))
+    while killed < rounds:
+        shutil.rmtree(f"{root}/killed", ignore_errors=True)
+        for _ in range(4):
+            if (child := os.fork()) == 0:
+                make(f"{root}/killed")
+                os._exit(0)
+            time.sleep(rng.uniform(0.005, 0.08))
+            os.kill(child, signal.SIGKILL)
+            killed += os.waitpid(child, 0)[1] == signal.SIGKILL
+            now = digests(Path(root, "killed")) if Path(root, "killed").exists() else {}
+            assert {(name, digest) for name, digest in now.items() if "/." not in name} <= {*expected.items()}
+        make(f"{root}/killed")
+        assert {*expected.items()} <= {*digests(Path(root, "killed")).items()}
+    print(killed)
+
+
+def run_here(call, *, prefix=()):
+    """Standard output of a call of these functions in a process of its own."""
+    command = [*prefix, sys.executable, "-c", f"from tests.storage.test_cache_files import *; {call}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_killed_processes_leave_whole_files(tmp_path):
+    assert int(run_here(f"kill_rounds({str(tmp_path)!r}, 40)")) >= 40
+
+
+def fill_disk(root):
+    """Write on a disk of 3 MB, which then grows. Prints messages and rows."""
+    disk, files = Path(root), opened(f"{root}/s")
+    mount(disk, "-o", "size=3m")
+    report = {}
+    for turn in ("first", "second"):
+        with pytest.raises(InputError) as error:
+            files.update({key: features_of(row, 700, 256) for row, key in enumerate(KEYS[:12])})
+        report[turn] = str(error.value)
+    report["whole"] = [row for row, key in enumerate(KEYS[:12]) if files.get(key) is not None]
+    mount(disk, "-o", "remount,size=12m")
+    files.update({key: features_of(row, 700, 256) for row, key in enumerate(KEYS[:12])})
+    mount(disk, "-o", "remount,ro")
+    report["read"] = [row for row, key in enumerate(KEYS[:12]) if files.get(key) is not None]
+    with pytest.raises(InputError) as error:
+        files.update({KEYS[12]: features_of(12)})
+    report["read only"] = str(error.value)
+    print(json.dumps(report))
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
+    need_small_disks(tmp_path)
+    report = json.loads(run_here(f"fill_disk({str(tmp_path)!r})", prefix=UNSHARE))
+    for turn in ("first", "second"):
+        assert report[turn].startswith(f"{tmp_path}/s/Sift-")
+        assert report[turn].endswith("the disk is full; free some space and run again, which goes on from here")
+    assert 3 <= len(report["whole"]) < 12
+    assert report["read"] == [*range(12)]
+    assert "cannot be used (Read-only file system)" in report["read only"]
