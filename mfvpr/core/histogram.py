@@ -105,18 +105,13 @@ class HistogramOfShifts:
         self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
     ) -> Float[jax.Array, " weightings"]:
         """The (smooth) maximum over bins of one pair for each weighting of its matches (0 on padding)."""
-        votes_x, votes_y, inside = bins.votes(0, shifts), bins.votes(1, shifts), bins.inside
-
-        def maximum(weights: Float[Array, " slots"]) -> Float[Array, ""]:
-            scores = bin_scores(votes_x, votes_y, weights)
-            if self.temperature is None:
-                return jnp.max(scores)  # without `inside`: bins beyond the last only repeat it
-            return smooth_maximum(scores, inside, temperature=positive(self.temperature, scores.dtype))
-
-        if len(weights) == 1:
-            return maximum(weights[0])[None]
-        # One after the other they stay in the cache of a CPU; an accelerator needs long operations.
-        return jax.lax.platform_dependent(weights, cpu=partial(jax.lax.map, maximum), default=jax.vmap(maximum))
+        votes_x, votes_y = bins.votes(0, shifts), bins.votes(1, shifts)
+        rows = (weights[:, None] * votes_y[None]).reshape(len(weights) * len(votes_y), weights.shape[1])
+        scores = bin_scores(votes_x, rows).reshape(len(weights), len(votes_y), len(votes_x))
+        if self.temperature is None:
+            return jnp.max(scores, axis=(1, 2))  # of all: bins beyond the last only repeat it
+        smooth = partial(smooth_maximum, mask=bins.inside, temperature=positive(self.temperature, scores.dtype))
+        return jax.vmap(smooth)(scores)
 
     def score_weightings(
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
@@ -244,7 +239,7 @@ class HistogramOfShifts:
     def _vote(self, matches: Matches) -> tuple[Float[Array, "bins bins"], "_Bins", Bool[Array, ""]]:
         """Scores of the bins (y, x), -inf out of range; the bins; whether they are usable."""
         bins, shifts, weights = self._bins(matches), self._shifts(matches), match_weights(self.weight, matches)
-        scores = bin_scores(bins.votes(0, shifts), bins.votes(1, shifts), weights)
+        scores = bin_scores(bins.votes(0, shifts), bins.votes(1, shifts) * weights[None])
         usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights))
         return jnp.where(bins.inside, scores, -jnp.inf), bins, usable
 
@@ -299,11 +294,9 @@ class _Bins:
         return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
 
 
-def bin_scores(
-    votes_x: Float[Array, "bins slots"], votes_y: Float[Array, "bins slots"], weights: Float[Array, " slots"]
-) -> Float[Array, "bins bins"]:
-    """(y, x) s_ij of equation 1: weighted sums of the votes."""
-    return jnp.matmul(votes_y * weights[None], votes_x.T, precision=jax.lax.Precision.HIGHEST)
+def bin_scores(votes_x: Float[Array, "bins slots"], weighted_votes_y: Float[Array, "rows slots"]) -> Array:
+    """s_ij of equation 1, (y, x): weighted sums of the votes."""
+    return jnp.matmul(weighted_votes_y, votes_x.T, precision=jax.lax.Precision.HIGHEST)
 
 
 def smooth_maximum(

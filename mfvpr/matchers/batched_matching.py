@@ -89,7 +89,6 @@ def match_queries(
     match = partial(match_pairs, matcher=matcher)
     if holds_function(matcher):  # or it would be compiled for every call; the program goes with the last query
         match = jax.jit(match)
-    # Shapes follow from all queries, not from `todo`: a run that is continued must have the bits of a single run.
     database_rows, budget = np.unique(indices), memory_budget(memory, devices)
     database_rows = database_rows[database_rows >= 0]
     sides = {

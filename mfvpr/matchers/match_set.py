@@ -164,7 +164,7 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
-    """Pairs per batch, by slots, for any number of pairs: larger sets have scores with the same bits."""
+    """Pairs per batch, by slots, for any number of pairs."""
     sizes = np.unique(slots(match_set, settings=settings)).tolist()
     return {size: round_up(BATCH_SLOTS // size, PAIRS_STEP) for size in sizes}
 

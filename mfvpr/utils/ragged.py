@@ -1,15 +1,11 @@
 """Ragged rows, on the host arrays by name <-> padded arrays of few shapes and a mask, for compiled functions."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
 Row = Mapping[str, np.ndarray]  # [n, ...] by name
-Tree = TypeVar("Tree")
 
 
 def pad_rows(
@@ -72,8 +68,3 @@ def smallest_capacities(
 def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np.ndarray, " _ *rest"]:
     """`values`, at least one, with the last entry repeated up to `total` entries."""
     return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
-
-
-def at_least_one_row(tree: Tree) -> Tree:
-    """Arrays `[n, ...]`; those with n = 0 become one entry of zeros, which can be indexed. Traced or not."""
-    return jax.tree.map(lambda leaf: leaf if len(leaf) else jnp.zeros((1, *leaf.shape[1:]), leaf.dtype), tree)

@@ -333,26 +333,3 @@ def test_image_sizes_are_all_combinations():
         (4, 9, 7, 8),
     }
     assert len(sizes0) == 4
-
-
-@pytest.mark.optimized
-def test_some_queries_are_matched_as_all_of_them():
-    """To the bit: where the others have more keypoints, so that shapes would be other ones without them."""
-    rng = np.random.default_rng(3)
-    queries = FeatureSet.of([make_features(rng, count) for count in (20, 200, 150)])
-    database = FeatureSet.of([make_features(rng, count) for count in (30, 25, 300, 220)])
-    listed = make_shortlist([[0, 1], [2, 3], [3, 2]])
-    options = {"matcher": NearestNeighborMatcher(), "memory": None, "devices": jax.local_devices()[:1]}
-    sizes, call = [], batched.match_pairs
-
-    def counted(first, second, *rest, **more):
-        sizes.append((first.mask.shape[1], second.mask.shape[1]))
-        return call(first, second, *rest, **more)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batched, "match_pairs", counted)
-        together = dict(batched.match_queries(queries, database, listed, [0, 1, 2], **options))
-        of_all, sizes[:] = {*sizes}, []
-        alone = dict(batched.match_queries(queries, database, listed, [0], **options))
-    assert {*sizes} < of_all
-    jax.tree.map(np.testing.assert_array_equal, alone[0].matches, together[0].matches)

@@ -30,7 +30,7 @@ class Options:
 
     c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
     retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.evaluation.shortlist_scores.retrieval_scores`
-    ties: Ties = "retrieval"  # as in `mfvpr.core.ranking.rank_shortlist`
+    ties: Ties = "retrieval"  # as in `mfvpr.evaluation.shortlist_scores.rank_shortlist`
     loss: Loss = cross_entropy  # of one query
     steps: int = 200  # updates of a training, at most
     every: int = 5  # steps from one validation to the next
