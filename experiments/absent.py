@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.cli.launch import Parser, run_command
+from mfvpr.cli.programs import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.core.metrics import reliability
 from mfvpr.datasets import Dataset

@@ -12,7 +12,6 @@ __all__ = [
     "Ranked",
     "RankedDataset",
     "Recall",
-    "Shard",
     "Split",
     "System",
     "best_setting",
@@ -20,7 +19,6 @@ __all__ = [
     "confidence_inputs",
     "estimate",
     "evaluation_protocol",
-    "fill_shard",
     "fit_confidence",
     "halves",
     "match_sequence",
@@ -48,6 +46,5 @@ from .rankings import Matched, Ranked
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .sequences import DriveFilter
-from .shards import Shard, fill_shard
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

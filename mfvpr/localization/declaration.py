@@ -11,7 +11,7 @@ from mfvpr.evaluation.system import System
 from mfvpr.storage.manifest import MANIFEST
 from mfvpr.storage.maps import has_rows
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError, check, without_removed
+from mfvpr.systems.choices import check_system
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 
@@ -30,24 +30,24 @@ def read_declaration(folder: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict) or content["format"] != _FORMAT or not {*_GROUPS} <= {*content}:
             raise ValueError
-        content = without_removed(content)
         settings = _SCORE_ALONE | {name: content[name] for name in (*_GROUPS, *_SCORE_ALONE) if name in content}
-        check(settings)
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         raise InputError(f"{folder}: expected a folder with a map, got none ({_FILE} is missing, or another). Make one "
                          "with `mfvpr map build` or `Map.create`, or open a map of a system of your own with "
                          "`Map(folder, system)`.") from None  # fmt: skip
-    except SettingsError as error:
+    try:
+        check_system(settings)
+    except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return settings
 
 
 def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
-    settings = read_declaration(folder) | {"cohort": None, "previous_queries": 0}
+    settings = read_declaration(folder)
     try:
         return assembly.system(settings)
-    except SettingsError as error:
+    except InputError as error:
         raise InputError(f"{folder / _FILE}: {error}") from None
 
 

@@ -23,7 +23,10 @@ from mfvpr.core.nearest_neighbors import (
 )
 from mfvpr.core.types import Array, Features, Matches, value
 from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.fields import COUNT, check_fields, number, setting, word_of
 from mfvpr.utils.numerics import as_array, compiled, is_concrete
+
+CHUNK_SIZE = "pairs matched at once; null = 1 on a CPU, elsewhere what a small part of its memory holds"
 
 
 class Matcher(Protocol):
@@ -60,14 +63,18 @@ class NearestNeighborMatcher:
 
     recipe_name: ClassVar[str] = "Matching"  # in stored recipes
 
-    cross_check: CrossCheck = field(default="mutual", metadata={"static": True})
-    max_distance: float | None = None
-    max_matches: int | None = field(default=None, metadata={"static": True})
-    chunk_size: int | None = field(default=None, metadata={"static": True})
+    cross_check: CrossCheck = setting(
+        "mutual", word_of(CrossCheck), "candidate: the nearest of every candidate keypoint, of SSM-VPR", static=True
+    )
+    max_distance: float | None = setting(None, number(1e-6, 2) | None, "keep matches at most this far apart, in (0, 2]")
+    max_matches: int | None = setting(
+        None, COUNT | None, "keep at most this number of matches, the closest ones; null = all", static=True
+    )
+    chunk_size: int | None = setting(None, COUNT | None, CHUNK_SIZE, static=True)
     product: Product | None = field(default=None, metadata={"static": True, "recipe": False})
 
     def __post_init__(self) -> None:
-        require_word("cross_check", self.cross_check, CrossCheck)
+        check_fields(self)
         if self.product is not None:
             require_word("product", self.product, Product)
 

@@ -205,7 +205,7 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
     roots = {side: str(images.root) for side, images in folders.items()}
     settings = {
         "dataset": {"name": dataset.name, **roots}, **stages, "candidates": pipeline.candidates, "scorer": scorers,
-        "cohort": system.cohort, "ties": system.ties, "final": system.headline,
+        "ties": system.ties, "final": system.headline,
     }  # fmt: skip
     contents = {side: cache.recipes.contents(images) for side, images in folders.items()}
     by_score = parameters(system.final_scores.values(), scorers)

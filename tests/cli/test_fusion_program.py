@@ -2,12 +2,11 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from mfvpr import HistogramOfShifts, RatioWeight
-from mfvpr.cli import axes, evaluation
-from mfvpr.systems import assembly, settings
+from mfvpr.cli import axes, evaluation, schema
+from mfvpr.systems import assembly
 from tests.programs import composed, csv_rows, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
@@ -53,29 +52,11 @@ def test_weights_choose_what_is_fused():
 @pytest.mark.parametrize(("arguments", "features", "side"), [([], "aliked", 320), (["features=sift"], "sift", 336)])
 def test_our_system_ranks_by_the_histogram_of_ratios(arguments, features, side):
     config = composed("system=mfvpr", *arguments)
-    settings.check(config)
+    schema.check("evaluate", config)
     assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
     rankings = assembly.rankings(config)
     assert rankings["scorers"] == {"histogram": HistogramOfShifts(weight=RatioWeight())}
     assert rankings["final"] == "histogram"
     config = composed("system=mfvpr", *arguments, "grid.sigma=[10]", config="sweep")
-    settings.check(config)
+    schema.check("sweep", config)
     assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]
-
-
-def test_the_weight_of_the_main_scorer_is_that_of_its_cohort_as_well(root, tmp_path):
-    more = ("scorer=paper", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, histogram: 2}", "cohort=1", "figures=0")
-    evaluation.evaluate(composed(*small(root), *more, f"out={tmp_path}/out"))
-    rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "results.json").read_text())}
-    name = "histogram + cohort + retrieval"
-    assert [*rows][-2:] == ["histogram + retrieval", name]
-    assert rows[name]["parameters"]["cohort"] == 1
-    retrieval_scores, cohort_scores, fused = (
-        {line[:2]: line[2] for line in ranked(tmp_path / "out", system)}
-        for system in ("retrieval", "histogram_cohort", "histogram_cohort_retrieval")
-    )
-    for query in {query for query, _ in fused}:
-        pairs = [pair for pair in fused if pair[0] == query]
-        scores = [np.array([part[pair] for pair in pairs]) for part in (retrieval_scores, cohort_scores)]
-        by_retrieval, normalized = ((values - values.mean()) / (values.std() or 1) for values in scores)
-        np.testing.assert_allclose([fused[pair] for pair in pairs], 0.5 * by_retrieval + 2 * normalized, atol=1e-2)

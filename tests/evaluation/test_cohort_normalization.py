@@ -1,6 +1,5 @@
 """Hubness against a loop over scores, scores divided by it, and a cohort in a whole evaluation."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 from tests.builders import evaluate_parts, make_shortlist
 from tests.evaluation.conftest import SCORERS, SIFT, VLAD
-from tests.programs import QUERIES, composed, folder, shared, small, typed
+from tests.programs import shared
 
 pytestmark = pytest.mark.thorough
 
@@ -165,39 +164,3 @@ def test_names_of_systems_with_a_cohort_are_known_only_with_one(dataset):
 @pytest.fixture(scope="session")
 def root(tmp_path_factory):
     return shared(tmp_path_factory)
-
-
-def test_a_run_names_its_cohort(root, tmp_path, monkeypatch, capsys):
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *small(root), "scorer=histogram", "figures=0",
-                                 "cohort=3", f"out={tmp_path}/out")  # fmt: skip
-    assert code == 0, stderr
-    assert f"cohort matches: {QUERIES} of {QUERIES} queries to match" in stderr
-    assert "histogram + cohort + retrieval" in stdout
-    rows = json.loads((tmp_path / "out" / "results.json").read_text())
-    parameters = {row["system"]: row["parameters"] for row in rows}
-    assert [*parameters] == ["retrieval", "histogram", "histogram + cohort", "histogram + retrieval",
-                             "histogram + cohort + retrieval"]  # fmt: skip
-    assert not any("cohort" in parameters[name] for name in ("retrieval", "histogram", "histogram + retrieval"))
-    assert parameters["histogram + cohort"] == parameters["histogram"] | {"cohort": 3}
-    assert parameters["histogram + cohort + retrieval"] == parameters["histogram + retrieval"] | {"cohort": 3}
-    assert {row["scorer"] for row in rows} == {"none", "histogram"}
-    assert (tmp_path / "out" / "predictions" / "histogram_cohort_retrieval.csv").exists()
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["settings"]["cohort"] == 3
-    assert composed()["cohort"] is None
-
-
-def test_a_list_of_pairs_must_be_of_database_images_as_well(small_street, tmp_path, monkeypatch, capsys):
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *folder(small_street), "retrieval=pairs", "cohort=2",
-                            "retrieval.queries=pairs.txt", "cache=null", f"out={tmp_path}/out")  # fmt: skip
-    assert code == 2
-    assert f"{small_street}/database: expected" in stderr
-    assert f"one of: {small_street}/queries;" in stderr
-
-
-@pytest.mark.parametrize("cohort", [-1, 2.5, "all"])
-def test_mistakes_are_one_line_and_exit_code_2(root, tmp_path, monkeypatch, capsys, cohort):
-    arguments = [*small(root), f"cohort={cohort}", f"out={tmp_path}/out"]
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments)
-    assert code == 2
-    assert f"cohort={cohort}: expected a whole number" in stderr.splitlines()[-1]
-    assert not stdout
