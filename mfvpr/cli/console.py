@@ -68,7 +68,7 @@ def explain(error: Exception) -> str:
 
 def refuse(reason: str) -> NoReturn:
     """Print one line on stderr and exit with code 2."""
-    print("error:", *reason.splitlines(), file=sys.stderr)
+    print("error:", *reason.encode(errors="backslashreplace").decode().splitlines(), file=sys.stderr)
     sys.exit(2)
 
 
