@@ -370,8 +370,8 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
         for path in sorted((street / side).iterdir())[:6]:
             shutil.copy(path, place / side / os.fsdecode(b"\xfe" + path.name.encode()))
     out = tmp_path / os.fsdecode(b"out\xff")
-    arguments = [f"dataset.database='{place}/database'", f"dataset.queries='{place}/queries'", f"out='{out}'", "figures=2",
-                 "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
+    arguments = [f"dataset.database='{place}/database'", f"dataset.queries='{place}/queries'", f"out='{out}'",
+                 "figures=2", "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
     stdout, stderr = succeed("evaluate", *small(root), *arguments)
     assert stdout.endswith("out\\udcff/report.html\n")
     assert "warning" not in stderr
