@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.cli.launch import Parser, run_command
+from mfvpr.cli.programs import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.cli.launch import Parser, run_command
+from mfvpr.cli.programs import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr import HistogramOfShifts, Shortlist
-from mfvpr.cli.launch import Parser, run_command
+from mfvpr.cli.programs import Parser, run_command
 from mfvpr.cli.systems import load_system
 from mfvpr.datasets import folder
 from mfvpr.datasets.streets import TRUTH

@@ -1,6 +1,5 @@
 """The programs, and a small data set for them: called, as command lines of this process, or in one of their own."""
 
-import atexit
 import csv
 import json
 import logging
@@ -17,12 +16,12 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from mfvpr.cli import programs
+from mfvpr.cli import programs, schema
 from mfvpr.cli.inputs import prepare
-from mfvpr.cli.launch import exit_at_once, launch
+from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.match_files import MatchStore
-from mfvpr.systems.settings import CONF
+from mfvpr.systems.choices import CONF
 from mfvpr.utils import Stopwatch
 
 ROOT = Path(__file__).parent.parent
@@ -39,13 +38,14 @@ def run(*arguments, program="evaluate", cwd=ROOT, **environment):
     )  # fmt: skip
 
 
-def composed(*overrides, config="config"):
+def composed(*overrides, config="evaluate"):
     """The settings of a command line, not yet checked."""
     return deepcopy(_composed(config, overrides))
 
 
 @cache
 def _composed(config, overrides):
+    schema.register()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return OmegaConf.to_container(hydra.compose(config, list(overrides)), resolve=True)
 
@@ -94,7 +94,6 @@ def typed(monkeypatch, capsys, program, *arguments):
     """Exit code, stdout and stderr of a command line, in this process."""
     program, *command = program.split()
     monkeypatch.setattr(sys, "argv", [program, *command, *map(str, arguments)])
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # this and the next two are put back
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(logging, "shutdown", lambda *_: None)  # Hydra's call would close an earlier test's stderr
     handler, code = signal.getsignal(signal.SIGTERM), 0
@@ -110,7 +109,6 @@ def typed(monkeypatch, capsys, program, *arguments):
         code = left.code
     finally:
         signal.signal(signal.SIGTERM, handler)
-        atexit.unregister(exit_at_once)  # else the tests end with the exit code of this command line
     return code, *capsys.readouterr()
 
 

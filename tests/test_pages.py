@@ -8,9 +8,11 @@ import sys
 
 import pytest
 
-from mfvpr.cli import overrides
+from mfvpr.cli import schema
+from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
-from mfvpr.systems.settings import CONF, RULES, check, scorer_rules
+from mfvpr.systems.choices import CONF
+from mfvpr.utils.fields import flat, settings_of
 from tests.needs import needs
 from tests.programs import QUICK, ROOT, composed, run, typed
 
@@ -22,7 +24,7 @@ PAGES = {
     for pattern in (README, "conf/*.md", "experiments/*.md", "mfvpr/*/README.md")
     for path in sorted(ROOT.glob(pattern))
 }
-CONFIGS = {"mfvpr evaluate": "config", "mfvpr sweep": "sweep", "mfvpr learn": "learn", "mfvpr map build": "map",
+CONFIGS = {"mfvpr evaluate": "evaluate", "mfvpr sweep": "sweep", "mfvpr learn": "learn", "mfvpr map build": "map",
            "mfvpr localize": "localize", "python -m experiments.paper": "paper"}  # fmt: skip
 PLACEHOLDERS = r"\b(?:DIR|FILE|IMAGE|RUN|NAME)\b"
 
@@ -59,10 +61,10 @@ def test_settings_of_commands_are_valid(command, config):
     chosen = [each for each in arguments if each != "-m" and not each.startswith(("launcher=", "cluster"))]
     if "-m" in arguments:  # the first of several values
         chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", each) for each in chosen]
-    settings = composed(*map(overrides.quote, overrides.split_first(chosen)), config=config)
-    check(settings)
+    settings = composed(*chosen, config=config)
+    schema.check(config, settings)
     for name in ("also", "report"):
-        assert not settings.get(name) or overrides.compose_data_sets(name, settings[name])
+        assert not settings.get(name) or compose_data_sets(name, settings[name])
 
 
 def command_words(config):
@@ -134,8 +136,10 @@ def test_settings_that_pages_name_exist():
     names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    rules = [*RULES, *(name for scorer in scorer_rules(CONF / "rules.yaml").values() for name in scorer)]
-    assert set(names) <= {rule.rpartition(".")[2] for rule in rules} | groups
+    known = {name for owner in schema.PROGRAMS.values() for name, _ in flat(settings_of(owner))} | {*schema.axes()}
+    known |= {name for choices in schema.CHOICES.values() for each in choices.values() for name in each}
+    known |= {name for owner in schema.OTHERS for name in settings_of(owner)}
+    assert {*names} <= {name.rpartition(".")[2] for name in known} | groups
 
 
 def test_pages_name_no_machine_path():

@@ -8,8 +8,8 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-from mfvpr.cli.launch import Parser, run_command
-from mfvpr.systems.settings import SettingsError
+from mfvpr.cli.programs import Parser, run_command
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
 
 PROGRAM = "python -m experiments.benchmark"
@@ -50,7 +50,7 @@ def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None,
     if benchmark == "accelerator":
         module.run(rounds, out, groups, is_quick=is_quick)
     elif groups or is_quick:
-        raise SettingsError(f"{benchmark} has no groups and no --quick, which belong to accelerator")
+        raise InputError(f"{benchmark} has no groups and no --quick, which belong to accelerator")
     else:
         module.run(rounds, out)
 

@@ -1,6 +1,6 @@
 """The paper's evaluation. `python -m experiments.paper --help`."""
 
-from mfvpr.cli.launch import launch
+from mfvpr.cli.programs import launch
 
 if __name__ == "__main__":
     launch("paper")

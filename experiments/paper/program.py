@@ -20,8 +20,7 @@ from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report import Table, write_json, write_table
 from mfvpr.report.pages.one_run import PAGE
 from mfvpr.report.runs import LAST
-from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import InputError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
 
@@ -35,7 +34,7 @@ def paper(settings: dict[str, Any]) -> None:
     if not places or not rows:
         for line in left_out:
             tell(f"left out: {line}")
-        raise SettingsError("nothing to evaluate: the lines above say what is missing")
+        raise InputError("nothing to evaluate: the lines above say what is missing")
     names, known = _names(rows), [place.name for place in places]
     tell(
         f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets ({', '.join(known)}), "
@@ -84,7 +83,7 @@ def _evaluate_and_report(
 
     datasets, failures = evaluate_all(rows, places, settings, write_tables)
     if not datasets:
-        raise SettingsError(f"nothing was evaluated: {failures[0]}")
+        raise InputError(f"nothing was evaluated: {failures[0]}")
     evaluations = _read_evaluations(rows, datasets, settings)
     name = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets))
     timed_on = next(place for place in places if place.name == name)
@@ -105,7 +104,7 @@ def _evaluate_and_report(
     write_pages(out, evaluations, tables, [*left_out, *failures])
     print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
     if failures:
-        raise SettingsError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
+        raise InputError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
 
 
 def evaluate_all(

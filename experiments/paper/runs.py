@@ -11,13 +11,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from omegaconf import OmegaConf
 
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
-from mfvpr.cli import evaluation, run_folder
+from mfvpr.cli import evaluation, run_folder, schema
+from mfvpr.cli.command_line import checked, compose
 from mfvpr.cli.inputs import Inputs
-from mfvpr.cli.overrides import compose_program
 from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
@@ -29,7 +28,7 @@ from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError, check
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user, remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.locks import lock_folder
@@ -55,18 +54,18 @@ def lock_output(out: Path) -> Iterator[None]:
     """Lock a folder for evaluations, and remove temporary files of a killed process.
 
     Raises:
-        SettingsError: another process uses the folder, or it has files of others.
+        InputError: another process uses the folder, or it has files of others.
     """
-    in_use = SettingsError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
+    in_use = InputError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
         try:
             out.mkdir(parents=True, exist_ok=True)
             stack.enter_context(lock_folder(out, in_use))
         except OSError as error:
-            raise SettingsError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
+            raise InputError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
-            raise SettingsError(f"out={out}: expected a new or empty folder, or one of this program; name another")
+            raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
         remove_leftovers(out)
         yield
 
@@ -74,10 +73,10 @@ def lock_output(out: Path) -> Iterator[None]:
 def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The checked settings of an evaluation."""
     chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
-    composed: Any = OmegaConf.to_container(compose_program("config", chosen), resolve=True)
+    composed = checked("evaluate", compose("evaluate", chosen))
     composed |= {name: settings[name] for name in _SHARED}
     composed["out"] = str(folder_of(run, place.name, settings))
-    check(composed)
+    schema.check("evaluate", composed)
     del composed["compiled"]  # a setting of this process
     return composed | {"command": f"mfvpr evaluate {' '.join(chosen)}"}
 
@@ -102,18 +101,18 @@ def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], t
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
-    """Whether a run of these inputs is finished there; SettingsError for one of other inputs, or a damaged one."""
+    """Whether a run of these inputs is finished there; InputError for one of other inputs, or a damaged one."""
     if not (folder / LAST).is_file():
         return False
     for name in (LAST, "run.json", SIZES):
         try:
             read_json(folder / name)
         except (OSError, ValueError):
-            raise SettingsError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
+            raise InputError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
                                 "name another with out=DIR") from None  # fmt: skip
     before = read_object(folder / INPUTS)
     if other := [name for name, value in inputs.items() if before.get(name) != value]:
-        raise SettingsError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
+        raise InputError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
                             "another folder with out=DIR")  # fmt: skip
     return True
 

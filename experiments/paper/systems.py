@@ -9,10 +9,11 @@ from typing import Any
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
 from mfvpr.cli.build import expand_user
-from mfvpr.cli.overrides import quote
+from mfvpr.cli.command_line import override
+from mfvpr.cli.schema import DATA_SET_NAME
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.systems.settings import RULES, SettingsError
+from mfvpr.utils.errors import InputError
 
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
@@ -115,7 +116,7 @@ def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]
         if name not in known:
             nearest = difflib.get_close_matches(name, known, n=1) or [choice for choice in known if name in choice]
             hint = f"; the nearest is {nearest[0]}" if nearest else ""
-            raise SettingsError(f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}")
+            raise InputError(f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}")
 
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], dict[str, str], list[str]]:
@@ -123,7 +124,7 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
     root = None if data is None else expand_user(data)
     if root is not None and not root.is_dir():
         got = "a file" if root.exists() else "nothing"
-        raise SettingsError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
+        raise InputError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
     located = {place.name: place for place in _places_by_coordinates(root)} if root else {}
     known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))
     _check_names("datasets", names, known)
@@ -137,12 +138,12 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
                 refused.append(f"{root / name}: the drawn data set has this name; rename the folder")
         elif name in located and name in (*REAL, *PUBLISHED):
             refused.append(f"{name}: expected another layout than that of names with positions; rename the folder")
-        elif name in located and not RULES["dataset.name"].holds(name):
-            refused.append(f"{name}: expected a folder's name of {RULES['dataset.name'].expected}; rename it")
+        elif name in located and not DATA_SET_NAME.holds(name):
+            refused.append(f"{name}: expected a folder's name of {DATA_SET_NAME.expected}; rename it")
         elif name in located:
             available.append(located[name])
         elif present:
-            available.append(Place(name, (f"dataset={name}", quote(f"dataset.root={present[0]}")), present[0]))
+            available.append(Place(name, (f"dataset={name}", override("dataset.root", present[0])), present[0]))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
             absent[name] = f"{name}: needs {data or 'data=DIR'}/{name} {needs}"
@@ -156,7 +157,7 @@ def _places_by_coordinates(root: Path) -> Iterator[Place]:
             sides = {side: inside / side for side in _SIDES}
             if all(any(path.is_file() for path in side.glob(f"{_POSITIONS}*")) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
-                settings = (quote(f"dataset.{name}={value}") for name, value in chosen.items())
+                settings = (override(f"dataset.{name}", value) for name, value in chosen.items())
                 yield Place(folder.name, ("dataset=folder", *settings), folder)
                 break
 

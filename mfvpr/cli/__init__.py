@@ -5,10 +5,9 @@
 | evaluate, sweep, learn | evaluation, sweeping, learning |
 | map and localize, data, weights, report | localization, published_data, checkpoints, mfvpr.report.pages |
 
-Read first: programs (the command `mfvpr`), launch (starts a program), command_line (Hydra), groups (of settings),
-systems (`load_system`), sweeps (`mfvpr.sweep`). Then overrides, help_text, wording (of errors), declare (files in conf/
-that follow from scorers). Settings are checked and become systems in `mfvpr.systems`; they become the inputs of a job
-in inputs, with notes about them, and its parts in build, truth and confidences. Jobs share run_folder, axes, console.
+Read first: programs (the command `mfvpr`), schema (settings of the programs), command_line (Hydra), systems
+(`load_system`), sweeps (`mfvpr.sweep`). Settings become systems in `mfvpr.systems`; they become the inputs of a job in
+inputs, with notes about them, and its parts in build, truth and confidences. Jobs share run_folder, axes, console.
 """
 
 import lazy_loader

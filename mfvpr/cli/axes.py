@@ -7,12 +7,11 @@ from mfvpr.core.parameters import parameters_of
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import block_bytes, scales
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.models import can_learn
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.setting_rankings import SETTINGS_PER_BLOCK
 from mfvpr.tuning.sweeps.setting_search import require_optuna
-from mfvpr.utils import InputError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import free_host_bytes
 
 _BYTES_PER_SETTING = 2000  # Python objects, about
@@ -29,27 +28,27 @@ def with_final_axis(settings: dict[str, Any]) -> dict[str, Any]:
 def axes(settings: dict[str, Any]) -> Axes:
     """The axes of the chosen scorer, checked."""
     if "method" not in settings["scorer"]:
-        raise SettingsError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
+        raise InputError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several "
                             "with -m scorer=sum,anchor,histogram")  # fmt: skip
     if isinstance(weights := settings["scorer"].get("weight"), list):
         listed = ",".join(weights)
-        raise SettingsError(f"scorer.weight=[{listed}]: expected one weight; to compare weights, set "
+        raise InputError(f"scorer.weight=[{listed}]: expected one weight; to compare weights, set "
                             f"grid.weight=[{listed}]")  # fmt: skip
     if isinstance(methods := settings.get("sequence"), list):
-        raise SettingsError(f"sequence=[{','.join(methods)}]: a sweep takes one at a time; sweep them with -m "
+        raise InputError(f"sequence=[{','.join(methods)}]: a sweep takes one at a time; sweep them with -m "
                             f"sequence={','.join(methods)}")  # fmt: skip
     [scorer] = assembly.scorers(settings["scorer"]).values()
     values = {name: axis for name, axis in settings["grid"].items() if axis is not None}
     known = [name for name in settings["grid"] if name in {*parameters_of(scorer), "max_distance", "c"}]
     if unknown := [name for name in values if name not in known]:
-        raise SettingsError(f"grid.{unknown[0]}: scorer={settings['scorer']['method']} has no such parameter; it has "
+        raise InputError(f"grid.{unknown[0]}: scorer={settings['scorer']['method']} has no such parameter; it has "
                             f"{', '.join(known)}")  # fmt: skip
     if not values:
-        raise SettingsError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
+        raise InputError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
                             "--help")  # fmt: skip
     limit = settings["matching"].get("max_distance")
     if limit is not None and any(value is None or value > limit for value in values.get("max_distance", [])):
-        raise SettingsError(
+        raise InputError(
             f"grid.max_distance={values['max_distance']}: expected values up to {limit}, as "
             f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
         )
@@ -60,7 +59,7 @@ def axes(settings: dict[str, Any]) -> Axes:
         return Axes(scorer, values, defaults)
     except InputError as error:
         is_axis = str(error).partition("=")[0].partition(":")[0] in values
-        raise SettingsError(f"grid.{error}" if is_axis else str(error)) from error
+        raise InputError(f"grid.{error}" if is_axis else str(error)) from error
 
 
 def search_axes(settings: dict[str, Any]) -> Axes:
@@ -73,7 +72,7 @@ def search_axes(settings: dict[str, Any]) -> Axes:
         try:
             require_optuna()
         except InputError as error:
-            raise SettingsError(f"search=optuna: {error}, or search=grid") from error
+            raise InputError(f"search=optuna: {error}, or search=grid") from error
     return grid_axes
 
 
@@ -83,10 +82,10 @@ def learning_axes(settings: dict[str, Any]) -> Axes:
     known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
     if method not in known:
         setting = f"scorer={method}" if method else "scorer"
-        raise SettingsError(f"{setting}: expected one to learn, of {', '.join(known)}")
+        raise InputError(f"{setting}: expected one to learn, of {', '.join(known)}")
     grid_axes = axes(settings)
     if settings["split"] is None:
-        raise SettingsError("split=null: what is learned is never reported on the same queries; expected first_half, "
+        raise InputError("split=null: what is learned is never reported on the same queries; expected first_half, "
                             "second_half or both")  # fmt: skip
     return grid_axes
 
@@ -100,7 +99,7 @@ def retrieval_weight(settings: dict[str, Any]) -> float | None:
 def _plain_c(settings: dict[str, Any]) -> Any:
     """The setting fusion.c, which must not fuse several scores here."""
     if (c := settings["fusion"]["c"]) == "zscore":
-        raise SettingsError(
+        raise InputError(
             "fusion.c=zscore: expected a number or auto, as sweeps and learning add retrieval to one score; set "
             "fusion.c=auto fusion.weights=null, which ranks alike for weights of 1"
         )
@@ -108,7 +107,7 @@ def _plain_c(settings: dict[str, Any]) -> Any:
 
 
 def require_memory(settings: dict[str, Any], grid_axes: Axes, views: int, matches: MatchSet | Scales) -> None:
-    """Raise a SettingsError before a sweep whose results, or one chunk, do not fit into memory."""
+    """Raise a InputError before a sweep whose results, or one chunk, do not fit into memory."""
     queries = len(scales(matches)[0])
     num_settings = grid_axes.size + (dict(grid_axes.own) not in grid_axes.grid())
     _require_bytes(
@@ -130,6 +129,6 @@ def require_memory(settings: dict[str, Any], grid_axes: Axes, views: int, matche
 def _require_bytes(purpose: str, needed: int, remedy: str) -> None:
     free = free_host_bytes()
     if needed > 0.8 * free:
-        raise SettingsError(
+        raise InputError(
             f"{purpose} would take about {needed / 1e6:,.0f} MB of memory, {free / 1e6:,.0f} MB are free; {remedy}"
         )

@@ -11,8 +11,8 @@ from mfvpr.datasets.ground_truth import CHOICES
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
 from mfvpr.storage import FeatureCache
-from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Cluster, Runtime
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
 
@@ -32,11 +32,11 @@ def dataset(settings: Mapping[str, Any], progress: Callable[[int, int], None]) -
             seasons=settings.get("seasons") and tuple(settings["seasons"]),
         )
     if settings["ground_truth"] is None:
-        raise SettingsError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
+        raise InputError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
     database, queries, several = settings["database"], settings["queries"], isinstance(settings["queries"], list)
     if several == ("database_labels" in settings):  # only a single sequence has labels
         expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
-        raise SettingsError(f"dataset.queries: expected {expected}, got {queries}")
+        raise InputError(f"dataset.queries: expected {expected}, got {queries}")
     queries = [expand_user(path) for path in queries] if several else expand_user(queries)
     options = {name: settings[name] for name in ("name", "orient", "bits")}
     return datasets.folder(expand_user(database), queries, ground_truth=_ground_truth(settings), **options)
@@ -48,10 +48,10 @@ def _ground_truth(settings: Mapping[str, Any]) -> IndexFile | LabelFiles | str:
     for option, reader in {"index_file": "index", "database_labels": "label", "query_labels": "label"}.items():
         path = settings.get(option)
         if path is not None and kind != reader:
-            raise SettingsError(f"{path}: given as dataset.{option}, but dataset.ground_truth={kind}; "
+            raise InputError(f"{path}: given as dataset.{option}, but dataset.ground_truth={kind}; "
                                 f"set it to {reader}")  # fmt: skip
         if path is None and kind == reader:
-            raise SettingsError(f"dataset.ground_truth={kind}: expected a file; give dataset.{option}=FILE as well")
+            raise InputError(f"dataset.ground_truth={kind}: expected a file; give dataset.{option}=FILE as well")
     if kind == "index":
         return IndexFile(expand_user(settings["index_file"]), settings["widen_index"])
     if kind == "label":
@@ -84,6 +84,6 @@ def runtime(number: int | str, memory: float | None, cluster: Cluster | None) ->
 
     devices = jax.local_devices()
     if not isinstance(number, str) and number > len(devices):
-        raise SettingsError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
+        raise InputError(f"devices={number}: expected at most {len(devices)}, as many as there are here, or all")
     devices = devices if isinstance(number, str) else devices[:number]
     return Runtime(devices, memory, console.track, console.tell, cluster)

@@ -10,11 +10,11 @@ from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import Confidence, System, read_confidences
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
 # Confidences depend on these settings.
-_NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries", "cohort")
+_NAMES = ("features", "retrieval", "scorer", "matching", "candidates", "fusion", "previous_queries")
 
 
 class ConfidenceFile(NamedTuple):
@@ -44,10 +44,10 @@ def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> Co
     """
     headline, settings = system.headline, system.settings or {}
     if not file.systems:
-        raise SettingsError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
+        raise InputError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
                             "none, as where there is but one candidate")  # fmt: skip
     if headline not in file.systems:
-        raise SettingsError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
+        raise InputError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
                             f"{', '.join(file.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
     before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), fingerprints(inputs.contents)))
     if before & now:

@@ -1,9 +1,13 @@
-"""Notes, warnings and progress of the programs, on stderr."""
+"""Notes, warnings, errors and progress of the programs, on stderr."""
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:  # or the command line would wait for JAX
     from mfvpr.utils.progress import Track
@@ -12,10 +16,65 @@ _QUIET = 2.0  # seconds before anything is shown
 _INTERVALS = {True: 0.1, False: 10.0}  # seconds between two lines in a terminal, and in a file
 _ERASE = "\r\x1b[K"
 
+_OTHER_NAMES = {"store": "cache", "fusion.filter_score": "fusion.retrieval_score"}  # of version 0.2.0
+
 
 def tell(text: str) -> None:
     """Print a line that is no result."""
     print(_ERASE * sys.stderr.isatty() + text, file=sys.stderr)
+
+
+@contextmanager
+def one_line() -> Iterator[None]:
+    """Exit with 2 and one line for wrong input, with 130 for Ctrl-C, 141 for a closed stdout; a bug is a traceback."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("\ninterrupted; what was finished is kept", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except _hydra_errors() as error:
+        refuse(explain(error))
+    except InputError as error:
+        refuse(str(error))
+    except ValueError as error:
+        if not str(error).startswith("Config group override"):  # Hydra's, of GROUP=null
+            raise
+        refuse(str(error))
+    except OSError as error:
+        refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
+
+
+def _hydra_errors() -> tuple[type[Exception], ...]:
+    """Hydra's errors; its import is slow, and Ctrl-C must be handled before."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    return HydraException, OmegaConfBaseException
+
+
+def explain(error: Exception) -> str:
+    """Hydra's error in one line."""
+    text = " ".join((str(error) or str(error.__cause__)).split())
+    text = text.partition(" Config search path")[0].partition(" See https")[0]
+    if new := _new_name(text):
+        return f"{text.partition('.')[0]}; its name is {new} now"
+    if "viable alternative" in text or "mismatched input" in text or "NoViableAlt" in text:
+        return f"{text}; put quotes around a value with special characters: 'NAME=\"VALUE\"'"
+    return text
+
+
+def refuse(reason: str) -> NoReturn:
+    """Print one line on stderr and exit with code 2."""
+    print("error:", *reason.encode(errors="backslashreplace").decode().splitlines(), file=sys.stderr)
+    sys.exit(2)
+
+
+def _new_name(text: str) -> str | None:
+    """The name of a setting now, if an error is about one that had another name."""
+    return next((new for old, new in _OTHER_NAMES.items() if f"'{old}'" in text), None)
 
 
 def track(label: str) -> "Track":

@@ -6,7 +6,7 @@ from typing import Any
 from mfvpr.cli import confidences, run_folder, truth
 from mfvpr.cli.inputs import Inputs, prepare, with_image_size
 from mfvpr.datasets import Dataset
-from mfvpr.evaluation import Shard, System, fill_shard, rank_dataset
+from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.report.confidences import confidence_figures, confidence_table
 from mfvpr.report.evaluations import EvaluationReport, recall_table
@@ -14,8 +14,8 @@ from mfvpr.report.query_figures import query_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Stopwatch
+from mfvpr.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,8 @@ class Outcome:
 
 
 def evaluate(settings: dict[str, Any]) -> None:
-    """Run all stages, print the table, fill the run folder; a shard fills the cache only."""
+    """Run all stages, print the table, fill the run folder."""
     settings = with_image_size(settings)
-    if settings["shard"] is not None:
-        _fill_shard(settings)
-        return
     with run_folder.claim(settings["out"], settings["dataset"]["name"]) as folder:
         outcome = evaluation_of(settings)
         truth_of_run = ground_truth(outcome.report, outcome.description)
@@ -45,15 +42,8 @@ def evaluate(settings: dict[str, Any]) -> None:
             print(f"report: {page}")
 
 
-def _fill_shard(settings: dict[str, Any]) -> None:
-    """Do the part of a shard, and print what is done, and what to do next."""
-    shard = Shard.parse(settings["shard"])
-    rankings, inputs = assembly.rankings(settings), prepare(settings, Stopwatch())
-    print(fill_shard(inputs.dataset, System(inputs.pipeline, **rankings), inputs.cache, shard))
-
-
 def evaluation_of(settings: dict[str, Any]) -> Outcome:
-    """Evaluate the retrieval, each scorer, alone and with a cohort, and the main scorer fused with the retrieval."""
+    """Evaluate the retrieval, each scorer, alone, and the main scorer fused with the retrieval."""
     rankings, watch = assembly.rankings(settings), Stopwatch()  # errors come before anything slow
     confidence = settings["confidence"] and confidences.read_file(settings["confidence"])
     inputs = prepare(settings, watch)
@@ -97,7 +87,7 @@ def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[i
     rows = [names.get(query, -1) if isinstance(query, str) else query for query in queries]
     for query, row in zip(queries, rows, strict=True):
         if not 0 <= row < len(names):
-            raise SettingsError(
+            raise InputError(
                 f"figures=[{query}]: expected rows of queries from 0 to {len(names) - 1}, or names such as "
                 f"{dataset.queries.names[0]}"
             )

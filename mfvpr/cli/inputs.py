@@ -16,8 +16,8 @@ from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import Stopwatch
+from mfvpr.utils.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Inputs:
     def protocol(self, split: Split | None) -> EvaluationProtocol:
         """The protocol of rankings for sweeps and learning."""
         if self.dataset.truth is None:
-            raise SettingsError(
+            raise InputError(
                 "dataset.ground_truth=none: choosing settings needs a ground truth; set order, index, utm or label"
             )
         return evaluation_protocol(self.dataset.truth, self.thresholds, split)

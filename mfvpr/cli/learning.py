@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.cli import build, console, run_folder, truth
 from mfvpr.cli.axes import learning_axes, retrieval_weight
+from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.inputs import prepare, with_image_size
-from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.core import Scorer
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
 from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.report.run_files import matched_content
-from mfvpr.systems.settings import SettingsError
 from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.losses import LOSSES
 from mfvpr.tuning.learning.teaching import Options
 from mfvpr.tuning.learning.training import Checkpoints
 from mfvpr.utils import Stopwatch, recipe_of
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user, write_text
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
@@ -46,7 +46,7 @@ def learn(settings: dict[str, Any]) -> None:
         teach = [_prepare(choice, watch) for choice in _settings_by_data_set(settings)]
         report, data = [], teach[0].part
         if settings["report"]:
-            number = len(compose_data_sets("report", settings["report"]))
+            number = len(settings["report"])
             teach, report = teach[:-number], teach[-number:]
             require_disjoint(teach, report)
             data = join_data_sets([data_set.part for data_set in teach], [data_set.part for data_set in report])
@@ -91,7 +91,7 @@ def _settings_by_data_set(settings: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _prepare(settings: dict[str, Any], watch: Stopwatch) -> Prepared:
     if len(sizes := settings["features"].get("patch_sizes", [])) > 1:
-        raise SettingsError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
+        raise InputError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     inputs = prepare(settings, watch)
     protocol = inputs.protocol(settings["split"])
     matches, candidates = inputs.match(watch)
@@ -109,15 +109,15 @@ def label(settings: dict[str, Any]) -> str:
 
 
 def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
-    """Raise a SettingsError for reports on images that were learned on, and for queries that would count twice."""
+    """Raise a InputError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
         sides = itertools.product(second.contents.values(), first.contents.values())
         if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
-            raise SettingsError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
+            raise InputError(f"report={second.part.name}: expected other images than those of {first.part.name}, "
                                 f"which is learned on; {same} are the same")  # fmt: skip
     for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
         if same := sum(map(bool, own_rows(second.contents["query"], first.contents["query"]))):
-            raise SettingsError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
+            raise InputError(f"{second.part.name}: expected other queries than those of {first.part.name}; {same} "
                                 "are the same, and would count twice")  # fmt: skip
     for first, second in itertools.combinations(report, 2):
         if any(own_rows(second.contents["database"], first.contents["database"])):

@@ -20,14 +20,14 @@ from mfvpr.localization.declaration import fit_to_map, read_declaration, read_sy
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import InputError, Runtime
+from mfvpr.utils import Runtime
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user, printable, used_bytes
 
 
 def build_map(settings: dict[str, Any]) -> None:
     """Map the database of a data set."""
-    system = assembly.system({**settings, "cohort": None, "previous_queries": 0})
+    system = assembly.system(settings)
     images = dataset_of(settings["dataset"]).database
     folder, warn = expand_user(settings["map"]), lambda line: tell(f"warning: {line}")
     robot_map = Map(folder, fit_to_map(folder, system, images, warn))
@@ -84,7 +84,7 @@ def localize(settings: dict[str, Any]) -> None:
         finally:  # the prediction must not be lost if its image cannot be added
             print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
-        raise SettingsError(f"{failed} of the images could not be localized; their lines say why")
+        raise InputError(f"{failed} of the images could not be localized; their lines say why")
     figures.finish()
 
 
@@ -143,7 +143,7 @@ class _LocalizationFigures:
         self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
         self._out, self._root = (settings[name] and expand_user(settings[name]) for name in ("out", "root"))
         if self._root and not self._root.is_dir():
-            raise SettingsError(f"root={self._root}: expected the folder of the map's images, got no folder")
+            raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
     def draw(
         self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Localization
@@ -166,12 +166,12 @@ class _LocalizationFigures:
         return {"figure": str(path)}
 
     def finish(self) -> None:
-        """Raise a SettingsError if a figure could not be drawn, or if an image did not come."""
+        """Raise a InputError if a figure could not be drawn, or if an image did not come."""
         if self._failed:
-            raise SettingsError(f"{self._failed} of the figures could not be drawn; warnings say why")
+            raise InputError(f"{self._failed} of the figures could not be drawn; warnings say why")
         if self._missing:
             names = ",".join(sorted(map(str, self._missing)))
-            raise SettingsError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
+            raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
                                 "the lines have them, or the last parts of these")  # fmt: skip
 
 
@@ -186,7 +186,7 @@ def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | Non
     if map_settings["final"] == "score":
         del map_settings["fusion"]
     if name not in file.systems:
-        raise SettingsError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
+        raise InputError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
                             f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
     confidences.warn_of_absent_places(file)
     scorers = system.final_scores[name].scorers

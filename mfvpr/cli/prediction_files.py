@@ -14,7 +14,7 @@ from mfvpr.report import prediction_files
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
-from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 
 _CANDIDATES = ("preds", "hloc", "kapture")
@@ -27,13 +27,11 @@ def convert(
     """Write the predictions of an evaluation, or of localized images, and print the paths."""
     _check(source, layout, poses, times, database)
     if (prefixes := (query_prefix, database_prefix)) != ("", "") and layout not in ("hloc", "kapture"):
-        raise SettingsError(f"--query-prefix, --database-prefix: expected none for --layout {layout}; remove them")
+        raise InputError(f"--query-prefix, --database-prefix: expected none for --layout {layout}; remove them")
     if source.is_dir():
         dataset, thresholds = _dataset_of_run(source)
         if times and len(dataset.sequences) > 1:
-            raise SettingsError(
-                f"--times: expected one query sequence, got {len(dataset.sequences)}; name images by time"
-            )
+            raise InputError(f"--times: expected one query sequence, got {len(dataset.sequences)}; name images by time")
         for target, sequence, images in _sequences(source, out, dataset):
             if layout in _CANDIDATES:
                 _write_candidates(target, layout, images, sequence, dataset, thresholds, prefixes)
@@ -45,19 +43,19 @@ def convert(
 
 
 def _check(source: Path, layout: str, poses: Path | None, times: Path | None, database: Path | None) -> None:
-    """Raise a SettingsError for arguments that do not belong together."""
+    """Raise a InputError for arguments that do not belong together."""
     is_run, is_trajectory = source.is_dir(), layout in ("tum", "kitti")
     if layout in _CANDIDATES and not is_run:
-        raise SettingsError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got no folder")
+        raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got no folder")
     for name, value, is_needed in (
         ("poses", poses, is_trajectory), ("database", database, is_trajectory and not is_run)
     ):  # fmt: skip
         if is_needed != (value is not None):
             remedy = f"add --{name} PATH" if is_needed else f"remove --{name}"
-            raise SettingsError(f"--{name}: expected {'a path' if is_needed else 'none'} for --layout {layout} of "
+            raise InputError(f"--{name}: expected {'a path' if is_needed else 'none'} for --layout {layout} of "
                                 f"{source}, got {value}; {remedy}")  # fmt: skip
     if times and layout not in ("tum", "shifts"):
-        raise SettingsError(f"--times: expected none for --layout {layout}, which has no times, got {times}")
+        raise InputError(f"--times: expected none for --layout {layout}, which has no times, got {times}")
 
 
 def _dataset_of_run(folder: Path) -> tuple[Dataset, Sequence[float]]:
@@ -67,7 +65,7 @@ def _dataset_of_run(folder: Path) -> tuple[Dataset, Sequence[float]]:
         settings, thresholds = about["settings"]["dataset"], about["ground_truth"].get("thresholds", [])
         thresholds = [] if settings.get("exclude_neighbors") is not None else thresholds  # they are not correct
     if "recall" not in about["settings"]:
-        raise SettingsError(f"{folder}: expected a run of mfvpr evaluate, got one of Python; use "
+        raise InputError(f"{folder}: expected a run of mfvpr evaluate, got one of Python; use "
                             "Result.write_predictions, or mfvpr.io.write_trajectory")  # fmt: skip
     return dataset_of(settings), thresholds
 

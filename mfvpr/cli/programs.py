@@ -1,9 +1,18 @@
-"""The command `mfvpr` and its programs; nothing slow is imported before a program knows what to do."""
+"""The command `mfvpr` and its programs."""
 
+import argparse
+import io
+import pkgutil
+import signal
 import sys
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version as version_of
 from pathlib import Path
+from typing import Any, NoReturn
 
-from mfvpr.cli.launch import Parser, launch, refuse, run_command, version
+from mfvpr import __version__
+from mfvpr.cli.console import one_line, refuse
 
 COMMANDS = {
     "demo": "evaluate the paper's scores on a drawn street",
@@ -47,7 +56,58 @@ def run(program: str) -> None:
         description, add_arguments = _ARGUMENTS[program]
         run_command(f"mfvpr {program}", description, add_arguments)
     else:
-        launch("config" if program == "evaluate" else program)
+        launch(program)
+
+
+_JOBS = {  # command and job of each program with settings
+    "evaluate": ("mfvpr evaluate", "mfvpr.cli.evaluation:evaluate"),
+    "sweep": ("mfvpr sweep", "mfvpr.cli.sweeping:sweep"),
+    "learn": ("mfvpr learn", "mfvpr.cli.learning:learn"),
+    "map": ("mfvpr map build", "mfvpr.cli.localization:build_map"),
+    "localize": ("mfvpr localize", "mfvpr.cli.localization:localize"),
+    "paper": ("python -m experiments.paper", "experiments.paper.program:paper"),
+}
+
+
+def launch(program: str) -> None:
+    """Run a program with the settings of the command line; one line and an exit code for wrong ones."""
+    with one_line():
+        from mfvpr.cli.command_line import run as run_settings  # here, where Ctrl-C is handled
+
+        _prepare_process()
+        command, job = _JOBS[program]
+        run_settings(program, partial(pkgutil.resolve_name, job), command)
+
+
+class Parser(argparse.ArgumentParser):
+    """Command line of a program that has commands instead of settings."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with one line for wrong usage."""
+        refuse(f"{message}; see {self.prog} --help")
+
+
+def run_command(prog: str, description: str, add_arguments: Callable[[Parser], None]) -> None:
+    """Parse the command line, and call the job `package.module:function` that is the parser's default `run`."""
+    with one_line():
+        _prepare_process()
+        parser = Parser(prog=prog, description=description)
+        parser.add_argument("--version", action="version", version=version(), help="print it and exit")
+        add_arguments(parser)
+        arguments: dict[str, Any] = vars(parser.parse_args())
+        pkgutil.resolve_name(arguments.pop("run"))(**arguments)
+
+
+def version() -> str:
+    """Versions of mfvpr, JAX and Python in one line."""
+    return f"mfvpr {__version__} (jax {version_of('jax')}, Python {sys.version.split()[0]})"
+
+
+def _prepare_process() -> None:
+    """Let SIGTERM unwind the stack, and names that the terminal cannot show be printed."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _add_map_commands(parser: Parser) -> None:

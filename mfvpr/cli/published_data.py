@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from mfvpr.cli import console
+from mfvpr.cli.command_line import compose_data_set
+from mfvpr.cli.console import refuse
 from mfvpr.cli.inputs import dataset_of
-from mfvpr.cli.launch import refuse
-from mfvpr.cli.overrides import compose_data_sets
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.datasets.ground_truth import threshold_words
@@ -51,8 +52,10 @@ def list_data(names: list[str]) -> None:
 
 def check_data_set(name: str, settings: list[str], sheet: Path | None) -> None:
     """Print image counts beside the published ones and the ground truth's extent; draw image pairs."""
-    [chosen] = compose_data_sets("check", ":".join([name, *settings]))
-    dataset = dataset_of(chosen)
+    if wrong := [each for each in settings if "=" not in each]:
+        raise InputError(f"{wrong[0]}: expected name=value")
+    values = {key: yaml.safe_load(value) for key, value in (each.split("=", 1) for each in settings)}
+    dataset = dataset_of(compose_data_set("check", name, values))
     cache = FeatureCache(None)
     database, *contents = map(cache.recipes.contents, [dataset.database, *(part.images for part in dataset.sequences)])
     sides = list(_sides(dataset))

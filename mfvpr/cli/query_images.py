@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from mfvpr.cli.console import tell
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
-from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user
 
 POLL = 0.2  # seconds between two looks at a folder
@@ -24,9 +24,9 @@ def images(settings: Mapping[str, Any]) -> Iterator[tuple[str, Path | UInt8[np.n
     paths = [expand_user(path) for path in paths]
     for path in paths:
         if not path.exists():
-            raise SettingsError(f"images={path}: expected an image, a folder or a video, got nothing")
+            raise InputError(f"images={path}: expected an image, a folder or a video, got nothing")
     if settings["watch"] and not (len(paths) == 1 and paths[0].is_dir()):
-        raise SettingsError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
+        raise InputError(f"watch=true: expected images=DIR, one folder, got {settings['images']}")
     for path in paths:
         if settings["watch"]:
             yield from ((canonical_name(image), image) for image in _watch(path))

@@ -9,8 +9,7 @@ from mfvpr.cli import console
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
-from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import InputError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
 _NO_SETTINGS = ("multirun", "command", "cluster")  # added by `command_line`; results do not depend on them
@@ -24,7 +23,7 @@ def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
         try:
             folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
         except InputError as error:
-            raise SettingsError(f"{error} with out=DIR") from error
+            raise InputError(f"{error} with out=DIR") from error
         yield folder
 
 
@@ -57,7 +56,7 @@ def write_files(
             about = {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
             runs.write_about(new, about, ground_truth, settings.get("command"))
     except OSError as error:
-        raise SettingsError(
+        raise InputError(
             f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "
             "matches are kept where there is a store: make room, or name another folder with out=DIR"
         ) from error

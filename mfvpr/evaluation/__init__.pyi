@@ -12,7 +12,6 @@ __all__ = [
     "Ranked",
     "RankedDataset",
     "Recall",
-    "Shard",
     "Split",
     "System",
     "balancing_c",
@@ -21,7 +20,6 @@ __all__ = [
     "confidence_inputs",
     "estimate",
     "evaluation_protocol",
-    "fill_shard",
     "fit_confidence",
     "fuse_scales",
     "halves",
@@ -53,7 +51,6 @@ from .reliability import precision_recall, reliability
 from .selection import Half, best_setting, halves, neighboring_settings, separate
 from .sequence_matching import match_sequence
 from .sequences import DriveFilter
-from .shards import Shard, fill_shard
 from .shortlist_scores import balancing_c, fuse_scales
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

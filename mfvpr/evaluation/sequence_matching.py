@@ -87,16 +87,6 @@ def match_sequence(
     return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.scales))
 
 
-def match_rows(
-    dataset: Dataset, sequence: QuerySequence, pipeline: Pipeline, rows: Sequence[int], cache: FeatureCache
-) -> None:
-    """Match some queries of a sequence, and leave the matches in the folder of the cache for `match_sequence`."""
-    work = _Work.fit(dataset, sequence, pipeline, cache, Stopwatch())
-    stores = _match_stores(work)
-    if not all(store.has_all(rows) for store in stores):
-        _match(work, _find_candidates(work), stores, rows)
-
-
 def _find_candidates(work: _Work) -> RetrievalResult:
     sequence, database, retriever = work.sequence, work.dataset.database, work.pipeline.retriever
     number = num_candidates(work.pipeline.candidates, database)

@@ -212,9 +212,6 @@ def _with_part(whole: Any, part: Any, new: Any) -> Any:
 
 
 def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:
-    for name in ("filter_threshold", "depth_confidence"):
-        if (share := getattr(matcher, name)) is not None and not 0 <= share <= 1:
-            raise InputError(f"{name}={share}: expected a number from 0 to 1")
     dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
     if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
         got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"

@@ -13,6 +13,7 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
+from mfvpr.utils.fields import FLAG, SIZE, check_fields, setting, whole, word_of
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth
 _SMALLEST_MAP = 2
@@ -35,14 +36,21 @@ class D2NetFeatures(NetworkExtractor):
 
     vector_size = 0  # no global descriptor
     model: D2Net = field(repr=False)
-    image_size: tuple[int, int] = (336, 336)
-    interpolation: Interpolation = "pil_bilinear"
-    preprocessing: Preprocessing = "caffe"
-    multiscale: bool = False
-    max_keypoints: int | None = None
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting(
+        (336, 336),
+        SIZE,
+        "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many",
+    )
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    preprocessing: Preprocessing = setting("caffe", word_of(Preprocessing))
+    multiscale: bool = setting(False, FLAG)
+    max_keypoints: int | None = setting(
+        None, whole(1, 20_000) | None, "the highest scores are kept; null = all, as in the paper"
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         smallest = round((_SMALLEST_MAP + 1) * STRIDE / min(self._network_scales))
         require_at_least("D2-Net, multi-scale" if self.multiscale else "D2-Net", self.image_size, smallest)
 

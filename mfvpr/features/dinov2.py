@@ -1,7 +1,7 @@
 """DINOv2's features of patches (Oquab et al., TMLR 2024): tokens, or values of the attention as in EffoVPR."""
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from mfvpr.features.network import NetworkExtractor, require_network
 from mfvpr.networks.imagenet import of_unit_length
 from mfvpr.networks.vit import PATCH, VisionTransformer, require_patches
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import SIZE, check_fields, number, setting, whole, word_of
 
 Facet = Literal["token", "query", "key", "value"]
 
@@ -42,22 +43,27 @@ class Dinov2Features(NetworkExtractor):
     """
 
     model: VisionTransformer = field(repr=False)
-    image_size: tuple[int, int] = (336, 336)
-    interpolation: Interpolation = "pil_bilinear"
-    facet: Facet = "token"
-    block: int = -1
-    threshold: float = 0.0
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting((336, 336), SIZE, "width, height, multiples of 14")
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    facet: Facet = setting(
+        "token",
+        word_of(Facet),
+        "token: the normalized tokens after the block; query, key, value: parts of the block's attention",
+    )
+    block: int = setting(-1, whole(-24, 23), "from the last, -1, backward; or from the first, 0, forward")
+    threshold: float = setting(
+        0.0,
+        number(0, 1),
+        "keep patches with at least this share of the class token's largest attention to a patch; 0 = all",
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require_network("DINOv2", self.model, VisionTransformer)
         require_patches(self.image_size)
-        if self.facet not in get_args(Facet):
-            raise InputError(f"facet={self.facet}: expected one of {', '.join(get_args(Facet))}")
         if not -(depth := len(self.model.blocks)) <= self.block < depth:
             raise InputError(f"block={self.block}: expected from {-depth} to {depth - 1}, a block of this network")
-        if not 0 <= self.threshold <= 1:
-            raise InputError(f"threshold={self.threshold}: expected from 0, which keeps all patches, to 1")
 
     @property
     def vector_size(self) -> int:

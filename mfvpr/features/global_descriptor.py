@@ -11,6 +11,7 @@ from mfvpr.features.network import NetworkExtractor
 from mfvpr.networks.imagenet import Images, Pixels, of_unit_length
 from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,12 @@ class MixVprDescriptor(NetworkExtractor):
 
     image_size = IMAGE_SIZE
     model: MixVPR = field(repr=False)  # 4096, 512 or 128 numbers with published weights
-    interpolation: Interpolation = "pil_bicubic"
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    interpolation: Interpolation = setting(
+        "pil_bicubic",
+        word_of(Interpolation),
+        "the authors' demo, OpenVPRLab; pil_bilinear (training), torch_bilinear (VPR-methods-evaluation)",
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
 
 class DescriptorNetwork(Protocol):
@@ -59,12 +64,15 @@ class GlobalDescriptor(NetworkExtractor):
     """
 
     model: DescriptorNetwork = field(repr=False)
-    image_size: tuple[int, int] = (640, 480)
-    interpolation: Interpolation = "pil_bilinear"
-    components: int | None = None
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting((640, 480), SIZE, "width, height")
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    components: int | None = setting(
+        None, whole(1, 4096) | None, "how many of the first of 4096, 512 or 128 are kept; null = all"
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         self.model.require(self.image_size)
         if self.components is not None and not self.model.has_components:
             raise InputError(f"components={self.components}: expected None, since these weights have no whitening")

@@ -14,6 +14,7 @@ from mfvpr.features.network import NetworkExtractor, require_network
 from mfvpr.networks.netvlad import VggNetVlad
 from mfvpr.networks.vgg import STRIDE
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import POSITIVE, SIZE, check_fields, list_of, setting, whole, word_of
 
 _MIDDLE = (STRIDE - 1) // 2  # px from a position's first pixel, as published: a half is dropped
 
@@ -34,16 +35,26 @@ class PatchNetVladFeatures(NetworkExtractor):
     """
 
     model: VggNetVlad = field(repr=False)
-    image_size: tuple[int, int] = (640, 480)
-    interpolation: Interpolation = "pil_bilinear"
-    patch_sizes: tuple[int, ...] = (5,)
-    scale_weights: tuple[float, ...] | None = field(default=None, metadata={"recipe": False})
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting((640, 480), SIZE, "width, height")
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    patch_sizes: tuple[int, ...] = setting(
+        (5,),
+        list_of(whole(1, 64)),
+        "positions of the map, 16 px each; of several, each is a scale, scored by itself",
+    )
+    scale_weights: tuple[float, ...] | None = setting(
+        None,
+        list_of(POSITIVE) | None,
+        "of the scales' scores, each standardized over a query's candidates; null = 1 each",
+        recipe=False,
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require_network("Patch-NetVLAD", self.model, VggNetVlad)
         columns, rows = self._map_size
-        if not self.patch_sizes or not 1 <= min(self.patch_sizes) <= max(self.patch_sizes) <= min(columns, rows):
+        if max(self.patch_sizes) > min(columns, rows):
             raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected sizes from 1 to {min(columns, rows)}, as "
                              f"a map of {columns} x {rows} positions has room for")  # fmt: skip
         if len(set(self.patch_sizes)) < len(self.patch_sizes):

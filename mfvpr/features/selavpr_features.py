@@ -10,6 +10,7 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, require_network
 from mfvpr.networks.selavpr import LOCAL, SelaVpr
 from mfvpr.networks.vit import PATCH, require_patches
+from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
 
 _STEP = PATCH / 4  # px between positions of the local map, which was upsampled twice
 _MIDDLE = (PATCH - 1) / 2  # px from a patch's first pixel to its middle
@@ -31,11 +32,12 @@ class SelaVprFeatures(NetworkExtractor):
     """
 
     model: SelaVpr = field(repr=False)
-    image_size: tuple[int, int] = (224, 224)
-    interpolation: Interpolation = "torch_no_antialias"
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting((224, 224), SIZE, "width, height, multiples of 14")
+    interpolation: Interpolation = setting("torch_no_antialias", word_of(Interpolation))
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require_network("SelaVPR", self.model, SelaVpr)
         require_patches(self.image_size)
 

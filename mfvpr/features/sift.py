@@ -1,6 +1,6 @@
 """OpenCV SIFT as RootSIFT (Lowe, IJCV 2004; Arandjelovic & Zisserman, CVPR 2012): local features without a download."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from mfvpr.core.types import Features
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
+from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SIZE, check_fields, setting, whole, word_of
 
 
 @dataclass(frozen=True)
@@ -22,12 +23,19 @@ class Sift:
     """
 
     vector_size = 0  # no global descriptor
-    image_size: tuple[int, int] = (336, 336)
-    interpolation: Interpolation = "pil_bilinear"
-    max_keypoints: int | None = 800
-    contrast_threshold: float = 0.01
-    clahe_clip: float = 0.0
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    image_size: tuple[int, int] = setting(
+        (336, 336),
+        SIZE,
+        "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many",
+    )
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    max_keypoints: int | None = setting(800, whole(1, 20_000) | None, "the highest scores are kept; null = all")
+    contrast_threshold: float = setting(0.01, POSITIVE, "low: the strongest max_keypoints are kept, in dark images too")
+    clahe_clip: float = setting(0.0, NOT_NEGATIVE, "local histogram equalization before detection; 0 = off")
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @property
     def scales(self) -> tuple[Scale, ...]:

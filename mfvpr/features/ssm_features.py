@@ -15,7 +15,7 @@ from mfvpr.features.network import NetworkExtractor, compile_network
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
 from mfvpr.utils.whitening import Whitening
 
 CHANNELS = 512
@@ -37,9 +37,11 @@ class SsmMaps(NetworkExtractor):
     model: SsmVgg = field(repr=False)
     stage: Literal[1, 2]
     image_size: tuple[int, int]
-    interpolation: Interpolation = "pil_bilinear"
-    preprocessing: Preprocessing = "torch"
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    preprocessing: Preprocessing = setting(
+        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
+    )
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -97,10 +99,12 @@ class SsmWindows(_WhitenedWindows):
 
     image_size, stage = STAGE1_SIZE, 1
     model: SsmVgg = field(repr=False)
-    interpolation: Interpolation = "pil_bilinear"
-    preprocessing: Preprocessing = "torch"
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    preprocessing: Preprocessing = setting(
+        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
+    )
     whitening: WindowFitting | Whitening = STAGE1_FITTING
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     @property
     def windows(self) -> Windows:
@@ -131,16 +135,19 @@ class SsmCells(_WhitenedWindows):
 
     vector_size, stage = 0, 2  # no global descriptor; the second stage's map
     model: SsmVgg = field(repr=False)
-    image_size: tuple[int, int] = (336, 336)
-    interpolation: Interpolation = "pil_bilinear"
-    preprocessing: Preprocessing = "torch"
-    stride: int = 1
+    image_size: tuple[int, int] = setting(
+        (336, 336), SIZE, "width, height: 40 x 40 cells; [224, 224]: 26 x 26, [448, 448]: 54 x 54"
+    )
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    preprocessing: Preprocessing = setting(
+        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
+    )
+    stride: int = setting(1, whole(1, 8), "positions of the map, 8 px each, from cell to cell")
     whitening: WindowFitting | Whitening = STAGE2_FITTING
-    batch_size: int = field(default=8, metadata={"recipe": False})
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise InputError(f"stride={self.stride}: expected positions from cell to cell, from 1")
+        check_fields(self)
         self.windows  # noqa: B018  # refuses images that are too small
 
     @property

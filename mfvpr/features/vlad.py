@@ -14,6 +14,7 @@ from jaxtyping import Float
 from mfvpr.core.types import Features
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT, INDEX, POSITIVE, check_fields, setting, whole
 
 # Chosen so that R@1 hardly depends on the input's last bits, with SIFT and with ALIKED, summer against snow.
 _VARIANCE = 0.015  # of a word's Gaussian, in squared lengths of descriptors
@@ -38,12 +39,13 @@ class VladFitting:
         InputError: `max_samples` is less than `num_words`.
     """
 
-    num_words: int = 64
-    power: float = 0.5
-    max_samples: int = 100_000
-    seed: int = 0
+    num_words: int = setting(64, whole(1, 4096))
+    power: float = setting(0.5, POSITIVE)
+    max_samples: int = setting(100_000, COUNT)
+    seed: int = setting(0, INDEX)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.max_samples < self.num_words:
             raise InputError(f"max_samples={self.max_samples}: expected at least one for each of "
                              f"num_words={self.num_words} words")  # fmt: skip

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from mfvpr.core.types import Array
 from mfvpr.features.extractor import Extractor
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.numerics import free_host_bytes
 from mfvpr.utils.whitening import Whitening, fit_bytes, fit_whitening
@@ -77,12 +78,15 @@ class WindowFitting:
         seed: of the random images and windows. (The public code has no seed.)
     """
 
-    dimension: int
-    max_images: int | None = 250
-    max_windows: int | None = 10_000
-    zero_row: bool = False
+    dimension: int = setting(100, whole(1, 4096), "that are learned from the database and kept")
+    max_images: int | None = setting(250, COUNT | None, "of the database to learn from; null = all")
+    max_windows: int | None = setting(10_000, COUNT | None, "of these images; null = all")
+    zero_row: bool = setting(False, FLAG, "learn from a row of zeros as well, as the public code may")
     dtype: Literal["float32", "float64"] = "float32"
-    seed: int = 0
+    seed: int = setting(0, INDEX)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def sample_rows(self, num_images: int) -> list[int]:
         """Rows of the images to learn from."""

@@ -10,7 +10,7 @@ from mfvpr.evaluation.image_sizes import Note
 from mfvpr.evaluation.system import System
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError, check
+from mfvpr.systems.choices import check_system
 from mfvpr.utils.errors import InputError
 
 _ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
@@ -30,18 +30,18 @@ def read_declaration(folder: Path) -> dict[str, Any]:
                          "`Map.create`, or open a map of a system of your own with `Map(folder, system)`.")  # fmt: skip
     settings = json.loads(content)
     try:
-        check(settings)
-    except SettingsError as error:
+        check_system(settings)
+    except InputError as error:
         raise InputError(f"{folder}: {error}") from None
     return settings
 
 
 def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
-    settings = read_declaration(folder) | {"cohort": None, "previous_queries": 0}
+    settings = read_declaration(folder)
     try:
         return assembly.system(settings)
-    except SettingsError as error:
+    except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 
 

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from mfvpr.core.matching import at_least_one, distance_ratio, make_matches, slot_numbers
 from mfvpr.core.nearest import lines_of, nearest, ready
 from mfvpr.core.types import Features, Matches, short_repr, value
+from mfvpr.matchers.matcher import CHUNK_SIZE
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT, check_fields, number, setting
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 if TYPE_CHECKING:  # Flax takes half a second
@@ -39,11 +41,18 @@ class LightGlueMatcher:
 
     weights: Packed
     network: str = field(metadata={"static": True})
-    filter_threshold: float = 0.1
-    depth_confidence: float | None = None
-    chunk_size: int | None = field(default=None, metadata={"static": True})
+    filter_threshold: float = setting(
+        0.1, number(0, 1), "matches are kept whose assignment, their confidence, is above it"
+    )
+    depth_confidence: float | None = setting(
+        None, number(0, 1) | None, "leave layers out once more than this share of keypoints is sure; null = never"
+    )
+    chunk_size: int | None = setting(None, COUNT | None, CHUNK_SIZE, static=True)
 
     __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     def of(cls, model: "LightGlue", **options: Any) -> "LightGlueMatcher":

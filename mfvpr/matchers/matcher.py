@@ -13,7 +13,10 @@ from mfvpr.core.matching import filter_matches, match_prepared, pairs_at_once, p
 from mfvpr.core.nearest import CrossCheck, Product, Query, ready
 from mfvpr.core.types import Array, Features, Matches, value
 from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.fields import COUNT, check_fields, number, setting, word_of
 from mfvpr.utils.numerics import as_array, compiled, is_concrete
+
+CHUNK_SIZE = "pairs matched at once; null = 1 on a CPU, elsewhere what a small part of its memory holds"
 
 
 class Matcher(Protocol):
@@ -48,14 +51,18 @@ class NearestNeighborMatcher:
     which of two neighbors is taken whose products differ by less than the rounding of float32.
     """
 
-    cross_check: CrossCheck = field(default="mutual", metadata={"static": True})
-    max_distance: float | None = None
-    max_matches: int | None = field(default=None, metadata={"static": True})
-    chunk_size: int | None = field(default=None, metadata={"static": True})
+    cross_check: CrossCheck = setting(
+        "mutual", word_of(CrossCheck), "candidate: the nearest of every candidate keypoint, of SSM-VPR", static=True
+    )
+    max_distance: float | None = setting(None, number(1e-6, 2) | None, "keep matches at most this far apart, in (0, 2]")
+    max_matches: int | None = setting(
+        None, COUNT | None, "keep at most this number of matches, the closest ones; null = all", static=True
+    )
+    chunk_size: int | None = setting(None, COUNT | None, CHUNK_SIZE, static=True)
     product: Product | None = field(default=None, metadata={"static": True, "recipe": False})
 
     def __post_init__(self) -> None:
-        require_word("cross_check", self.cross_check, CrossCheck)
+        check_fields(self)
         if self.product is not None:
             require_word("product", self.product, Product)
 

@@ -1,6 +1,6 @@
 """Systems from settings: checked values become an extractor, a retrieval, a matcher, scorers and their fusion.
 
-Read first: settings (rules and checks), assembly (settings -> System).
+Read first: choices (the settings of each choice, from fields of dataclasses), assembly (settings -> System).
 """
 
 import lazy_loader

@@ -1,8 +1,6 @@
 __all__ = [
-    "SettingsError",
     "assembly",
-    "settings",
+    "choices",
 ]
 
-from . import assembly, settings
-from .settings import SettingsError
+from . import assembly, choices

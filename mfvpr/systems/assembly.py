@@ -1,14 +1,16 @@
 """Turn checked settings into the parts of a system, by fixed tables: nothing named in a YAML file is called."""
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from mfvpr import features
 from mfvpr.baselines import SCORERS
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
 from mfvpr.core.parameters import parameters_of
@@ -28,8 +30,8 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
-from mfvpr.systems.settings import SettingsError
 from mfvpr.utils import recipe_of
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -59,8 +61,8 @@ def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | 
     if name != "sift":
         return _network_extractor("features", name, options)
     if (kind := options["interpolation"]).startswith("torch"):
-        raise SettingsError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
-    return Sift(**_require_fields(options, Sift, "features=sift"))
+        raise InputError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
+    return Sift(**options)
 
 
 def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
@@ -76,13 +78,11 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
     if name == "import":
         return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":
-        return Retrieval(
-            Aggregated(local, VladFitting(**_require_fields(options, VladFitting, "retrieval=vlad"))), search
-        )
+        return Retrieval(Aggregated(local, VladFitting(**options)), search)
     if name != "same":
         return Retrieval(_network_extractor("retrieval", name, options), search)
     if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise SettingsError("retrieval=same: expected features with a global descriptor, such as patch_netvlad, "
+        raise InputError("retrieval=same: expected features with a global descriptor, such as patch_netvlad, "
                             "selavpr or dinov2; choose another retrieval")  # fmt: skip
     return Retrieval(local, search)
 
@@ -95,7 +95,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
         title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's retrieval"}[name]
         expected = list(extractor_class.image_size)
-        raise SettingsError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
+        raise InputError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model = _network(group, networks, options.pop("weights", None))
     if (group, name) == ("retrieval", "dinov2"):
@@ -106,7 +106,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
         published = extractor_class.whitening
         replaced = {field.name for field in fields(published)} & options.keys()
         options["whitening"] = replace(published, **{option: options.pop(option) for option in replaced})
-    return extractor_class(model, **_require_fields(options, extractor_class, f"{group}={name}"))
+    return extractor_class(model, **options)
 
 
 def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | MatchFiles:
@@ -116,8 +116,7 @@ def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | Matc
         return _match_files(options, data)
     weights = options.pop("weights", None)
     if name == "neighbors":
-        return NearestNeighborMatcher(**_require_fields(options, NearestNeighborMatcher, "matching=neighbors"))
-    options = _require_fields(options, LightGlueMatcher, "matching=lightglue")
+        return NearestNeighborMatcher(**options)
     return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
 
 
@@ -136,10 +135,10 @@ def _match_files(settings: Mapping[str, Any], data: Dataset | None) -> MatchFile
 def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dict[Path, File]:
     """Files of another program, by folder of the images."""
     if data is None:
-        raise SettingsError(f"{group}: files of other programs belong to a data set; choose others")
+        raise InputError(f"{group}: files of other programs belong to a data set; choose others")
     queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
     if len(queries) not in (1, len(data.sequences)):
-        raise SettingsError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
+        raise InputError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
                             f"got {len(queries)}")  # fmt: skip
     files = {} if settings["database"] is None else {
         data.database.root: File(expand_user(settings["database"]), settings["database_prefix"])
@@ -148,7 +147,7 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
-            raise SettingsError(
+            raise InputError(
                 f"{group}.queries={path}: expected the file and the prefix of {group}.database, since the queries and "
                 f"the database are one folder, {root}; give one file with all of its images for both"
             )
@@ -157,11 +156,16 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
 
 def pipeline(settings: Mapping[str, Any], data: Dataset | None) -> Pipeline:
     """The pipeline that the settings name; files of other programs need their data set."""
-    local = extractor(settings["features"], data)
-    retrieval = retriever(settings["retrieval"], local, data)
-    size = settings["features"]["image_size"]
+    local_settings, finding, matching = (settings[group] for group in ("features", "retrieval", "matching"))
+    with in_group("features", local_settings):
+        local = extractor(local_settings, data)
+    with in_group("retrieval", finding):
+        retrieval = retriever(finding, local, data)
+    with in_group("matching", matching):
+        match = matcher(matching, data)
+    size = local_settings["image_size"]
     pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
-    return Pipeline(local, retrieval, matcher(settings["matching"], data), settings["candidates"], pixels)
+    return Pipeline(local, retrieval, match, settings["candidates"], pixels)
 
 
 def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:
@@ -173,19 +177,22 @@ def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """All of a system but its pipeline: the main scorer is fused with the retrieval."""
     chosen, fusing = scorers(settings["scorer"]), fusion(settings)
     main = main_scorer(chosen)
-    fusing.check(main, tuple(chosen))
-    fused = {main: fusing}
+    with in_group("fusion", settings["fusion"]):
+        fusing.check(main, tuple(chosen))
     headline = fusing.system(main) if settings["final"] == "combined" else main
-    correlated = {headline: FrameCorrelation(previous)} if (previous := settings["previous_queries"]) else {}
-    methods: Any = settings.get("sequence") or ()  # files of earlier versions lack it
-    methods = [methods] if isinstance(methods, str) else methods
+    previous, sequence = settings.get("previous_queries"), settings.get("sequence") or ()  # maps have none
+    methods: list[Any] = [sequence] if isinstance(sequence, str) else [*sequence]
     if len({*methods}) < len(methods):
-        raise SettingsError(f"sequence=[{','.join(methods)}]: expected every method once")
+        raise InputError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
-        "scorers": chosen, "fused": fused, "correlated": correlated, "ties": settings["ties"],
-        "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {}, "final": headline,
+        "scorers": chosen,
+        "fused": {main: fusing},
+        "correlated": {headline: FrameCorrelation(previous)} if previous else {},
+        "ties": settings["ties"],
+        "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {},
+        "final": headline,
         "settings": settings,
-    }  # fmt: skip
+    }
 
 
 def main_scorer(scorers: Mapping[str, Any]) -> str:
@@ -205,7 +212,7 @@ def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
     """A network of one of these names, with its converted weights."""
     known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
     if weights not in known:
-        raise SettingsError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
+        raise InputError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)
 
 
@@ -219,7 +226,7 @@ def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     variants = [each for name, values in by_scorer(settings).items() for each in _variants(name, values)]
     names = [name for name, _ in variants]
     if repeated := [name for name in names if names.count(name) > 1]:
-        raise SettingsError(f"scorer: expected every scorer once, got {repeated[0]} twice; leave out one of its "
+        raise InputError(f"scorer: expected every scorer once, got {repeated[0]} twice; leave out one of its "
                             "weights, or rename a file of weights")  # fmt: skip
     return dict(variants)
 
@@ -250,29 +257,35 @@ def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or several, by name."""
-    return {
-        name: from_values(SCORERS[values["method"]], _without(values, "method"))
-        for name, values in expand_weights(settings).items()
-    }
+    return {name: _scorer(name, values) for name, values in expand_weights(settings).items()}
 
 
-def from_values(method: type, values: Mapping[str, Any]) -> Any:
-    """Create a scorer from plain values by field; a weight is a word, or the path of a file."""
-    parameters = parameters_of(method)
-    return method(
-        **{
-            name: NAMED_WEIGHTS[plain] if name == "weight" else parameters[name].value(plain)
-            for name, plain in values.items()
-        }
-    )
+def _scorer(name: str, values: Mapping[str, Any]) -> Scorer:
+    """A scorer from plain values by field: a weight is a word, null is no limit, a list a tuple of numbers."""
+    scorer = SCORERS[values["method"]]
+    parameters = parameters_of(scorer)
+    fields: dict[str, Any] = {}
+    for field, plain in _without(values, "method").items():
+        if field == "weight":
+            fields[field] = named_weight(plain)
+        elif plain is None:
+            fields[field] = parameters[field].none
+        else:
+            fields[field] = tuple(map(float, plain)) if parameters[field].length else plain
+    with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
+        return scorer(**fields)
+
+
+@contextmanager
+def in_group(group: str, names: Collection[str]) -> Iterator[None]:
+    """Put the group in front of the name of a setting that an error of a dataclass begins with."""
+    try:
+        yield
+    except InputError as error:
+        if re.split("[=:]", str(error), maxsplit=1)[0] not in names:
+            raise
+        raise InputError(f"{group}.{error}") from error
 
 
 def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in names}
-
-
-def _require_fields(options: dict[str, Any], extractor: type, choice: str) -> dict[str, Any]:
-    """The options, if they all are fields of the extractor; others come from a mixture of two choices."""
-    if unknown := options.keys() - {field.name for field in fields(extractor)}:
-        raise SettingsError(f"{choice} has no setting {', '.join(sorted(unknown))}; see --help")
-    return options

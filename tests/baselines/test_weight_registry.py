@@ -15,7 +15,7 @@ from mfvpr import HistogramOfShifts
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, provenance, read_weight, write_weight
 from mfvpr.core.weights import WEIGHTS
-from mfvpr.systems.assembly import from_values
+from mfvpr.systems.assembly import scorers
 from tests.builders import random_matches
 from tests.programs import results, shared, small, typed
 
@@ -67,7 +67,7 @@ def test_weights_of_the_package_have_a_provenance(name):
 
 
 def test_the_file_of_a_user(file, monkeypatch):
-    scorer = from_values(HistogramOfShifts, {"weight": str(file)})
+    scorer = scorers({"method": "histogram", "weight": str(file)})["histogram"]
     jax.tree.map(np.testing.assert_array_equal, scorer.weight, WEIGHT)
     assert float(scorer(MATCHES)) == float(HistogramOfShifts(weight=WEIGHT)(MATCHES)) > 0
     assert NAMED_WEIGHTS[str(file)] is scorer.weight

@@ -15,7 +15,7 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
-from mfvpr.cli.launch import one_line
+from mfvpr.cli.console import one_line
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry

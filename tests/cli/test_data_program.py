@@ -60,9 +60,9 @@ def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["check", "gardens_point"], "has no default of root"),
+    (["check", "gardens_point"], "dataset.root: expected a value"),
     (["check", "gardens_point", "root=/no/such"], "expected the folder of gardens_point, got nothing"),
-    (["check", "garden"], "expected data sets such as"),
+    (["check", "garden"], "Could not find 'dataset/garden'"),
     (["check"], "the following arguments are required: NAME"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(program, arguments, words):

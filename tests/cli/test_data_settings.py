@@ -1,7 +1,6 @@
 """Data settings in the programs: ground truth, excluded images, image reading."""
 
 import json
-import os
 import shutil
 
 import numpy as np
@@ -144,4 +143,3 @@ def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     monkeypatch.setattr("mfvpr.cli.evaluation.evaluate", calls.append)
     succeed("evaluate")
     assert (calls[0]["cache"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
-    assert os.environ.get("MFVPR_CACHE", "unset") == (value or "unset")

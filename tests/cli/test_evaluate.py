@@ -11,9 +11,10 @@ from PIL import Image
 
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.baselines import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
-from mfvpr.cli import evaluation
-from mfvpr.systems import assembly, settings
-from mfvpr.systems.settings import CONF, SettingsError
+from mfvpr.cli import evaluation, schema
+from mfvpr.systems import assembly
+from mfvpr.systems.choices import CONF
+from mfvpr.utils.errors import InputError
 from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run
 
 pytestmark = pytest.mark.thorough
@@ -34,15 +35,15 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
         "address": ["cluster.address=tcp://localhost:8786"],
     }
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
-    programs = {"experiment": ["sweep"], "system": ["config", "sweep", "learn"], "grid": ["learn"]}
-    for config in programs.get(group, ["config"]):
-        settings.check(composed(f"{group}={choice}", *needs, config=config))
+    programs = {"experiment": ["sweep"], "system": ["evaluate", "sweep", "learn"], "grid": ["learn"]}
+    for config in programs.get(group, ["evaluate"]):
+        schema.check(config, composed(f"{group}={choice}", *needs, config=config))
 
 
 @pytest.mark.parametrize("features", ["sift", "aliked"])
 def test_features_of_a_named_system_may_be_replaced(features):
     config = composed("system=ssm_hist", f"features={features}")
-    settings.check(config)
+    schema.check("evaluate", config)
     assert (config["features"]["name"], config["retrieval"]["name"]) == (features, "ssm")
     assert config["features"]["image_size"] == [336, 336]
     assert (config["candidates"], config["scorer"]["method"]) == (50, "histogram")
@@ -52,15 +53,15 @@ def test_features_of_a_named_system_may_be_replaced(features):
     (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
     (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),
     (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
-    (["features=aliked", "features.image_size=null"], "features.image_size=null: expected width and height"),
+    (["features=aliked", "features.image_size=null"], "features.image_size=null: expected a list of 2"),
     (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate, since"),
     (["scorer=grid", "features=ssm", "matching=lightglue"], "cross_check=lightglue: expected candidate, since"),
     (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
 ])  # fmt: skip
 def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
-    with pytest.raises(SettingsError, match=words):
-        settings.check(composed(*arguments))
-    settings.check(composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
+    with pytest.raises(InputError, match=words):
+        schema.check("evaluate", composed(*arguments))
+    schema.check("evaluate", composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
 
 
 def test_scorers_of_conf_are_as_their_fields_say():
@@ -79,8 +80,8 @@ def test_scorers_of_conf_are_as_their_fields_say():
 def test_values_without_meaning_are_refused(name, value):
     config = OmegaConf.create(composed())
     OmegaConf.update(config, name, value)
-    with pytest.raises(SettingsError, match=f"{name}=.*expected a number from 1e-06"):
-        settings.check(OmegaConf.to_container(config))
+    with pytest.raises(InputError, match=f"{name}=.*expected a number from 1e-06"):
+        schema.check("evaluate", OmegaConf.to_container(config))
 
 
 @pytest.mark.slow

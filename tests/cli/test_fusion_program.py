@@ -5,8 +5,8 @@ import json
 import pytest
 
 from mfvpr import HistogramOfShifts, RatioWeight
-from mfvpr.cli import axes, evaluation
-from mfvpr.systems import assembly, settings
+from mfvpr.cli import axes, evaluation, schema
+from mfvpr.systems import assembly
 from tests.programs import composed, csv_rows, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
@@ -52,11 +52,11 @@ def test_weights_choose_what_is_fused():
 @pytest.mark.parametrize(("arguments", "features", "side"), [([], "aliked", 320), (["features=sift"], "sift", 336)])
 def test_our_system_ranks_by_the_histogram_of_ratios(arguments, features, side):
     config = composed("system=mfvpr", *arguments)
-    settings.check(config)
+    schema.check("evaluate", config)
     assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
     rankings = assembly.rankings(config)
     assert rankings["scorers"] == {"histogram": HistogramOfShifts(weight=RatioWeight())}
     assert rankings["final"] == "histogram"
     config = composed("system=mfvpr", *arguments, "grid.sigma=[10]", config="sweep")
-    settings.check(config)
+    schema.check("sweep", config)
     assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]

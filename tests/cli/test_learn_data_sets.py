@@ -5,8 +5,10 @@ import json
 from types import SimpleNamespace
 
 import pytest
+import yaml
 
-from mfvpr.cli import evaluation, learning, overrides
+from mfvpr.cli import evaluation, learning
+from mfvpr.cli.command_line import compose_data_set, compose_data_sets
 from mfvpr.datasets.streets import streets_folder
 from tests.programs import QUERIES, composed, results, small
 
@@ -17,8 +19,14 @@ SHORT = ("scorer=sum", "steps=2", "every=1", "batch=4", "grid.c=[1]", "grid.weig
 
 def as_text(street, name):
     """A synthetic street's folder, in the words of a list of data sets."""
-    index = f"ground_truth=index:index_file={street}/ground_truth.csv:widen_index=true"
-    return f"folder:name={name}:database={street}/database:queries={street}/queries:{index}"
+    index = f"ground_truth: index, index_file: {street}/ground_truth.csv, widen_index: true"
+    return f"{{folder: {{name: {name}, database: {street}/database, queries: {street}/queries, {index}}}}}"
+
+
+def read(text):
+    """The settings of a data set of such a list."""
+    [(name, values)] = yaml.safe_load(text).items()
+    return compose_data_set("report", name, values)
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +40,10 @@ def streets(root):
 def learned(root, streets, tmp_path_factory):
     """On the small data set and another, reported on a third."""
     out = tmp_path_factory.mktemp("learned")
-    common = (*SHORT, f"report='{streets[2]}'")
+    common = (*SHORT, f"report=[{streets[2]}]")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
-        learning.learn(composed(*small(root), *common, f"also='{streets[1]}'", f"out={out}/out", config="learn"))
+        learning.learn(composed(*small(root), *common, f"also=[{streets[1]}]", f"out={out}/out", config="learn"))
     return out, results(out / "out")
 
 
@@ -59,28 +67,19 @@ def test_results_and_tables_name_the_sets(learned):
     assert sorted(path.name for path in (out / "out" / "weights").iterdir())[0] == "other_sets_match_labels.json"
 
 
-def test_several_sets_as_they_are_typed(streets):
-    typed_so = overrides.split_first([f"dataset={streets[0]},{streets[1]}", "report=corridor:root=/a,b:c", "steps=3"])
-    assert typed_so[:2] == ["dataset=folder", "dataset.name=street0"]
-    assert typed_so[-3:] == [f"also={streets[1]}", "report=corridor:root=/a,b:c", "steps=3"]
-    assert overrides.split_first(["dataset=streets", "dataset.root=/a:b,c"]) == [
-        "dataset=streets",
-        "dataset.root=/a:b,c",
-    ]
-    assert overrides.split_first(["dataset=streets:seed=3"]) == ["dataset=streets", "dataset.seed=3"]
-    [named] = overrides.parse_data_sets("report", "corridor:root=/a,b:c")
-    assert named == ["corridor", "root=/a,b:c"]
-    [corridor, drawn] = overrides.compose_data_sets("report", "corridor:root=/a,b:c,streets:seed=4")
+def test_several_sets_as_they_are_typed():
+    [corridor, drawn] = compose_data_sets("report", [{"corridor": {"root": "/a,b:c"}}, {"streets": {"seed": 4}}])
     assert corridor["database"] == "/a,b:c/ref"
     assert (drawn["name"], learning.label(drawn)) == ("streets", "streets 4")
+    assert compose_data_sets("report", ["streets"])[0]["seed"] == 0
 
 
 def test_images_that_were_learned_on_are_not_reported_on_and_queries_count_once(root, streets, tmp_path, refuse):
-    again = streets[1].replace("name=street1", "name=again")
+    again = streets[1].replace("name: street1", "name: again")
     for report, name, other, same in (
         (streets[0], "report=street0", "folder", 2 * QUERIES), (f"{streets[1]},{again}", "again", "street1", QUERIES),
     ):  # fmt: skip
-        error = refuse("learn", *small(root), *SHORT, f"report={report}", f"out={tmp_path}/out")
+        error = refuse("learn", *small(root), *SHORT, f"report=[{report}]", f"out={tmp_path}/out")
         assert error.startswith(f"error: {name}: expected")
         assert f"; {same} " in error.partition(f" {other}")[2]
 
@@ -89,7 +88,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
     """Other queries of the same database: no set of blocks knows that they show the same places."""
     several = []
     for name, of_queries in (("there", 1), ("back", 2)):
-        database, queries = (overrides.compose_data_sets("report", streets[number])[0] for number in (1, of_queries))
+        database, queries = (read(streets[number]) for number in (1, of_queries))
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
         inputs = learning.prepare(settings, evaluation.Stopwatch())
@@ -114,6 +113,6 @@ def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, t
             line for line in stderr.splitlines() if "was learned" in line
         ]
         assert stderr.count("was learned") == len(warns)
-    [reported] = overrides.compose_data_sets("report", streets[2])
+    reported = read(streets[2])
     learning.prepare(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
     assert "was learned" not in capsys.readouterr().err

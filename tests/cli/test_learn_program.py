@@ -236,7 +236,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
     (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
     (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
-    (["report=streets:seed=-1"], "dataset.seed=-1: expected a whole number from 0"),
+    (["report=[{streets: {seed: -1}}]"], "dataset.seed=-1: expected a whole number from 0"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
     assert words in refuse_at_once("learn", *small(root), *arguments)

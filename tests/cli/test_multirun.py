@@ -12,14 +12,12 @@ SIGMA = "grid.sigma=[10]"
 def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call, succeed):
     monkeypatch.chdir(tmp_path)
     jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
-    code, stdout, stderr = call("sweep", *small(root), "-m", *jobs)
+    code, stdout, stderr = call("sweep", "-m", *small(root), *jobs)
     assert code == 2
     folders = sorted((tmp_path / "runs" / "folder").iterdir())
     assert [f"results: {path.relative_to(tmp_path)}" in stdout for path in folders] == [True, True]
     assert {results(path)["scorer"]["method"] for path in folders} == {"sum", "histogram"}
-    line = "error: candidates=0: expected "
-    assert [text.startswith(line) for text in stderr.splitlines()].count(True) == 3
-    assert stderr.splitlines()[-1].startswith(line)
+    assert stderr.splitlines()[-1].startswith("error: candidates=0: expected ")
     assert "Traceback" not in stderr
     assert [number for number in range(4) if f"job {number}: " in stderr] == [0, 1, 2, 3]
     [joint] = (tmp_path / "runs" / "multirun").iterdir()
@@ -55,13 +53,6 @@ def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, suc
     monkeypatch.chdir(tmp_path)
     stdout, _ = succeed("sweep", "-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
     assert [f"settings of the {name} score" in stdout for name in ("sum", "anchor", "histogram")] == [True] * 3
-
-
-def test_paths_stand_between_commas_in_a_multirun(root, tmp_path, monkeypatch, succeed):
-    outs = f"{tmp_path}/a b,{tmp_path}/it's"
-    monkeypatch.chdir(tmp_path)
-    succeed("sweep", "-m", *small(root), SIGMA, f"out={outs}")
-    assert results(tmp_path / "a b") == results(tmp_path / "it's")
 
 
 @pytest.mark.slow

@@ -25,8 +25,7 @@ from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.report import runs
 from mfvpr.report.query_figures import SequenceFigures
-from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import InputError
+from mfvpr.utils.errors import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
 
 pytestmark = pytest.mark.thorough
@@ -215,7 +214,7 @@ def test_figures_of_chosen_queries(outcome):
     assert query_rows([5, "0002.png", 5], dataset) == [5, 2]
     assert query_rows(7, dataset) == 7
     for incorrect in (24, -1, "nope.png"):
-        with pytest.raises(SettingsError, match=r"rows .*0 to 23, .*0000"):
+        with pytest.raises(InputError, match=r"rows .*0 to 23, .*0000"):
             query_rows([0, incorrect], dataset)
     assert list(page_of(outcome).verdicts([5, 2])) == [5, 2]
 
@@ -371,8 +370,8 @@ def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
         for path in sorted((street / side).iterdir())[:6]:
             shutil.copy(path, place / side / os.fsdecode(b"\xfe" + path.name.encode()))
     out = tmp_path / os.fsdecode(b"out\xff")
-    arguments = [f"dataset.database={place}/database", f"dataset.queries={place}/queries", f"out={out}", "figures=2",
-                 "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
+    arguments = [f"dataset.database='{place}/database'", f"dataset.queries='{place}/queries'", f"out='{out}'",
+                 "figures=2", "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
     stdout, stderr = succeed("evaluate", *small(root), *arguments)
     assert stdout.endswith("out\\udcff/report.html\n")
     assert "warning" not in stderr

@@ -5,13 +5,12 @@ import json
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import axes, evaluation, launch, sweeping
+from mfvpr.cli import axes, evaluation, sweeping
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, small
 
 pytestmark = pytest.mark.thorough
@@ -239,11 +238,3 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
     assert len(computed) == 6 * QUERIES - len(done)
     assert not list(store.glob("folder_sweep-*"))
     assert resumed == sweep(tmp_path / "again", *grid[:1])
-
-
-def test_a_lost_ctrl_c_comes_again():
-    """An exception in a garbage collection callback cannot be caught; it must come again at once, even in a sleep."""
-    start = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        launch.resend_interrupt(SimpleNamespace(exc_type=KeyboardInterrupt)) or time.sleep(20)
-    assert time.monotonic() - start < 10

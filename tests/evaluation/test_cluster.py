@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mfvpr
@@ -17,12 +18,18 @@ from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import Cluster, InputError, Runtime
-from tests.evaluation.test_shards import assert_same
 from tests.storage.extractors import SIFT, TwoScales
 
 pytestmark = pytest.mark.thorough
 
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
+
+
+def assert_same(result, expected):
+    for name, ranked in expected.systems.items():
+        for ranking, expected_ranking in zip(result.systems[name], ranked, strict=True):
+            np.testing.assert_array_equal(ranking.rows, expected_ranking.rows, err_msg=name)
+            np.testing.assert_array_equal(ranking.scores, expected_ranking.scores, err_msg=name)
 
 
 def die_once(flag):

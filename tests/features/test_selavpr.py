@@ -105,7 +105,7 @@ def test_dinov2_gives_features_and_the_global_descriptor(dinov2, tmp_path, featu
 
 @pytest.mark.parametrize(("option", "words"), [
     ("features.image_size=[56,40]", "image_size=[56, 40]: expected multiples of 14, the side of a patch in px"),
-    ("features.image_size=auto", "expected [width, height] for features=dinov2"),
+    ("features.image_size=auto", "features.image_size=auto: expected a list of 2"),
     ("features.block=-2", "block=-2: expected from -1 to 0, a block of this network"),
     ("features.block=24", "features.block=24: expected a whole number from -24 to 23"),
     ("features.facet=attention", "features.facet=attention: expected one of token, query, key, value"),

@@ -11,8 +11,7 @@ from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
-from mfvpr.systems.settings import SettingsError
-from mfvpr.utils import InputError
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 from tests.io.other_programs import feature
 
@@ -52,7 +51,7 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
         if not refused:
             assert build_stage(settings, data).files == {tmp_path: File(expand_user("a.h5"))}
             continue
-        with pytest.raises(SettingsError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
+        with pytest.raises(InputError, match=rf"^{group}\.queries={refused}: .*file .*prefix"):
             build_stage(settings, data)
 
 

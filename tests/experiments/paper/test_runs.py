@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.paper.runs import lock_output
-from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 
 
 @pytest.mark.parametrize("entries", [["figures"], ["runs", "figures", "thesis.tex"]])
@@ -11,7 +11,7 @@ def test_a_folder_with_files_of_others_is_refused(tmp_path, entries):
     for name in entries:
         (tmp_path / name).mkdir()
     with (
-        pytest.raises(SettingsError, match="expected a new or empty folder, or one of this program"),
+        pytest.raises(InputError, match="expected a new or empty folder, or one of this program"),
         lock_output(tmp_path),
     ):
         pass

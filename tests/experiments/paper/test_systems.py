@@ -10,7 +10,7 @@ from experiments.paper.runs import input_fingerprints, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
-from mfvpr.systems.settings import SettingsError
+from mfvpr.utils.errors import InputError
 
 pytestmark = pytest.mark.thorough
 
@@ -64,7 +64,7 @@ def test_data_sets_are_found_by_their_names(tmp_path):
     available, absent, _ = places(None, ["corridor", DRAWN])
     assert ([place.name for place in available], [*absent]) == ([DRAWN], ["corridor"])
     for arguments, words in (((None, ["x"]), "datasets"), ((str(tmp_path / "no"), None), "expected a folder")):
-        with pytest.raises(SettingsError, match=words):
+        with pytest.raises(InputError, match=words):
             places(*arguments)
 
 
@@ -80,7 +80,7 @@ def test_folders_with_positions_in_image_names_are_data_sets(tmp_path):
     assert f"dataset.database={tmp_path}/pitts30k/images/test/database" in settings
     assert "pitts30k_test" in absent
     assert [place.name for place in places(str(tmp_path), ["other"])[0]] == ["other"]
-    with pytest.raises(SettingsError, match="no positions"):
+    with pytest.raises(InputError, match="no positions"):
         places(str(tmp_path), ["no positions"])
 
 

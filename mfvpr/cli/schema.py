@@ -1,0 +1,415 @@
+"""The settings of each program as dataclasses, and of each data set and cluster; Hydra composes them with `conf/`."""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from mfvpr.baselines.scorers import SCORERS
+from mfvpr.core.parameters import parameters_of
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
+from mfvpr.systems.choices import CHOICES, check_group, check_system
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import (
+    COUNT,
+    FLAG,
+    INDEX,
+    NOT_NEGATIVE,
+    PATH,
+    POSITIVE,
+    REQUIRED,
+    TEXT,
+    Rule,
+    Setting,
+    check_values,
+    default_values,
+    list_of,
+    number,
+    one_of,
+    or_list,
+    setting,
+    settings_of,
+    text,
+    whole,
+    word_of,
+)
+
+_SHARE = number(0, 1) | None
+_SEQUENCE = one_of("causal", "lagged", "smoothed")
+_QUERIES = list_of(Rule(lambda value: INDEX.holds(value) or TEXT.holds(value), "a row or a name of a query"))
+_FIGURES = Rule(lambda value: INDEX.holds(value) or _QUERIES.holds(value),
+                "how many (at most 1000000), or a list of rows or names of queries")  # fmt: skip
+_WEIGHTS = Rule(lambda value: value is None, "weights by name, such as {retrieval: 0.5, anchor: 1}, or null")
+_DATA_SETS = list_of(Rule(lambda value: TEXT.holds(value) or (isinstance(value, Mapping) and len(value) == 1),
+                          "a data set, such as streets or {corridor: {root: DIR}}")) | None  # fmt: skip
+_MEMORY = "GB that features of the database may take while they are matched; null = a third of what is free"
+
+
+def _folder() -> str:
+    return os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr"
+
+
+def _compiled() -> Any:
+    return setting(
+        lambda: (os.environ.get("MFVPR_COMPILED") or "true").lower() == "true",
+        FLAG,
+        "keep compiled programs on disk: the next process starts fast",
+    )
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Fusion of scores with that of the retrieval."""
+
+    c: float | str = setting(
+        "auto",
+        NOT_NEGATIVE | one_of("auto", "zscore"),
+        "s = c * retrieval + score (the paper: about 1e6 with D2-Net's scores); auto = equal spread per query; zscore: "
+        "scores are standardized over the candidates of each query and added",
+    )
+    weights: Any = setting(None, _WEIGHTS, "of zscore, 1 each: {retrieval: 0.5, anchor: 1} adds the score of anchor")
+    retrieval_score: RetrievalScore = setting("cosine", word_of(RetrievalScore))
+
+
+@dataclass(frozen=True)
+class RecallSettings:
+    """Which predictions count as correct."""
+
+    tolerances: list[int] = setting((1, 2, 5), list_of(INDEX), "frames")
+    radius: float = setting(25.0, POSITIVE, "meters, where the ground truth has positions")
+    ks: list[int] = setting((1, 5, 10), list_of(COUNT))
+
+
+@dataclass(frozen=True)
+class SystemSettings:
+    """What a program knows of a system, beside its groups."""
+
+    candidates: int | str = setting(50, COUNT | "all", "number of database images that are re-ranked per query, or all")
+    fusion: FusionSettings = field(default=FusionSettings())
+    final: str = setting("score", one_of("score", "combined"), "what decides: the score, or combined with retrieval")
+    ties: Ties = setting("retrieval", word_of(Ties), "equal scores keep the order of retrieval, or of the database")
+
+
+@dataclass(frozen=True)
+class Common(SystemSettings):
+    """What evaluate, sweep and learn know."""
+
+    recall: RecallSettings = field(default=RecallSettings())
+    memory: float | None = setting(None, POSITIVE | None, _MEMORY)
+    devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
+    cache: str | None = setting(
+        lambda: f"{_folder()}/features", PATH | None, "features already taken from the same images; null = none"
+    )
+    compiled: bool = _compiled()
+    on_bad_image: str = setting("fail", one_of("fail", "skip"))
+    out: str | None = setting(None, PATH | None, "run folder; null = runs/<data set>/<time>")
+
+
+@dataclass(frozen=True)
+class Evaluate(Common):
+    """Re-rank a data set and print its recall."""
+
+    figures: Any = setting(
+        6, _FIGURES, "queries shown, with correct and incorrect predictions; or which: [42,48] rows, or names"
+    )
+    previous_queries: int = setting(
+        0, whole(0, 1000), "raise scores near the places of the last N queries (SSM-VPR: 2); needs a drive in order"
+    )
+    sequence: Any = setting(
+        None, or_list(_SEQUENCE) | None, "rank the queries of a drive together (extra rankings); needs a drive in order"
+    )
+    confidence: str | None = setting(
+        None, PATH | None, "confidence.json of a run on other images; null = fit one, on each half of the path"
+    )
+    threshold: float | None = setting(
+        None, _SHARE, "of the confidence: below it the prediction is `no place`; needs confidence"
+    )
+
+
+@dataclass(frozen=True)
+class ChunkSettings:
+    """What is in memory at once; the results do not depend on it."""
+
+    settings: int | None = setting(None, COUNT | None)
+    queries: int | None = setting(None, COUNT | None)
+
+
+@dataclass(frozen=True)
+class Sweep(Common):
+    """Search the parameters of the re-ranking over a whole data set."""
+
+    search: str = setting("grid", one_of("grid", "optuna"))
+    trials: int = setting(200, whole(1, 100_000), "of optuna")
+    seed: int = setting(0, INDEX, "of optuna")
+    split: str | None = setting(
+        None, one_of("first_half", "second_half", "both") | None, "choose on one half of the path, report on the other"
+    )
+    sequence: str | None = setting(None, _SEQUENCE | None, "rank the queries of a drive together")
+    chunk: ChunkSettings = field(default=ChunkSettings())
+
+
+@dataclass(frozen=True)
+class Learn(Common):
+    """Learn the parameters of a score, and the weights of its matches."""
+
+    also: Any = setting(None, _DATA_SETS, "further data sets to learn on, such as [{streets: {seed: 1}}]")
+    report: Any = setting(None, _DATA_SETS, "data sets to report on; null = the other half of the path")
+    split: str | None = setting("both", one_of("first_half", "second_half", "both") | None, "where to learn")
+    loss: str = setting("cross_entropy", one_of("cross_entropy", "recall", "average_precision"))
+    steps: int = setting(200, COUNT)
+    every: int = setting(5, COUNT, "steps from one validation to the next")
+    patience: int = setting(10, COUNT, "validations without gain")
+    batch: int = setting(8, whole(1, 1024), "queries of a step")
+    learning_rate: float = setting(0.01, POSITIVE)
+    inputs: str = setting(
+        "relative", one_of("relative", "absolute"), "of the match weights; relative to the pair's other matches"
+    )
+    hidden: int = setting(16, whole(1, 1024), "width of the network of match weights")
+    checkpoints: str | None = setting(None, PATH | None, "folder of unfinished trainings; null = beside the features")
+    seed: int = setting(0, INDEX)
+
+
+@dataclass(frozen=True)
+class MapBuild(SystemSettings):
+    """Build a map."""
+
+    map: str = setting(REQUIRED, PATH, "folder of the map")
+    compiled: bool = _compiled()
+
+
+@dataclass(frozen=True)
+class Localize:
+    """Localize images in a map; a line of JSON for each."""
+
+    map: str = setting(REQUIRED, PATH, "folder of the map")
+    images: Any = setting(REQUIRED, or_list(PATH), "image, folder of images, or video; or [PATH,PATH]")
+    watch: bool = setting(False, FLAG, "of a folder: localize new images as well, until Ctrl-C")
+    every: int = setting(1, COUNT, "of a video: every so many frames")
+    alternatives: int = setting(5, INDEX, "candidates in each line")
+    recent: int = setting(
+        0, INDEX, "number of newest images to leave out: of a drive that is being added, they show the same place"
+    )
+    confidence: str | None = setting(
+        None, PATH | None, "confidence.json of an evaluation with the same settings; null = that of a calibrated map"
+    )
+    threshold: float | None = setting(None, _SHARE, "of the confidence: below it there is no place")
+    field_of_view: float | None = setting(
+        None, number(5, 179) | None, "of the camera, horizontal, degrees: lines have `shift_angles`"
+    )
+    memory: float | None = setting(None, POSITIVE | None, "GB that features may take; null = a third of what is free")
+    route: float | str | None = setting(
+        None,
+        number(-1000, 1000) | one_of("auto", None),
+        "auto: lines have `route`, the position estimated from all images so far; only for maps in the order of a "
+        "drive. A number is the speed, in rows of the map from one image to the next",
+    )
+    add: bool = setting(
+        False,
+        FLAG,
+        "add every image to the end of the map after it is localized; its name, the absolute path, is its place. An "
+        "image that is in the map is localized among the images before it",
+    )
+    figures: Any = setting(0, _FIGURES, "localizations that are drawn: how many, or which rows or names; needs out")
+    out: str | None = setting(None, PATH | None, "folder of the figures")
+    root: str | None = setting(None, PATH | None, "folder of the map's images, which figures then show")
+    compiled: bool = _compiled()
+
+
+@dataclass(frozen=True)
+class Paper:
+    """The paper's evaluation."""
+
+    data: str | None = setting(None, PATH | None, "folder of data sets; null = the drawn one alone")
+    datasets: list[str] | None = setting(None, list_of(TEXT) | None, "of these; null = all that are there")
+    systems: list[str] | None = setting(None, list_of(TEXT) | None, "null = all whose weights are there")
+    out: str = setting("runs/paper", PATH)
+    cache: str | None = setting(lambda: f"{_folder()}/features", PATH | None)
+    memory: float | None = setting(None, POSITIVE | None, _MEMORY)
+    devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
+    compiled: bool = _compiled()
+
+
+DATA_SET_NAME = text(r"[\w-][\w.-]*", "letters, digits, - and _")
+_PLAIN = ("order", "index", "utm", "none", None)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Folders of images."""
+
+    database: str = setting(REQUIRED, PATH)
+    queries: Any = setting(REQUIRED, or_list(PATH))
+    ground_truth: str | None = setting(
+        None,
+        one_of(*_PLAIN, "label"),
+        "order: query i shows database image i; index: a file of pairs; utm: @easting@northing@ names; label: two csv "
+        "files of name,label; none: rankings only; nothing is assumed",
+    )
+    index_file: str | None = setting(None, PATH | None, "for index: .csv, .npz or .json")
+    widen_index: bool = setting(
+        False, FLAG, "for index: whether database images within recall.tolerances count as well, as in a sequence"
+    )
+    exclude_neighbors: int | None = setting(
+        None, INDEX | None, "where queries are database images: leave those within so many frames out; 0 = itself alone"
+    )
+    orient: bool = setting(True, FLAG, "turn images as their EXIF orientation says")
+    bits: int | None = setting(16, whole(8, 16) | None, "that 16-bit images use, of which the upper 8 are taken")
+
+
+@dataclass(frozen=True)
+class _Folder(_Images):
+    """Two folders of images."""
+
+    database_labels: str | None = setting(None, PATH | None, "for label: .csv with the columns name,label")
+    query_labels: str | None = setting(None, PATH | None)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Streets that are drawn."""
+
+    seed: int = setting(0, INDEX)
+    cache: str = setting(_folder, PATH)
+
+
+@dataclass(frozen=True)
+class _Published:
+    """A published data set."""
+
+    root: str = setting(REQUIRED, PATH)
+    seasons: Any = setting(None, list_of(one_of("fall", "spring", "summer", "winter"), 2), "database, queries")
+
+
+@dataclass(frozen=True)
+class _Workers:
+    """A cluster that is started or connected to."""
+
+    workers: int = setting(2, COUNT, "processes; or jobs of Slurm, one worker each")
+    options: str = setting("--cpus-per-task=4 --mem=16G --time=240", TEXT | "", "of sbatch for each job")
+    address: str = setting(REQUIRED, text(r"(tcp|tls|ucx)://\S+:\d+", "tcp://HOST:PORT"))
+
+
+OTHERS = (_Folder, _Drawn, _Published, _Workers)  # of data sets and clusters
+PROGRAMS: dict[str, type] = {
+    "evaluate": Evaluate, "sweep": Sweep, "learn": Learn, "map": MapBuild, "localize": Localize, "paper": Paper,
+}  # fmt: skip
+
+
+def axes() -> dict[str, Setting]:
+    """Lists of values of the parameters of all scorers that can be swept, and of `max_distance` and `c`."""
+    owners: dict[str, list[Setting]] = {}
+    for method, scorer in SCORERS.items():
+        for name in (name for name, parameter in parameters_of(scorer).items() if parameter.swept):
+            owners.setdefault(name, []).append(CHOICES["scorer"][method][name])
+    # Those of one scorer first.
+    known = {name: each[-1] for name, each in sorted(owners.items(), key=lambda item: len(item[1]) > 1)}
+    known["c"] = Setting(None, NOT_NEGATIVE | "auto")
+    known["max_distance"] = CHOICES["matching"]["neighbors"]["max_distance"]  # of sweeps alone
+    return {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in known.items()}
+
+
+def register() -> None:
+    """Give Hydra the settings of all programs and choices; defaults may depend on variables of the environment."""
+    # Else Hydra copies the store for each group that --help lists, which takes seconds; what it loads is a copy anyway.
+    setattr(ConfigStore, "__deepcopy__", lambda store, memo: store)  # noqa: B010
+    store = ConfigStore.instance().store
+    for program, owner in PROGRAMS.items():
+        store(name=f"{program}_settings", node=default_values(settings_of(owner)))
+    for group, choices in CHOICES.items():
+        for name, known in choices.items():
+            key = "method" if group == "scorer" else "name"
+            store(group=group, name=name, node={key: name, **default_values(known)})
+    axis_lists = default_values(axes())
+    store(name="sweep_axes", node={"grid": {**axis_lists}})
+    del axis_lists["max_distance"]
+    store(name="learn_axes", node={"grid": axis_lists})
+    workers, drawn = default_values(settings_of(_Workers)), default_values(settings_of(_Drawn))
+    store(group="cluster", name="local", node={"name": "local", "workers": workers["workers"]})
+    store(group="cluster", name="slurm", node={"name": "slurm", "workers": 8, "options": workers["options"]})
+    store(group="cluster", name="address", node={"name": "address", "address": workers["address"]})
+    store(group="dataset", name="folder", node={"name": "folder", **default_values(settings_of(_Folder))})
+    store(group="dataset", name="sequences", node={"name": "sequences", **default_values(settings_of(_Images))})
+    for name in ("streets", "streets_seasons"):
+        store(group="dataset", name=name, node={"name": name, **drawn})
+    OmegaConf.register_new_resolver("settings", _describe, replace=True)
+
+
+def schema(program: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that a program knows, by name and group, given the choices of its groups."""
+    known: dict[str, Any] = settings_of(PROGRAMS[program])
+    for group, values in settings.items():
+        if group in CHOICES and isinstance(values, Mapping):
+            known[group] = CHOICES[group].get(values.get("method" if group == "scorer" else "name", ""), {})
+        elif group == "grid":
+            method = settings.get("scorer", {}).get("method")
+            own = CHOICES["scorer"].get(method, {})
+            known[group] = {name: Setting(None, list_of(own[name].rule) | None, own[name].note) if name in own else each
+                            for name, each in axes().items()}  # fmt: skip
+        elif group == "dataset":
+            known[group] = data_set_schema(values)
+        elif group == "cluster":
+            known[group] = {"name": Setting("", one_of("local", "slurm", "address")), **settings_of(_Workers)}
+    return known
+
+
+def data_set_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a data set, by those that it has."""
+    owner = _Drawn if "cache" in settings else _Published if "database" not in settings else _Folder
+    known: dict[str, Any] = {"name": Setting("", DATA_SET_NAME), **settings_of(_Published), **settings_of(owner)}
+    return {name: known[name] for name in settings if name in known}
+
+
+def check(program: str, settings: Mapping[str, Any]) -> None:
+    """Raise an InputError for the first value that is not allowed, by itself or together with others."""
+    known = schema(program, settings)
+    if weights := settings.get("fusion", {}).get("weights"):
+        for name, weight in weights.items():
+            POSITIVE.check(f"fusion.weights.{name}", weight)
+        settings = {**settings, "fusion": {**settings["fusion"], "weights": None}}
+    for name, value in settings.items():
+        if name in CHOICES:
+            check_group(name, value)
+        elif not (name == "cluster" and value is None):
+            check_values(known, {name: value})
+    if "scorer" in settings:
+        check_system(settings)
+    needs = (
+        ("also", "report", "report=[...] as well, to learn on several data sets and report on others"),
+        ("cluster", "cache", "cache=DIR as well, a folder that all workers share"),
+        ("threshold", "confidence", "confidence=FILE as well, of a run on other images with ground truth"),
+    )
+    for name, needed, expected in needs:
+        if settings.get(name) is not None and settings[needed] is None and program != "localize":
+            raise InputError(f"{name}={settings[name]}: expected {expected}")
+    if program == "localize" and settings["figures"] and settings["out"] is None:
+        raise InputError(f"figures={settings['figures']}: expected out=DIR as well, where they are drawn")
+    if settings.get("report"):
+        for group in ("features", "retrieval", "matching"):
+            if (name := settings[group]["name"]) in ("import", "pairs"):
+                raise InputError(f"{group}={name}: expected none with report=, since the files are of one data set")
+        if settings["split"] != "both":
+            raise InputError(f"split={settings['split']}: expected none with report=, since the data sets are it")
+
+
+def _describe(program: str, *, _root_: Any) -> str:
+    """A line for each setting in `--help`, with its value, and what it means."""
+    settings: Any = OmegaConf.to_container(_root_)
+    settings = {name: value for name, value in settings.items() if name != "hydra"}
+    text = "\n".join(_lines(schema(program, settings), settings))
+    return text.replace("$", "$$")  # Hydra fills in names behind $
+
+
+def _lines(known: Mapping[str, Any], settings: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    for name, value in settings.items():
+        about = known.get(name, {})
+        if isinstance(value, Mapping):
+            about = CHOICES["scorer"].get(value.get("method", ""), about)
+            yield f"{indent}{name}:"
+            yield from _lines(about if isinstance(about, Mapping) else {}, value, f"{indent}  ")
+        else:
+            words = [about.note.replace("None", "null"), about.rule.expected] if isinstance(about, Setting) else []
+            shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else value
+            yield f"{indent}{name}: {shown}" + f"  # {'; '.join(filter(None, words))}" * bool(words)

@@ -1,0 +1,228 @@
+"""The choices of each group of settings: which settings a choice has, from the fields of the classes that it makes.
+
+A choice that is named in a file is looked up here; nothing else can be made.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from mfvpr import features
+from mfvpr.baselines.scorers import SCORERS
+from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
+from mfvpr.core.parameters import Parameter, parameters_of
+from mfvpr.core.weights import WEIGHTS
+from mfvpr.features.windows import WindowFitting
+from mfvpr.io.checks import Lengths
+from mfvpr.matchers import LightGlueMatcher, NearestNeighborMatcher
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import (
+    COUNT,
+    FLAG,
+    PATH,
+    POSITIVE,
+    REQUIRED,
+    SIZE,
+    TEXT,
+    Setting,
+    check_values,
+    list_of,
+    number,
+    one_of,
+    or_list,
+    setting,
+    settings_of,
+    text,
+    whole,
+    word_of,
+)
+
+_INSTALLED = Path(__file__).parent / "conf"  # in a wheel; in a clone, it stands beside the package
+CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"
+GROUPS = ("features", "retrieval", "matching", "scorer")
+
+_WHITEN = Setting(
+    None,
+    whole(1, 4096) | None,
+    "principal components that are kept, each of unit variance, fitted on the database; null = as they are",
+)
+_SHAPED = SIZE | whole(10_000, 4096**2) | "auto"  # a number of pixels; fewer than 10,000 are a side that was meant
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Settings of files of another program."""
+
+    database: str = setting(REQUIRED, PATH, "file or folder")
+    queries: str = setting(REQUIRED, or_list(PATH), "likewise; [FILE,FILE,...] of several sequences")
+    database_prefix: str = setting("", TEXT | "", "what stands before the images' names in the file, such as database/")
+    query_prefix: str = setting("", TEXT | "")
+    lengths: Lengths = setting("unit", word_of(Lengths), "of descriptors")
+    image_size: list[int] | None = setting(None, SIZE | None, "width, height, where the files do not tell")
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Settings of matches of another program."""
+
+    matches: str = setting(REQUIRED, or_list(PATH), "file or folder; [FILE,FILE,...] of several sequences")
+    features: str | None = setting(None, PATH | None, "hloc's feats*.h5 that were matched")
+    query_features: str | None = setting(None, PATH | None, "those of the queries, if they are in another file")
+    database_prefix: str = setting("", TEXT | "", "what stands before the images' names in the files")
+    query_prefix: str = setting("", TEXT | "")
+    lengths: Lengths = setting("unit", word_of(Lengths), "of the features' descriptors")
+    image_size: list[int] | None = setting(None, SIZE | None, "width, height of the images that the points are in")
+    verified: bool = setting(False, FLAG, "true: matches that fit a geometric model, of COLMAP or vismatch")
+    confidences: bool = setting(True, FLAG, "false: all matches count alike")
+
+
+def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in names}
+
+
+def _network(weights: str, owner: type, **more: Any) -> dict[str, Any]:
+    """Settings of a network: of its weights, of its extractor, and further ones."""
+    note = "`mfvpr weights list` has all weights"
+    return {"weights": Setting(weights, TEXT, note), **_without(settings_of(owner), "whitening"), **more}
+
+
+def _features() -> dict[str, dict[str, Any]]:
+    files = settings_of(_Files)
+    known = {
+        "sift": settings_of(features.Sift),
+        "aliked": _network("aliked-n16", features.AlikedFeatures),
+        "d2net": _network("d2_tf", features.D2NetFeatures),
+        "ssm": _network("vgg16_places365", features.SsmCells, **settings_of(WindowFitting)),
+        "patch_netvlad": _network("patchnetvlad_mapillary_512", features.PatchNetVladFeatures),
+        "selavpr": _network("selavpr_msls", features.SelaVprFeatures),
+        "dinov2": _network("dinov2_vitl14", features.Dinov2Features),
+        "import": files,
+    }
+    for name in ("sift", "aliked", "d2net"):  # of images of any shape
+        known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
+    del known["sift"]["batch_size"]
+    return known
+
+
+def _retrieval() -> dict[str, dict[str, Any]]:
+    files, whiten = settings_of(_Files), {"whiten": _WHITEN}
+    descriptor = features.GlobalDescriptor
+    fitting: dict[str, Any] = settings_of(WindowFitting)
+    fitting["dimension"] = replace(fitting["dimension"], default=125)
+    pooling = {
+        "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),
+        "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
+    }
+    small = {"image_size": Setting([224, 224], SIZE, "width, height, multiples of 14")}
+    mixvpr = {"image_size": Setting([320, 320], SIZE, "width, height: the only one that its weights are for")}
+    windows = {"image_size": Setting([224, 224], SIZE, "width, height: the only one that it takes")}
+    without_components = _without(_network("", descriptor), "components", "weights")
+    return {
+        "vlad": {**settings_of(features.VladFitting), **whiten},
+        "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **mixvpr, **whiten),
+        "netvlad": _network("netvlad_pitts30k", descriptor, **whiten),
+        "gem": {**_weights("cosplace_resnet50_2048"), **without_components, **whiten},
+        "dinov2": {**_weights("dinov2_vitl14"), **without_components, **small, **pooling, **whiten},
+        "ssm": _network("vgg16_places365", features.SsmWindows, **windows, **fitting),
+        "same": whiten,
+        "import": {**_without(files, "image_size"), **whiten},
+        "pairs": _without(files, "database", "lengths", "image_size"),
+    }
+
+
+def _weights(name: str) -> dict[str, Setting]:
+    return {"weights": Setting(name, TEXT, "`mfvpr weights list` has all weights")}
+
+
+def _matching() -> dict[str, dict[str, Any]]:
+    return {
+        "neighbors": settings_of(NearestNeighborMatcher),
+        "lightglue": {**_weights("aliked_lightglue"), **settings_of(LightGlueMatcher)},
+        "import": settings_of(_Matches),
+    }
+
+
+def _scorer(scorer: type) -> dict[str, Setting]:
+    """Settings of a scorer from its parameters."""
+    known = parameters_of(scorer)
+    return {each.name: _parameter(each.name, known[each.name], each.default) for each in fields(scorer)
+            if each.name in known}  # fmt: skip
+
+
+def _parameter(name: str, parameter: Parameter, default: Any) -> Setting:
+    if name == "weight":
+        files = text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
+        word = next(word for word, weight in WEIGHTS.items() if weight == default)
+        return Setting(word, one_of(*NAMED_WEIGHTS) | files, "a list: a scorer of each")
+    if parameter.choices:
+        rule = one_of(*parameter.choices)
+    else:
+        low, high = parameter.bounds
+        rule = whole(int(low), int(high)) if parameter.whole else number(low, high)
+    rule = list_of(rule, parameter.length) if parameter.length else rule
+    plain = None if default is None or default == math.inf else default
+    plain = [*plain] if isinstance(plain, tuple) else plain
+    rule = rule | None if plain is None else rule
+    return Setting(plain, rule, "; ".join(filter(None, (parameter.unit, parameter.note))))
+
+
+CHOICES: dict[str, dict[str, dict[str, Any]]] = {
+    "features": _features(),
+    "retrieval": _retrieval(),
+    "matching": _matching(),
+    "scorer": {name: _scorer(scorer) for name, scorer in SCORERS.items()},
+}
+"""Settings by group, choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
+
+
+def check_group(group: str, values: Mapping[str, Any]) -> None:
+    """Raise an InputError for a value of a choice that is not allowed, or a setting that the choice does not have."""
+    if group == "scorer" and "method" not in values:
+        for name, each in values.items():
+            _check_choice("scorer", f"scorer.{name}", each, "method")
+    else:
+        _check_choice(group, group, values, "method" if group == "scorer" else "name")
+
+
+def _check_choice(group: str, prefix: str, values: Any, key: str) -> None:
+    choices = CHOICES[group]
+    if not isinstance(values, Mapping) or values.get(key) not in choices:
+        got = values.get(key) if isinstance(values, Mapping) else values
+        raise InputError(f"{prefix}.{key}={got}: expected one of {', '.join(choices)}")
+    known = choices[values[key]]
+    if group == "scorer" and isinstance(values.get("weight"), list) and "weight" in known:
+        known = {**known, "weight": replace(known["weight"], rule=list_of(known["weight"].rule))}
+    check_values(known, _without(values, key), f"{prefix}.")
+
+
+def check_system(settings: Mapping[str, Any]) -> None:
+    """Raise an InputError for settings of a system's groups that are not allowed, by themselves or together."""
+    for group in GROUPS:
+        check_group(group, settings[group])
+    if not isinstance(candidates := settings["candidates"], str) or candidates != "all":
+        COUNT.check("candidates", candidates)
+    _check_scorers(settings)
+
+
+def _check_scorers(settings: Mapping[str, Any]) -> None:
+    """Check scorers against the features: cells of a square grid, and the size of patches."""
+    local, matching, scorer = settings["features"], settings["matching"], settings["scorer"]
+    if scorer.get("method") == "grid":
+        if local["name"] not in ("ssm", "import") and matching["name"] != "import":
+            raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
+        if (check := matching.get("cross_check", matching["name"])) != "candidate":
+            raise InputError(f"matching.cross_check={check}: expected candidate, since scorer=grid takes a match of "
+                             "every cell of the candidate")  # fmt: skip
+        sides = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
+        if local["name"] == "ssm" and sides != [scorer["side"]] * 2:
+            raise InputError(f"scorer.side={scorer['side']}: expected the cells of features.image_size="
+                             f"{local['image_size']}, which are {sides[0]} x {sides[1]}")  # fmt: skip
+    if local["name"] == "patch_netvlad":
+        sizes = [[16 * (pixels // 16 - patch) for pixels in local["image_size"]] for patch in local["patch_sizes"]]
+        for values in [scorer] if "method" in scorer else scorer.values():
+            reach = values.get("size")
+            if reach is not None and min(map(min, sizes)) >= 0 and [[*reach]] != sizes:
+                words = f"{sizes[0]}, the largest place of these patches, or null" if len(sizes) == 1 else "null"
+                raise InputError(f"scorer.size={reach}: expected {words}")
