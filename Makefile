@@ -10,7 +10,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist lo
 FLAGS := --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1
 QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="`cat .venv/.flags`"
 
-.PHONY: demo test test-fast test-all test-wheel setup check conf benchmark clean
+.PHONY: demo test test-fast test-all test-wheel setup check benchmark clean
 
 demo: setup
 	$(BIN)/mfvpr evaluate scorer=demo
@@ -37,9 +37,6 @@ setup: .venv/.setup
 
 check: .venv/.check  ## style and types
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
-
-conf: setup  ## the files of conf/ that follow from the scores' classes
-	$(BIN)/python -m mfvpr.cli.declare
 
 benchmark: .venv/.benchmark
 	$(BIN)/python -m experiments.benchmark

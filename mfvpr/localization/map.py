@@ -303,7 +303,7 @@ def _extractor(system: System) -> Extractor:
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.correlated or system.sequences:
-        raise InputError("a map ranks single images: expected a system without cohort, frame correlation and "
+        raise InputError("a map ranks single images: expected a system without frame correlation and "
                          "sequences; mfvpr.Route follows a drive")  # fmt: skip
     return extractor
 

@@ -199,7 +199,7 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
 
 def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
     settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    systems = (assembly.system({**each, "cohort": None, "previous_queries": 0}) for each in settings)
+    systems = (assembly.system({**each, "previous_queries": 0}) for each in settings)
     first, second = (Map(tmp_path / "map", system) for system in systems)
     images = image_folder(small_street / "database")
     second.build(images)

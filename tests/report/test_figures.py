@@ -9,7 +9,7 @@ from mfvpr.evaluation import precision_recall, reliability
 from mfvpr.report import figures, plots
 from mfvpr.report.pages.charts import line_chart
 
-SYSTEMS = ["retrieval", *(f"histogram + anchor + cohort + retrieval {number}" for number in range(10))]
+SYSTEMS = ["retrieval", *(f"histogram + anchor + sum + retrieval {number}" for number in range(10))]
 QUERY = np.zeros((90, 90, 3), np.uint8)
 P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
 
