@@ -135,7 +135,7 @@ def test_settings_that_pages_name_exist():
     text = re.sub(r"`hydra\.[^`]*`|`\w+=(?:True|False)`", "", "".join(PAGES.values()))  # of Hydra, and of Python
     names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
     assert len(names) > 20
-    groups = {path.name for path in CONF.iterdir() if path.is_dir()}
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*schema.CHOICES, "cluster", "name"}
     known = {name for owner in schema.PROGRAMS.values() for name, _ in flat(settings_of(owner))} | {*schema.axes()}
     known |= {name for choices in schema.CHOICES.values() for each in choices.values() for name in each}
     known |= {name for owner in schema.OTHERS for name in settings_of(owner)}

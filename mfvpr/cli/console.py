@@ -1,6 +1,7 @@
 """Notes, warnings, errors and progress of the programs, on stderr."""
 
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -30,6 +31,7 @@ def one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends, whatever comes
         print("\ninterrupted; what was finished is kept", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # as in `| head`

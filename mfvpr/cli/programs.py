@@ -1,10 +1,12 @@
 """The command `mfvpr` and its programs."""
 
+import _thread
 import argparse
 import io
 import pkgutil
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version as version_of
@@ -72,9 +74,9 @@ _JOBS = {  # command and job of each program with settings
 def launch(program: str) -> None:
     """Run a program with the settings of the command line; one line and an exit code for wrong ones."""
     with one_line():
+        _prepare_process()
         from mfvpr.cli.command_line import run as run_settings  # here, where Ctrl-C is handled
 
-        _prepare_process()
         command, job = _JOBS[program]
         run_settings(program, partial(pkgutil.resolve_name, job), command)
 
@@ -104,10 +106,19 @@ def version() -> str:
 
 
 def _prepare_process() -> None:
-    """Let SIGTERM unwind the stack, and names that the terminal cannot show be printed."""
+    """Let SIGTERM unwind the stack, Ctrl-C never be lost, and names that the terminal cannot show be printed."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    sys.unraisablehook = _interrupt_again
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Repeat a Ctrl-C that was raised where no code can catch it, as in JAX's callback of the garbage collection."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        threading.Timer(0.01, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _add_map_commands(parser: Parser) -> None:

@@ -75,4 +75,6 @@ class _Matrix:
         queries, size = self.matrix.shape
         if len(rows) != queries or (rows.size and (rows.dtype.kind not in "iu" or rows.max() >= size)):
             raise InputError(f"order: expected rows below {size} of {queries} queries, got {rows.dtype}{rows.shape}")
+        if not size:
+            return np.zeros(rows.shape, bool)
         return np.take_along_axis(self.matrix, np.maximum(rows, 0).astype(int), axis=1) & (rows >= 0)

@@ -107,6 +107,6 @@ def test_ctrl_c_is_one_line(tmp_path, seconds):
     time.sleep(seconds)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130, stderr[-2000:]
+    assert process.returncode in (130, -signal.SIGINT), stderr[-2000:]  # a shell sees 130 both times
     assert stderr.splitlines()[-1].startswith("interrupted")
     assert "Traceback" not in stderr

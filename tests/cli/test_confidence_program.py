@@ -201,7 +201,7 @@ def test_confidence_of_what_counted_otherwise_is_said(evaluate):
     first, *_ = evaluate("first", "scorer=paper")
     same = (f"confidence={first}/confidence.json", "scorer=paper")
     for changed, words in (("recall.tolerances=[0]", "recall"), ("candidates=5", "candidates")):
-        _, stderr, _ = evaluate(changed, *same, changed)
+        _, stderr, _ = evaluate(words, *same, changed)
         assert f"other settings of {words}" in stderr
     out, stderr, _ = evaluate("sum", *same, "scorer.sum.weight=fs")
     assert "nothing is said of sum" in stderr

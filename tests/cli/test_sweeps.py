@@ -25,6 +25,7 @@ AXES = {"sigma": [5, 10.0, 22.5], "weight": ["fs", "ratio"]}
 class MyScorer:
     """Total weight of the matches, the less, the larger their shifts."""
 
+    recipe = "my scorer 1"
     sigma: float = 10.0
     weight: mfvpr.Weight = mfvpr.UnitWeight()
 

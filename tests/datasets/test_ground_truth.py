@@ -2,8 +2,6 @@
 
 import json
 import os
-import warnings
-import zipfile
 
 import numpy as np
 import pytest
@@ -210,12 +208,6 @@ def test_excluded_images_are_not_correct():
     assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
 
 
-def twice(path):
-    np.savez(path, query=np.array([0, 1]), database=np.array([0, 1]))
-    with zipfile.ZipFile(path, "a") as archive, warnings.catch_warnings(action="ignore"):
-        archive.writestr("query.npy", archive.read("query.npy"))
-
-
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -234,7 +226,11 @@ def twice(path):
         ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
         ("gt.json", "[[0", "cannot be read"),
         ("gt.npz", "no archive", "cannot be read"),
-        ("gt.npz", {"query": np.array([{"a": 1}], object), "database": np.array([0])}, "got objects or records"),
+        (
+            "gt.npz",
+            {"query": np.array([{"a": 1}], object), "database": np.array([0])},
+            "Object arrays cannot be loaded",
+        ),
         ("gt.json", '{"00": 1, "11": 1}', "expected [[query, [database, ...]], ...]"),
         ("gt.json", '[[0, "12"], [1, "0"]]', "expected [[query, [database, ...]], ...]"),
         (
@@ -245,7 +241,6 @@ def twice(path):
         ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [2, 2]"),
         ("gt.npz", {"query": np.arange(2), "database": np.arange(3)}, "of one length"),
         ("gt.npz", {"other": np.zeros(2)}, "got neither"),
-        ("gt.npz", twice, "got query.npy again"),
         ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
         ("gt.csv", os.mkfifo, "got a pipe"),
         (

@@ -62,7 +62,7 @@ def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, syste
 def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_path):
     without, with_registers = checkpoint(tmp_path), checkpoint(tmp_path, "SelaVPR_reg4_msls", registers=4)
     stderr = program("weights", "add", without, "--as", "selavpr_msls_registers", code=2)
-    assert "1 missing (backbone.registers); use the official SelaVPR_reg4_msls.pth" in stderr
+    assert "backbone.registers missing; use the official SelaVPR_reg4_msls.pth" in stderr
     assert "register_tokens" in program("weights", "add", with_registers, "--as", "selavpr_msls", code=2)
     program("weights", "add", with_registers)
     small = "features.image_size=[28,28]", "candidates=3", "figures=0"
@@ -120,6 +120,6 @@ def test_wrong_settings_of_dinov2_are_one_line(dinov2, option, words):
 
 def test_wrong_weights_are_told(program, tmp_path):
     path = write_zip(tmp_path / "SelaVPR_msls.pth", random_checkpoint(dinov2_shapes(64, 1)))
-    assert "expected the keys of another network, got those of dinov2" in program("weights", "add", path, code=2)
+    assert "keys do not fit the network" in program("weights", "add", path, code=2)
     stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf", code=2)
     assert "features.weights=d2_tf: expected weights of selavpr: one of selavpr_pitts30k" in stderr

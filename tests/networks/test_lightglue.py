@@ -161,7 +161,7 @@ def test_older_names_of_the_published_tensors_are_known():
     expected = convert(tensors, LIGHTGLUE, shapes)
     assert all(np.array_equal(converted[path], expected[path]) for path in shapes)
     twice = {"self_attn.0.Wqkv.bias": tensors["transformers.0.self_attn.Wqkv.bias"]}
-    with pytest.raises(InputError, match=r"1 .*\(self_attn.0.Wqkv.bias .*transformers.0.self_attn.Wqkv.bias\)"):
+    with pytest.raises(InputError, match=r"self_attn.0.Wqkv.bias twice"):
         convert(tensors | twice, LIGHTGLUE, shapes)
 
 

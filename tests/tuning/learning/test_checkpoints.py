@@ -80,6 +80,7 @@ def test_folders_of_something_else_are_refused(tmp_path):
     assert contents(tmp_path) == before
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Orbax leaves an event loop behind
 @pytest.mark.parametrize("damage", ["flipped", "half"])
 def test_damage_is_told_and_the_one_before_still_serves(tmp_path, damage):
     state = {"only": np.random.default_rng(0).normal(size=(20, 30)).astype(np.float32)}
