@@ -366,6 +366,10 @@ def check(program: str, settings: Mapping[str, Any]) -> None:
     """Raise an InputError for the first value that is not allowed, by itself or together with others."""
     known = schema(program, settings)
     if weights := settings.get("fusion", {}).get("weights"):
+        if not isinstance(weights, Mapping):
+            raise InputError(
+                f"fusion.weights={weights}: expected weights by name, such as {{retrieval: 0.5, anchor: 1}}"
+            )
         for name, weight in weights.items():
             POSITIVE.check(f"fusion.weights.{name}", weight)
         settings = {**settings, "fusion": {**settings["fusion"], "weights": None}}

@@ -52,7 +52,9 @@ def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Settings in Hydra's grammar."""
     for name, value in settings.items():
-        if isinstance(value, Mapping):
+        if f"{prefix}{name}" == "fusion.weights" and isinstance(value, Mapping):  # any names, but no group of settings
+            yield f"fusion.weights={{{','.join(f'{scorer}:{weight}' for scorer, weight in value.items())}}}"
+        elif isinstance(value, Mapping):
             yield from _overrides(value, f"{prefix}{name}.")
         elif isinstance(value, str):
             yield override(f"{prefix}{name}", value)

@@ -1,7 +1,6 @@
 """A map as a program of one's own makes, opens and calibrates it."""
 
 import json
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -96,27 +95,13 @@ def test_what_is_there_is_not_added_again(street, small_street):
     assert [line for line in lines if "has 10 of 10 images already, by their names" in line]
 
 
-def with_scales(settings, scales):
-    """Settings as earlier versions wrote them."""
-    histogram = settings["scorer"]["histogram"] | {"scales": scales, "scale_deviation": None}
-    return settings | {"scorer": settings["scorer"] | {"histogram": histogram}}
-
-
-def test_settings_that_were_removed_are_errors_unless_they_changed_nothing(tmp_path):
-    settings = mfvpr.load_system("mfvpr", features="sift", scorer="ratio").settings
-    for scales, words in (([1.0], None), ([0.7, 1.0], r"scorer\.histogram\.scales=\[0\.7, 1\.0\]: .* was removed")):
-        (tmp_path / "run.json").write_text(json.dumps({"settings": with_scales(settings, scales)}))
-        with pytest.raises(InputError, match=words) if words else nullcontext():
-            assert mfvpr.load_system(tmp_path / "run.json").settings == settings
-
-
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
-    """The scores are those of `system=mfvpr` in 0.2.0; its runs open, since they hold settings."""
+    """The scores are those of `system=mfvpr` in 0.2.0."""
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
-    weights = {"fusion.c": "zscore", "fusion.weights": "{retrieval: 0.5, anchor: 1}", "final": "combined"}
+    weights = {"fusion.c": "zscore", "fusion.weights": {"retrieval": 0.5, "anchor": 1}, "final": "combined"}
     more = {"scorer": "ratio", "retrieval": {"num_words": 8}, "candidates": 5}
     fused = mfvpr.load_system("mfvpr", **features, **weights, **more)
-    (tmp_path / "run.json").write_text(json.dumps({"settings": with_scales(fused.settings, [1.0])}))
+    (tmp_path / "run.json").write_text(json.dumps({"settings": fused.settings}))
     system = mfvpr.load_system(tmp_path / "run.json")
     dataset = mfvpr.datasets.folder(small_street / "database", small_street / "database", ground_truth="none")
     result = mfvpr.evaluate(dataset, system, cache=FeatureCache(tmp_path / "cache"))
