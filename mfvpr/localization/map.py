@@ -203,7 +203,8 @@ class Map(MapImages):
         self._refresh_images()
         self.describing.image(noise_image())
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
-        rows = {padded_size(count, self._typical): row for row, count in enumerate(self._counts())}  # one of each size
+        counts = self._counts().tolist()
+        rows = {padded_size(count, self._typical): row for row, count in enumerate(counts)}  # one of each size
         images = self._read_features([*rows.values()])
         for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
             match_and_score(features, images, matcher, self.system.scorers, self._typical)
