@@ -11,7 +11,7 @@ from mfvpr.evaluation import precision_recall, read_confidences, reliability
 from mfvpr.evaluation.system import noise_image
 from tests.programs import QUERIES, csv_rows, small
 
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.slow
 
 SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
 LINES = ("scorer=histogram", "figures=0")

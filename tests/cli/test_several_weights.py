@@ -9,7 +9,7 @@ from mfvpr.cli import evaluation
 from mfvpr.systems import assembly
 from tests.programs import composed, small
 
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.slow
 
 
 def evaluate(root, out, *more):

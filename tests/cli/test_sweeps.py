@@ -16,7 +16,7 @@ from mfvpr.storage import FeatureCache
 from mfvpr.tuning.sweeps import DriveRanking
 from mfvpr.tuning.sweeps import setting_rankings as rankings
 
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.slow
 
 AXES = {"sigma": [5, 10.0, 22.5], "weight": ["fs", "ratio"]}
 

@@ -48,6 +48,7 @@ def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsy
         assert stderr.count("system=steering uses SIFT, because the weights") == notes
 
 
+@pytest.mark.slow
 def test_a_run_records_the_size_that_the_images_decide(tmp_path):
     settings = composed(*small(tmp_path), "features.image_size=19200", f"out={tmp_path}/run", "figures=0")
     evaluation.evaluate(settings | {"multirun": False})
@@ -79,6 +80,7 @@ def test_what_cannot_be_loaded_is_one_line(name, settings, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path):
     arguments = ("system=steering", f"out={tmp_path}/run", "figures=0")
     evaluation.evaluate(composed(*small(tmp_path), *arguments) | {"multirun": False})

@@ -20,7 +20,7 @@ from mfvpr.storage import FeatureCache
 from mfvpr.utils import Cluster, InputError, Runtime
 from tests.storage.extractors import SIFT, TwoScales
 
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.slow
 
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 
@@ -130,7 +130,6 @@ def test_workers_need_the_versions_of_the_client(dataset, cluster, tmp_path, mon
         FeatureCache(tmp_path, runtime=Runtime(cluster=cluster)).describe(dataset.database, SIFT)
 
 
-@pytest.mark.slow
 def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
     extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))

@@ -16,7 +16,7 @@ from mfvpr.utils import InputError
 from tests.builders import map_system
 from tests.localization.test_map import Constant
 
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
