@@ -221,8 +221,9 @@ def _check_scorers(settings: Mapping[str, Any]) -> None:
                              f"{local['image_size']}, which are {sides[0]} x {sides[1]}")  # fmt: skip
     if local["name"] == "patch_netvlad":
         sizes = [[16 * (pixels // 16 - patch) for pixels in local["image_size"]] for patch in local["patch_sizes"]]
-        for values in [scorer] if "method" in scorer else scorer.values():
+        several = {f"scorer.{name}": values for name, values in scorer.items()}
+        for name, values in ({"scorer": scorer} if "method" in scorer else several).items():
             reach = values.get("size")
             if reach is not None and min(map(min, sizes)) >= 0 and [[*reach]] != sizes:
                 words = f"{sizes[0]}, the largest place of these patches, or null" if len(sizes) == 1 else "null"
-                raise InputError(f"scorer.size={reach}: expected {words}")
+                raise InputError(f"{name}.size={reach}: expected {words}")

@@ -12,6 +12,7 @@ from PIL import Image
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.baselines import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from mfvpr.cli import evaluation, schema
+from mfvpr.cli.command_line import override
 from mfvpr.systems import assembly
 from mfvpr.systems.choices import CONF
 from mfvpr.utils.errors import InputError
@@ -94,7 +95,8 @@ def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
             (root / name / f"é {path.name}").write_bytes(path.read_bytes())
     (root / "database" / "é 0003.png").write_bytes(b"")
     Image.new("RGB", (30, 30)).save(root / "queries" / "é 0005.png")
-    arguments = ["dataset=folder", f"dataset.database={root}/database", f"dataset.queries={root}/queries",
+    arguments = ["dataset=folder", override("dataset.database", root / "database"),
+                 override("dataset.queries", root / "queries"),
                  "dataset.ground_truth=order", *QUICK, "candidates=99", f"out={tmp_path}/out"]  # fmt: skip
 
     assert "é 0003.png: expected an image file" in refuse("evaluate", *arguments)

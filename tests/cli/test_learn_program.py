@@ -232,10 +232,9 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     (["scorer=count"], "scorer=count: expected one to learn"),
     (["scorer=all"], "scorer: expected one to learn"),
     (["recall.tolerances=[30]"], "smaller tolerances or radius"),
-    (["also=streets"], "also=streets: expected report="),
-    (["report=streets", "split=first_half"], "split=first_half: expected none with report="),
-    (["report=streets:sed=1"], "report=streets:sed=1: streets has no setting sed"),
-    (["report=streets", "retrieval.name=pairs"], "retrieval=pairs: expected none with report="),
+    (["also=[streets]"], "expected report=[...] as well"),
+    (["report=[streets]", "split=first_half"], "split=first_half: expected none with report="),
+    (["report=[{streets: {sed: 1}}]"], "streets has no setting sed"),
     (["report=[{streets: {seed: -1}}]"], "dataset.seed=-1: expected a whole number from 0"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):

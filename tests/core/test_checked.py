@@ -368,7 +368,7 @@ def test_bfloat16_is_taken_for_long_descriptors_where_it_is_faster(monkeypatch):
         checked.choose_product("bfloat16", long, long, "none", 2)
     with pytest.raises(ValueError, match="product='half': expected one of bfloat16, float32"):
         mfvpr.NearestNeighborMatcher(product="half")
-    with pytest.raises(ValueError, match="cross_check='x': expected one of"):
+    with pytest.raises(ValueError, match="cross_check=x: expected one of"):
         mfvpr.NearestNeighborMatcher(cross_check="x")
     with pytest.raises(ValueError, match="expected one of bfloat16, float32"):
         mfvpr.match_candidates(long, stack([long]), product="half")
