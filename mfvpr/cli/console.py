@@ -30,6 +30,8 @@ def one_line() -> Iterator[None]:
     """Exit with 2 and one line for wrong input, with 130 for Ctrl-C, 141 for a closed stdout; a bug is a traceback."""
     try:
         yield
+    except SystemExit:  # before Hydra's errors, whose import is slow
+        raise
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends, whatever comes
         print("\ninterrupted; what was finished is kept", file=sys.stderr)
