@@ -7,6 +7,7 @@ import pkgutil
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version as version_of
@@ -106,9 +107,10 @@ def version() -> str:
 
 
 def _prepare_process() -> None:
-    """Let SIGTERM unwind the stack, Ctrl-C never be lost, and names that the terminal cannot show be printed."""
+    """Let SIGTERM unwind the stack, Ctrl-C never be lost, and names and warnings be printed."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     sys.unraisablehook = _interrupt_again
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 

@@ -115,7 +115,7 @@ def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["database features", "queries to match"])
+@pytest.mark.parametrize("stage", ["database features", "query folder features"])
 def test_ctrl_c_leaves_nothing(small_street, tmp_path, interrupt, stage):
     command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -44,8 +45,10 @@ def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch
 def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
     for more, notes in (((), 1), (("features=sift",), 0)):
-        _, stderr = output_of(monkeypatch, capsys, "evaluate", "system=steering", "candidates=0", *more, code=2)
-        assert stderr.count("system=steering uses SIFT, because the weights") == notes
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            output_of(monkeypatch, capsys, "evaluate", "system=steering", "candidates=0", *more, code=2)
+        assert sum("system=steering uses SIFT" in str(warning.message) for warning in caught) == notes
 
 
 @pytest.mark.slow
