@@ -11,7 +11,7 @@ import pytest
 from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.choices import CONF, GROUPS, choices_of
 from mfvpr.utils.fields import flat, settings_of
 from tests.needs import needs
 from tests.programs import QUICK, ROOT, composed, run, typed
@@ -135,9 +135,9 @@ def test_settings_that_pages_name_exist():
     text = re.sub(r"`hydra\.[^`]*`|`\w+=(?:True|False)`", "", "".join(PAGES.values()))  # of Hydra, and of Python
     names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
     assert len(names) > 20
-    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*schema.CHOICES, "cluster", "name"}
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*GROUPS, "cluster", "name"}
     known = {name for owner in schema.PROGRAMS.values() for name, _ in flat(settings_of(owner))} | {*schema.axes()}
-    known |= {name for choices in schema.CHOICES.values() for each in choices.values() for name in each}
+    known |= {name for group in GROUPS for each in choices_of(group).values() for name in each}
     known |= {name for owner in schema.OTHERS for name in settings_of(owner)}
     assert {*names} <= {name.rpartition(".")[2] for name in known} | groups
 

@@ -62,9 +62,14 @@ def _hydra_errors() -> tuple[type[Exception], ...]:
 def explain(error: Exception) -> str:
     """Hydra's error in one line."""
     text = " ".join((str(error) or str(error.__cause__)).split())
-    text = text.partition(" Config search path")[0].partition(" See https")[0]
+    for rest in (" Config search path", " See https", " To append to your config", " object_type="):
+        text = text.partition(rest)[0]
     if new := _new_name(text):
-        return f"{text.partition('.')[0]}; its name is {new} now"
+        return f"{text.removesuffix('.')}; its name is {new} now"
+    if text.startswith("Could not override"):
+        return f"{text.removesuffix('.')}: there is no such setting here; --help lists all"
+    if text.startswith("Missing mandatory value"):
+        return f"{text.rpartition(' ')[2]}: expected a value"
     if "viable alternative" in text or "mismatched input" in text or "NoViableAlt" in text:
         return f"{text}; put quotes around a value with special characters: 'NAME=\"VALUE\"'"
     return text

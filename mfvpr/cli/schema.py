@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.parameters import parameters_of
 from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
-from mfvpr.systems.choices import CHOICES, check_group, check_system
+from mfvpr.systems.choices import GROUPS, check_group, check_system, choices_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
     COUNT,
@@ -85,7 +85,7 @@ class RecallSettings:
 
 @dataclass(frozen=True)
 class SystemSettings:
-    """What a program knows of a system, beside its groups."""
+    """Settings of a system, beside its groups."""
 
     candidates: int | str = setting(50, COUNT | "all", "number of database images that are re-ranked per query, or all")
     fusion: FusionSettings = field(default=FusionSettings())
@@ -95,7 +95,7 @@ class SystemSettings:
 
 @dataclass(frozen=True)
 class Common(SystemSettings):
-    """What evaluate, sweep and learn know."""
+    """Settings that evaluate, sweep and learn share."""
 
     recall: RecallSettings = field(default=RecallSettings())
     memory: float | None = setting(None, POSITIVE | None, _MEMORY)
@@ -131,7 +131,7 @@ class Evaluate(Common):
 
 @dataclass(frozen=True)
 class ChunkSettings:
-    """What is in memory at once; the results do not depend on it."""
+    """Sizes of the blocks of a sweep; the results do not depend on them."""
 
     settings: int | None = setting(None, COUNT | None)
     queries: int | None = setting(None, COUNT | None)
@@ -303,11 +303,11 @@ def axes() -> dict[str, Setting]:
     owners: dict[str, list[Setting]] = {}
     for method, scorer in SCORERS.items():
         for name in (name for name, parameter in parameters_of(scorer).items() if parameter.swept):
-            owners.setdefault(name, []).append(CHOICES["scorer"][method][name])
+            owners.setdefault(name, []).append(choices_of("scorer")[method][name])
     # Those of one scorer first.
     known = {name: each[-1] for name, each in sorted(owners.items(), key=lambda item: len(item[1]) > 1)}
     known["c"] = Setting(None, NOT_NEGATIVE | "auto")
-    known["max_distance"] = CHOICES["matching"]["neighbors"]["max_distance"]  # of sweeps alone
+    known["max_distance"] = choices_of("matching")["neighbors"]["max_distance"]  # of sweeps alone
     return {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in known.items()}
 
 
@@ -318,8 +318,8 @@ def register() -> None:
     store = ConfigStore.instance().store
     for program, owner in PROGRAMS.items():
         store(name=f"{program}_settings", node=default_values(settings_of(owner)))
-    for group, choices in CHOICES.items():
-        for name, known in choices.items():
+    for group in GROUPS:
+        for name, known in choices_of(group).items():
             key = "method" if group == "scorer" else "name"
             store(group=group, name=name, node={key: name, **default_values(known)})
     axis_lists = default_values(axes())
@@ -341,13 +341,13 @@ def schema(program: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that a program knows, by name and group, given the choices of its groups."""
     known: dict[str, Any] = settings_of(PROGRAMS[program])
     for group, values in settings.items():
-        if group in CHOICES and isinstance(values, Mapping):
-            known[group] = CHOICES[group].get(values.get("method" if group == "scorer" else "name", ""), {})
+        if group in GROUPS and isinstance(values, Mapping):
+            known[group] = choices_of(group).get(values.get("method" if group == "scorer" else "name", ""), {})
         elif group == "grid":
             method = settings.get("scorer", {}).get("method")
-            own = CHOICES["scorer"].get(method, {})
-            known[group] = {name: Setting(None, list_of(own[name].rule) | None, own[name].note) if name in own else each
-                            for name, each in axes().items()}  # fmt: skip
+            of_scorer = choices_of("scorer").get(method, {})
+            own_axes = {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in of_scorer.items()}
+            known[group] = {name: own_axes.get(name, each) for name, each in axes().items()}
         elif group == "dataset":
             known[group] = data_set_schema(values)
         elif group == "cluster":
@@ -374,7 +374,7 @@ def check(program: str, settings: Mapping[str, Any]) -> None:
             POSITIVE.check(f"fusion.weights.{name}", weight)
         settings = {**settings, "fusion": {**settings["fusion"], "weights": None}}
     for name, value in settings.items():
-        if name in CHOICES:
+        if name in GROUPS:
             check_group(name, value)
         elif not (name == "cluster" and value is None):
             check_values(known, {name: value})
@@ -410,7 +410,7 @@ def _lines(known: Mapping[str, Any], settings: Mapping[str, Any], indent: str = 
     for name, value in settings.items():
         about = known.get(name, {})
         if isinstance(value, Mapping):
-            about = CHOICES["scorer"].get(value.get("method", ""), about)
+            about = choices_of("scorer").get(value.get("method", ""), about)
             yield f"{indent}{name}:"
             yield from _lines(about if isinstance(about, Mapping) else {}, value, f"{indent}  ")
         else:

@@ -1,4 +1,4 @@
-"""What a scorer is: a function from the matches of one pair to a score."""
+"""The contract of a scorer: a function from the matches of one pair to a score."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar

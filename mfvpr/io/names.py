@@ -47,8 +47,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         candidates = {}
         for row in (row for row, match in enumerate(matched) if match is None):
             spelling = spellings(printable(names[row]))[0]
-            others = by_file[PurePosixPath(spelling).name]
-            candidates[row] = {name for name, parts in others if _has_same_end(parts, _parts(spelling))}
+            named_alike = by_file[PurePosixPath(spelling).name]
+            candidates[row] = {name for name, parts in named_alike if _has_same_end(parts, _parts(spelling))}
         _choose(path, names, candidates, matched)
     return matched
 

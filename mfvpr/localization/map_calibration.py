@@ -81,11 +81,11 @@ def write_confidence(
 ) -> None:
     """Keep the confidence of the ranking that decides in a map, whose other `parts` are written first."""
     try:
-        made = _fingerprint(system)
+        of_system = _fingerprint(system)
     except TypeError as error:
         warnings.warn(f"{error}: the confidence is not kept on disk", stacklevel=3)
         return
-    content = {"system": made, "queries": len(data.correct), "absent_queries": data.num_absent}
+    content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
     content["confidence"] = vars(confidence)
     file.write({**parts, "confidence": json.dumps(content).encode()})
 
@@ -96,10 +96,10 @@ def read_confidence(file: MapFile, system: System) -> Confidence | None:
         return None
     content = json.loads(part)
     try:
-        made = _fingerprint(system)
+        of_system = _fingerprint(system)
     except TypeError:
-        made = None
-    if content["system"] != made:
+        of_system = None
+    if content["system"] != of_system:
         raise InputError(f"{file.folder}: expected the confidence of this map's system, got that of another system or "
                          "version; calibrate again")  # fmt: skip
     return confidence_from_json(content["confidence"])

@@ -237,7 +237,7 @@ class MapImages:
         self.refresh()
 
     def _parts(self) -> dict[str, bytes]:
-        """What a new file gets first: recipe and settings; nothing if they are there."""
+        """Recipe and settings, the first content of a new file; nothing if they are there."""
         check_declaration(self._file, self.system)  # another process may have written it first
         parts = {"recipe": self._recipe}
         if self.system.settings is not None:

@@ -67,7 +67,7 @@ class NearestNeighborMatcher:
             require_word("product", self.product, Product)
 
     def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Query:
-        """What matching needs of the queries `[B, N0]`."""
+        """The queries `[B, N0]` in the form that matching needs."""
         options = candidates, self.cross_check, chunk_size, self.product
         return jax.vmap(lambda query: prepare_query(query, *options))(queries)
 

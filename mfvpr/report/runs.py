@@ -19,7 +19,7 @@ from mfvpr.report.tables import Table, format_value, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.locks import lock, lock_folder
+from mfvpr.utils.locks import lock_folder
 from mfvpr.utils.versions import versions
 
 _UNFINISHED = ".unfinished"
@@ -152,7 +152,7 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
     """Add a finished run to the joint table in the folder of its multirun; jobs may end at the same time."""
     job = {"job": number, "overrides": dict(overrides), "run": str(run), "rows": list(_rows(run))}
     multirun.mkdir(parents=True, exist_ok=True)
-    with lock(multirun, os.O_RDONLY | os.O_DIRECTORY, lambda _: None):
+    with lock_folder(multirun, None):
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
         jobs = sorted([*known, job], key=lambda job: job["job"])
         names = dict.fromkeys(name for job in jobs for name in job["overrides"])

@@ -83,8 +83,8 @@ class Descriptions:
         for part in parts:
             items = self.parts[part]
             unknown = [row for row in rows if self.counts[part, row] < 0 and row not in self.bad]
-            found = ordered_map(lambda row, items=items: items.get(self.keys[row]), unknown, workers=THREADS)
-            for row, item in zip(unknown, found, strict=True):
+            read = ordered_map(lambda row, items=items: items.get(self.keys[row]), unknown, workers=THREADS)
+            for row, item in zip(unknown, read, strict=True):
                 if item is not None:
                     self.counts[part, row] = _count(item)
                     continue

@@ -1,7 +1,7 @@
 """A map on disk: one SQLite file with a write-ahead log, which many processes read while one writes.
 
-A row is in the file whole or not at all, also after a kill or on a full disk, and rows keep their order. Its features
-and the vocabulary have a checksum, and so have name, place and global descriptor together.
+A row is in the file whole or not at all, also after a kill or on a full disk, and rows keep their order. Everything
+has a checksum: the settings and other parts, features, and name, place and global descriptor together.
 """
 
 import json
@@ -28,12 +28,11 @@ from mfvpr.utils.files import clip_middle
 from mfvpr.utils.locks import lock_folder
 
 FILE = "map.sqlite"  # in the folder of the map
-DEEPEST = 50  # levels of a place: Python's JSON reads fewer levels, the more functions are called already
 _FORMAT = 3
 _WAIT = 60  # seconds for another process that writes
 _AT_ONCE = 500  # rows of a query, whose number of parameters is limited
 _SCHEMA = """
-CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL);
+CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL);
 CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,
                       vector BLOB NOT NULL, checksum INTEGER NOT NULL);
 CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL);
@@ -69,18 +68,21 @@ class MapFile:
             raise InputError(f"{folder}: expected a new or empty folder, or a map; name another")
 
     def part(self, name: str) -> bytes | None:
-        """A part that was written: settings, vocabulary or confidence; None if it was not."""
+        """A part that was written: settings, vocabulary or confidence; None if it was not. InputError if damaged."""
+        query = "SELECT value, checksum FROM parts WHERE name = ?"
         with self._reading() as database:
-            found = database and database.execute("SELECT value FROM parts WHERE name = ?", [name]).fetchone()
-        return found[0] if found else None
+            row: tuple[bytes, int] | None = database and database.execute(query, [name]).fetchone()
+        if row is None:
+            return None
+        content, checksum = row
+        if zlib.crc32(content) != checksum:
+            raise InputError(f"{self._path}: the {name} is damaged. Put back a copy, or build the map again.")
+        return content
 
     def arrays(self, name: str) -> dict[str, np.ndarray] | None:
-        """Arrays that were written as a part; an InputError if they are damaged."""
+        """Arrays that were written as a part."""
         content = self.part(name)
-        try:
-            return None if content is None else unpack_arrays(content, name)
-        except InputError:
-            raise InputError(f"{self._path}: the {name} is damaged. Put back a copy, or build the map again.") from None
+        return None if content is None else unpack_arrays(content, name)
 
     def entries(self, start: int) -> Iterator[tuple[int, Entry]]:
         """(row, entry) of all rows from `start` on, in their order; an InputError if one is damaged or missing."""
@@ -155,7 +157,8 @@ class MapFile:
             database.execute(f"PRAGMA user_version = {_FORMAT}")
             parts = {"id": uuid.uuid4().bytes, **parts}
         self._check_id(database)
-        database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?)", parts.items())
+        of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
+        database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?, ?)", of_parts)
         [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
         for row, (arrays, entry) in enumerate(images, first):
             name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # ASCII: names may be no UTF-8
@@ -191,11 +194,11 @@ class MapFile:
     def _connect(self, *, create: bool) -> sqlite3.Connection:
         """The connection, a new one if the file was replaced."""
         status = self._path.stat() if self._path.exists() else None
-        if self._database is None or status is None or (status.st_dev, status.st_ino) != self._stamp:
-            if not create and not os.access(self.folder, os.W_OK):
-                how = "?mode=ro&immutable=1"  # without the files of a log beside it
-            else:
-                how = "?mode=rwc" if create else "?mode=rw"
+        is_readonly = not create and not os.access(self.folder, os.W_OK)
+        if is_readonly or self._database is None or status is None or (status.st_dev, status.st_ino) != self._stamp:
+            how = "?mode=rwc" if create else "?mode=rw"
+            if is_readonly:  # `immutable` needs no files of a log beside it, but would not see the rows in one
+                how = "?mode=ro" if self._path.with_name(f"{FILE}-wal").exists() else "?mode=ro&immutable=1"
             self._database = sqlite3.connect(
                 self._path.as_uri() + how, uri=True, timeout=_WAIT, isolation_level=None, check_same_thread=False
             )
@@ -242,17 +245,6 @@ def check_entry(name: Any, place: Any) -> None:
         text = json.dumps(place, allow_nan=False)
         if place is None or json.loads(text) != place:
             raise ValueError(f"{clip_middle(repr(place), 80)}, which JSON gives back as {clip_middle(text, 80)}")
-        if _levels(place) > DEEPEST:
-            raise RecursionError
-    except RecursionError:
-        message = f"{name}: expected a place of at most {DEEPEST} levels, got a deeper one; flatten it"
-        raise InputError(message) from None
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
                          "lists, and dictionaries by text") from None  # fmt: skip
-
-
-def _levels(place: Any) -> int:
-    """Depth of nested lists and dictionaries."""
-    parts = place.values() if isinstance(place, dict) else place
-    return 1 + max(map(_levels, parts), default=0) if isinstance(place, dict | list) else 0

@@ -30,6 +30,7 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
+from mfvpr.systems.choices import without
 from mfvpr.utils import recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
@@ -52,7 +53,7 @@ _NETWORK_EXTRACTORS = {
 
 def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
     """The extractor of local features, or the feature files of another program."""
-    name, options = settings["name"], _without(settings, "name", "image_size")
+    name, options = settings["name"], without(settings, "name", "image_size")
     size = tuple(settings["image_size"]) if isinstance(settings["image_size"], list) else None
     if name == "import":
         return FeatureFiles(_files("features", options, data), options["lengths"], size)
@@ -67,7 +68,7 @@ def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | 
 
 def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
-    name, options = settings["name"], _without(settings, "name", "whiten")
+    name, options = settings["name"], without(settings, "name", "whiten")
     if name == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None, **settings}, data), settings["database_prefix"])
     if name == "ssm":
@@ -111,7 +112,7 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
 
 def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | MatchFiles:
     """The matcher of an image pair, or the match files of another program."""
-    name, options = settings["name"], _without(settings, "name")
+    name, options = settings["name"], without(settings, "name")
     if name == "import":
         return _match_files(options, data)
     weights = options.pop("weights", None)
@@ -265,7 +266,7 @@ def _scorer(name: str, values: Mapping[str, Any]) -> Scorer:
     scorer = SCORERS[values["method"]]
     parameters = parameters_of(scorer)
     fields: dict[str, Any] = {}
-    for field, plain in _without(values, "method").items():
+    for field, plain in without(values, "method").items():
         if field == "weight":
             fields[field] = named_weight(plain)
         elif plain is None:
@@ -285,7 +286,3 @@ def in_group(group: str, names: Collection[str]) -> Iterator[None]:
         if re.split("[=:]", str(error), maxsplit=1)[0] not in names:
             raise
         raise InputError(f"{group}.{error}") from error
-
-
-def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in names}

@@ -6,6 +6,7 @@ A choice that is named in a file is looked up here; nothing else can be made.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +79,15 @@ class _Matches:
     confidences: bool = setting(True, FLAG, "false: all matches count alike")
 
 
-def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+def without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """The settings but for those of some names."""
     return {name: value for name, value in settings.items() if name not in names}
 
 
 def _network(weights: str, owner: type, **more: Any) -> dict[str, Any]:
     """Settings of a network: of its weights, of its extractor, and further ones."""
     note = "`mfvpr weights list` has all weights"
-    return {"weights": Setting(weights, TEXT, note), **_without(settings_of(owner), "whitening"), **more}
+    return {"weights": Setting(weights, TEXT, note), **without(settings_of(owner), "whitening"), **more}
 
 
 def _features() -> dict[str, dict[str, Any]]:
@@ -118,7 +120,7 @@ def _retrieval() -> dict[str, dict[str, Any]]:
     small = {"image_size": Setting([224, 224], SIZE, "width, height, multiples of 14")}
     mixvpr = {"image_size": Setting([320, 320], SIZE, "width, height: the only one that its weights are for")}
     windows = {"image_size": Setting([224, 224], SIZE, "width, height: the only one that it takes")}
-    without_components = _without(_network("", descriptor), "components", "weights")
+    without_components = without(_network("", descriptor), "components", "weights")
     return {
         "vlad": {**settings_of(features.VladFitting), **whiten},
         "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **mixvpr, **whiten),
@@ -127,8 +129,8 @@ def _retrieval() -> dict[str, dict[str, Any]]:
         "dinov2": {**_weights("dinov2_vitl14"), **without_components, **small, **pooling, **whiten},
         "ssm": _network("vgg16_places365", features.SsmWindows, **windows, **fitting),
         "same": whiten,
-        "import": {**_without(files, "image_size"), **whiten},
-        "pairs": _without(files, "database", "lengths", "image_size"),
+        "import": {**without(files, "image_size"), **whiten},
+        "pairs": without(files, "database", "lengths", "image_size"),
     }
 
 
@@ -168,13 +170,12 @@ def _parameter(name: str, parameter: Parameter, default: Any) -> Setting:
     return Setting(plain, rule, "; ".join(filter(None, (parameter.unit, parameter.note))))
 
 
-CHOICES: dict[str, dict[str, dict[str, Any]]] = {
-    "features": _features(),
-    "retrieval": _retrieval(),
-    "matching": _matching(),
-    "scorer": {name: _scorer(scorer) for name, scorer in SCORERS.items()},
-}
-"""Settings by group, choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
+@cache
+def choices_of(group: str) -> dict[str, dict[str, Any]]:
+    """Settings of a group by choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
+    if group == "scorer":
+        return {name: _scorer(scorer) for name, scorer in SCORERS.items()}
+    return {"features": _features, "retrieval": _retrieval, "matching": _matching}[group]()
 
 
 def check_group(group: str, values: Mapping[str, Any]) -> None:
@@ -187,14 +188,14 @@ def check_group(group: str, values: Mapping[str, Any]) -> None:
 
 
 def _check_choice(group: str, prefix: str, values: Any, key: str) -> None:
-    choices = CHOICES[group]
+    choices = choices_of(group)
     if not isinstance(values, Mapping) or values.get(key) not in choices:
         got = values.get(key) if isinstance(values, Mapping) else values
         raise InputError(f"{prefix}.{key}={got}: expected one of {', '.join(choices)}")
     known = choices[values[key]]
     if group == "scorer" and isinstance(values.get("weight"), list) and "weight" in known:
         known = {**known, "weight": replace(known["weight"], rule=list_of(known["weight"].rule))}
-    check_values(known, _without(values, key), f"{prefix}.")
+    check_values(known, without(values, key), f"{prefix}.")
 
 
 def check_system(settings: Mapping[str, Any]) -> None:

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from mfvpr.cli import schema
+from mfvpr.systems.choices import choices_of
 from tests.programs import ROOT, composed, run
 
 pytestmark = pytest.mark.thorough
@@ -43,7 +43,7 @@ def test_flags_of_hydra(succeed):
 
 
 def test_a_scorer_composes_with_the_values_of_its_fields():
-    for name, known in schema.CHOICES["scorer"].items():
+    for name, known in choices_of("scorer").items():
         values = composed(f"scorer={name}")["scorer"]
         assert values == {"method": name} | {field: each.default for field, each in known.items()}
 

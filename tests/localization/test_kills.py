@@ -95,17 +95,17 @@ while seen < 200:
     assert assert_whole(folder, 200) == 200
 
 
-@pytest.mark.parametrize("part", ["entries", "features", "vocabulary"])
+@pytest.mark.parametrize("part", ["entries", "features", "system"])
 def test_flipped_bytes_are_named(tmp_path, part):
     file = MapFile(tmp_path)
-    file.write({"vocabulary": b"v" * 100}, [image_of(0), image_of(1)])
+    file.write({"system": b"v" * 100}, [image_of(0), image_of(1)])
     del file
     path = tmp_path / FILE
     content = path.read_bytes()
     marks = {
         "entries": np.full(8, 1, np.float32).tobytes(),
         "features": features_of(1).keypoints.tobytes(),
-        "vocabulary": b"v" * 100,
+        "system": b"v" * 100,
     }
     assert content.count(marks[part]) == 1
     damaged = bytearray(content)
@@ -115,9 +115,9 @@ def test_flipped_bytes_are_named(tmp_path, part):
     read = {
         "entries": lambda: [*file.entries(0)],
         "features": lambda: [*file.features([0, 1])],
-        "vocabulary": lambda: file.arrays("vocabulary"),
+        "system": lambda: file.part("system"),
     }
-    with pytest.raises(InputError, match=r"map\.sqlite: (row 1|the vocabulary) is damaged") as error:
+    with pytest.raises(InputError, match=r"map\.sqlite: (row 1|the system) is damaged") as error:
         read[part]()
     assert "\n" not in str(error.value)
 
@@ -135,3 +135,14 @@ def test_a_map_that_may_only_be_read(tmp_path):
         assert assert_whole(tmp_path, 1) == 1
     finally:
         os.chmod(tmp_path, 0o700)
+
+
+def test_without_write_access_the_rows_in_the_log_are_there(tmp_path, monkeypatch):
+    writer = MapFile(tmp_path)
+    writer.write({"system": b"{}"}, [image_of(0)])
+    assert (tmp_path / f"{FILE}-wal").exists()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    reader = MapFile(tmp_path)
+    assert len(reader.counts()) == 1
+    writer.write({}, [image_of(1)])
+    assert [row for row, _ in reader.entries(0)] == [0, 1]

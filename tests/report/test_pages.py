@@ -299,6 +299,6 @@ def test_files_of_other_programs_are_errors(error_with, name, text, words):
 
 def test_the_library_and_its_evaluation_wait_for_no_optional_package():
     code = ("import sys; from mfvpr import Map, match; from mfvpr.cli import evaluation; "
-            "assert not {'plotly', 'jinja2', 'playwright', 'orbax'} & {*sys.modules}")  # fmt: skip
+            "assert not {'plotly', 'jinja2', 'playwright', 'optax', 'orbax'} & {*sys.modules}")  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")

@@ -1,4 +1,4 @@
-"""Locks of files and folders."""
+"""Locks of folders."""
 
 import fcntl
 import os
@@ -6,11 +6,7 @@ import threading
 
 import pytest
 
-from mfvpr.utils.locks import lock, lock_folder
-
-
-def refuse(_):
-    raise KeyError("in use")
+from mfvpr.utils.locks import lock_folder
 
 
 def test_a_folder_is_held_by_one_block_and_left_empty(tmp_path):
@@ -25,17 +21,17 @@ def test_a_folder_is_held_by_one_block_and_left_empty(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_conflict_without_an_error_waits(tmp_path):
-    order, flags = [], os.O_RDWR | os.O_CREAT
+def test_without_an_error_it_waits(tmp_path):
+    order = []
 
     def wait_for_it():
-        with lock(tmp_path / "lock", flags, lambda _: (order.append("waits"), waits.set())):
+        with lock_folder(tmp_path, None):
             order.append("second")
 
-    waits, other = threading.Event(), threading.Thread(target=wait_for_it)
-    with lock(tmp_path / "lock", flags, refuse):
+    other = threading.Thread(target=wait_for_it)
+    with lock_folder(tmp_path, None):
         other.start()
-        assert waits.wait(timeout=30)
+        other.join(timeout=0.2)
         order.append("first")
     other.join(timeout=30)
-    assert order == ["waits", "first", "second"]
+    assert order == ["first", "second"]

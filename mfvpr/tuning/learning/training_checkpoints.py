@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from filelock import FileLock, Timeout
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.locks import lock_folder
 
 
 @contextmanager
@@ -22,13 +22,10 @@ def lock_checkpoints(folder: Path) -> Iterator[None]:
     """Lock a folder of checkpoints, which is made if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / ".lock", blocking=False).acquire()
-    except Timeout:
-        words = "another process trains here; wait until it ends, or choose another folder"
-        raise InputError(f"{folder}: {words}") from None
     except OSError as error:
         raise InputError(f"{folder}: no checkpoint can be kept here ({_reason(error)}); check the path") from None
-    with lock:
+    in_use = InputError(f"{folder}: another process trains here; wait until it ends, or choose another folder")
+    with lock_folder(folder, in_use):
         yield
 
 
