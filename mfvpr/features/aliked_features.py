@@ -13,12 +13,11 @@ from jaxtyping import Float, Num
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
+from mfvpr.features.network import NetworkExtractor, compile_network, in_batches
 from mfvpr.networks.aliked import STRIDE, Aliked
-from mfvpr.networks.aliked_detection import RADIUS, Detections
+from mfvpr.networks.aliked_detection import Detections
 from mfvpr.utils.fields import NOT_NEGATIVE, SIZE, check_fields, setting, whole, word_of
 
-_SMALLEST = 2 * RADIUS + 1  # px: one pixel within the border, which has no keypoints
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
 
 
@@ -34,7 +33,7 @@ class AlikedFeatures(NetworkExtractor):
         max_keypoints: the keypoints of the highest scores are kept; None = all.
 
     Raises:
-        InputError: images of this size have no room for a keypoint.
+        InputError: a value that is out of its range.
     """
 
     vector_size = 0  # no global descriptor
@@ -52,7 +51,6 @@ class AlikedFeatures(NetworkExtractor):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        require_at_least("ALIKED", self.image_size, _SMALLEST)
 
     @property
     def scales(self) -> tuple[Scale, ...]:

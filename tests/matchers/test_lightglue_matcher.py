@@ -162,7 +162,7 @@ def test_features_of_another_kind_are_one_line():
     Pipeline(Extractor(0), retriever, matcher())  # not known before they are read
     with pytest.raises(InputError, match=r"^LightGlue: .*16 dimensions, got 8\b"):
         match_one(matcher(), *pair(COUNTS, 8, 0))
-    with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1$"):
+    with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1, or null$"):
         Pipeline(Extractor(16), retriever, matcher(depth_confidence=95))
     with pytest.raises(InputError, match=r"^matcher: .*the class NearestNeighborMatcher; .*mfvpr.Matcher"):
         Pipeline(Extractor(16), retriever, NearestNeighborMatcher)

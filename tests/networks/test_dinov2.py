@@ -111,7 +111,7 @@ def test_other_settings_have_other_recipes():
     ({"facet": "values"}, "facet=values: expected one of token, query, key, value"),
     ({"block": 2}, "block=2: expected from -2 to 1, a block of this network"),
     ({"block": -3}, "block=-3: expected from -2 to 1, a block of this network"),
-    ({"threshold": 1.5}, "threshold=1.5: expected from 0, which keeps all patches, to 1"),
+    ({"threshold": 1.5}, "threshold=1.5: expected a number from 0 to 1"),
 ])  # fmt: skip
 def test_wrong_settings_are_one_line(settings, words):
     with pytest.raises(InputError, match=f"^{words}[^\n]*$"):
@@ -121,8 +121,8 @@ def test_wrong_settings_are_one_line(settings, words):
 def test_another_network_and_images_of_another_size_are_one_line():
     with pytest.raises(InputError, match="DINOv2: expected a VisionTransformer as model, got TokenDescriptor"):
         Dinov2Features(TokenDescriptor(network()))
-    with pytest.raises(InputError, match=r"Dinov2Features: .*28 x 14 px, got 14 x 28"):
-        Dinov2Features(network(), (28, 14))(np.zeros((1, 28, 14, 3), np.uint8))
+    with pytest.raises(InputError, match=r"Dinov2Features: .*56 x 28 px, got 28 x 56"):
+        Dinov2Features(network(), (56, 28))(np.zeros((1, 56, 28, 3), np.uint8))
 
 
 @pytest.mark.optimized
