@@ -247,6 +247,7 @@ def assert_as_in_float32(query, candidate, monkeypatch):
             np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
 def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
     query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))
@@ -289,6 +290,7 @@ def test_numbers_out_of_range_match_as_in_float32(kind):
         np.testing.assert_array_equal(np.asarray(getattr(rounded, name))[mask], np.asarray(values)[mask])
 
 
+@pytest.mark.slow
 def test_features_of_images_match_as_in_float32_by_candidates_and_by_pairs():
     sift = Sift(image_size=(160, 160), max_keypoints=150)
     images = np.random.default_rng(0).integers(0, 256, (2, 20, 20, 3), np.uint8).repeat(8, axis=1).repeat(8, axis=2)

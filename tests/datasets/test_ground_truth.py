@@ -146,6 +146,7 @@ def test_a_long_file_of_labels_is_read_in_seconds(tmp_path):
     np.testing.assert_array_equal(truth.query_labels, np.repeat(range(5), [10, 90, 900, 9000, 20_000]))
 
 
+@pytest.mark.slow
 def test_nordland_takes_a_few_megabytes():
     """A matrix of 27,592 frames on each side takes 761 MB."""
     number, tolerance = 27_592, 10

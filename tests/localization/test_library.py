@@ -180,6 +180,7 @@ def test_a_confidence_that_tells_nothing_is_a_warning(street, small_street, tmp_
         street.calibrate(small_street / "database", small_street / "queries", ground_truth=truth)
 
 
+@pytest.mark.slow
 def test_noise_gets_no_place_though_all_predictions_of_the_drive_are_correct(tmp_path):
     street = streets_folder(tmp_path, num_frames=40, image_size=(160, 120))
     Map.create(tmp_path / "map", street / "database", small("steering", candidates=20)).calibrate(
