@@ -138,13 +138,12 @@ def bytes_of_an_image(inputs: Inputs) -> dict[str, float]:
     They are counted as in the paper: with detected keypoints, without those of a grid.
     """
     cache, pipeline, database = inputs.cache, inputs.pipeline, inputs.dataset.database
-    sources = cache.local(database, fit_to_database(pipeline.extractor, database, cache), [])  # extracts nothing
+    extractor: Any = fit_to_database(pipeline.extractor, database, cache)
     keypoint = 0 if isinstance(pipeline.extractor, _GRIDS) else _KEYPOINT
     local = 0.0
-    for features in sources:
-        counts = features.source.counts
+    for scale, counts in zip(extractor.scales, cache.counts(database, extractor), strict=True):
         known = counts[counts >= 0]  # retrieval other than VLAD needs the candidates' features alone
-        local += (_FLOAT * features.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
+        local += (_FLOAT * scale.dimension + keypoint) * (float(known.mean()) if known.size else 0.0)
     describer: Any = fit_to_database(pipeline.retriever, database, cache)  # all of the paper's have one
     vectors = cache.vectors(database, describer.describer, database).values
     return {"local": local, "descriptor": _FLOAT * vectors.shape[1]}

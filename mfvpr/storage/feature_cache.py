@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
@@ -226,6 +226,12 @@ class FeatureCache:
         self._describe(state, state.scales, rows, f"{label} features")
         _require_images(state)
         return tuple(FeatureSet(_LocalFeatures(state, part), dict(state.bad)) for part in state.scales)
+
+    def counts(self, folder: ImageFolder, extractor: Extractor) -> Int[np.ndarray, "scales images"]:
+        """Keypoints of the images whose local features are here, by scale; -1 = not here. Nothing is extracted."""
+        state = self._open(folder, extractor)
+        state.missing(state.scales, range(len(folder)))
+        return state.counts[state.scales]
 
     def vectors(
         self,
