@@ -60,10 +60,10 @@ def truth_from_file(
     csv_pairs = partial(_csv_columns, choices=(("query", "database"), ("live", "reference")))
     with _reading(path):
         content = choose_reader(path, {".csv": csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs})(path)
-    if isinstance(content, RadiusTruth):
-        require_positions(f"{path}: utmQ", content.query_xy, len(query_names))
-        require_positions(f"{path}: utmDb", content.database_xy, len(database_names))
-        return content
+    if isinstance(content, dict):
+        for (name, xy), images in zip(content.items(), (query_names, database_names), strict=True):
+            require_positions(f"{path}: {name}", xy, len(images))
+        return RadiusTruth(*content.values())
     sides = ("query", query_names, _row_table(query_names)), ("database", database_names, _row_table(database_names))
     rows: dict[int, list[int]] = {}
     for line, pair in enumerate(content, start=1):
@@ -96,10 +96,10 @@ def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[s
     raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
 
 
-def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | RadiusTruth:
+def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | dict[str, np.ndarray]:
     arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
     if {"utmQ", "utmDb"} <= arrays.keys():
-        return RadiusTruth(arrays["utmQ"].astype(np.float64), arrays["utmDb"].astype(np.float64))
+        return {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
     if {"query", "database"} <= arrays.keys():
         return list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
     got = shorten(", ".join(arrays)) or "neither"
