@@ -171,7 +171,7 @@ def test_answers_are_pictures_and_rows(page, several, run):
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
-    assert len([row for row in several.rows if len(row) == 7 and row[0] in SYSTEMS]) == 60
+    assert len([row for row in several.rows if len(row) == 7 and row[1] in TWO]) == 60
 
 
 def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, monkeypatch):
