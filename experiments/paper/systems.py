@@ -64,8 +64,12 @@ _PAPER = (
     *(Row(f"mix_{name}", f"Mix-{title}", f"mix_{name}") for name, title in _MIX.items()),
     Row("mix_hist_aliked_50", "Mix-hist 50, ALIKED", "mix_hist_aliked_50"),
 )
-_SCORES = {"count": "count", "rapid": "rapid", "sum": "sum", "anchor": "anchor", "histogram": "hist 50",
-           "homography_8": "RAN 8 px", "homography_24": "RAN 24 px", COMBINED: "hist-comb 50"}  # fmt: skip
+_SCORES = {name: name for name in ("count", "rapid", "sum", "anchor")} | {
+    "histogram": "hist 50",
+    "homography_8": "RAN 8 px",
+    "homography_24": "RAN 24 px",
+    COMBINED: "hist-comb 50",
+}
 _NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran_24", COMBINED: "hist_comb_50"}
 
 
