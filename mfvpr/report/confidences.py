@@ -12,7 +12,7 @@ from mfvpr.evaluation.confidence_calibration import write_confidences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.reliability import chance_calibration_error, reliability
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport
-from mfvpr.report.plots import precision_recall_figure, reliability_figure, shares_figure
+from mfvpr.report.plots import reliability_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_number, write_csv
 
@@ -122,14 +122,9 @@ def _write_top_predictions(folder: Path, evaluation: EvaluationReport) -> None:
 
 
 def confidence_figures(evaluation: EvaluationReport) -> list[Figure]:
-    """Precision against recall, reliability, and recall over the share that is re-ranked; with ground truth."""
-    if not evaluation.thresholds:
+    """Reliability of the confidences, with ground truth; other curves of confidences are on the page."""
+    if not evaluation.thresholds or not evaluation.probabilities:
         return []
-    curves = {name: evaluation.curves(name) for name in evaluation.ranked.systems}
-    figures: list[Figure] = [("precision_recall.png", partial(precision_recall_figure, curves=curves))]
-    if known := evaluation.probabilities:
-        reliabilities = {name: reliability(values, evaluation.hits(name)) for name, values in known.items()}
-        figures.append(("reliability.png", partial(reliability_figure, reliabilities=reliabilities)))
-    if recalls := recalls_by_share(evaluation):
-        figures.append(("rerank_share.png", partial(shares_figure, shares=SHARES, recall=recalls)))
-    return figures
+    probabilities = evaluation.probabilities.items()
+    reliabilities = {name: reliability(values, evaluation.hits(name)) for name, values in probabilities}
+    return [("reliability.png", partial(reliability_figure, reliabilities=reliabilities))]

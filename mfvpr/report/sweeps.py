@@ -17,7 +17,7 @@ from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import runs
 from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
 from mfvpr.report.runs import Figure, file_names
-from mfvpr.report.tables import Table, data_frame, format_interval, format_value, format_values
+from mfvpr.report.tables import Table, data_frame, format_estimate, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Outcome
 from mfvpr.tuning.sweeps.sweep_axes import Axes
 from mfvpr.utils.errors import InputError
@@ -46,7 +46,7 @@ class Sweep:
     outcome: Outcome
 
     def __repr__(self) -> str:
-        axes, recall = self.outcome.axes, f"{_label(self.outcome)} {_with_interval(self.interval)}"
+        axes, recall = self.outcome.axes, f"{_label(self.outcome)} {format_estimate(self.interval)}"
         about = f"{self.dataset}, {self.scorer}: {axes.size} settings of {', '.join(axes.values)}"
         return f"Sweep({about}; best {format_values(self.best)}; {recall})"
 
@@ -200,21 +200,16 @@ def sweep_summary(outcome: Outcome, heading: str) -> str:
         parts.append(f"chosen: {format_values(outcome.settings[outcome.chosen[0]])}")
     parts.append("Recall at 1 in %, with 95 % intervals in brackets:")
     for threshold, _, chosen, own, test, path in outcome.report:
-        parts.append(
-            f"{protocol.label(1, threshold)}: chosen {_with_interval(chosen)}, own values {_with_interval(own)}; only "
-            f"one of them correct: {test.only_first} and {test.only_second} queries, McNemar p = {test.p_value:.2g}, "
-            f"along the path p = {path.p_value:.2g}"
-        )
+        recalls = f"chosen {format_estimate(chosen)}, own values {format_estimate(own)}"
+        counts = f"only one of them correct: {test.only_first} and {test.only_second} queries"
+        probabilities = f"McNemar p = {test.p_value:.2g}, along the path p = {path.p_value:.2g}"
+        parts.append(f"{protocol.label(1, threshold)}: {recalls}; {counts}, {probabilities}")
     if not protocol.halves:
         parts.append(
             "Chosen and reported on the same queries, so this flatters; split=both chooses on one half of the path "
             "and reports on the other."
         )
     return "\n".join(parts)
-
-
-def _with_interval(estimate: Estimate) -> str:
-    return f"{100 * estimate.recall:.1f} {format_interval(estimate.interval)}"
 
 
 def sweep_figures(outcome: Outcome) -> list[Figure]:

@@ -123,3 +123,9 @@ def format_interval(interval: tuple[float, float]) -> str:
     """An interval of fractions, in %."""
     low, high = interval
     return f"[{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def format_estimate(estimate: tuple[float, tuple[float, float]]) -> str:
+    """A fraction with its interval, in %."""
+    recall, interval = estimate
+    return f"{100 * recall:.1f} {format_interval(interval)}"

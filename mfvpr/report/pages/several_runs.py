@@ -12,7 +12,7 @@ from mfvpr.report.pages.charts import bar_chart
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.rendering import Section, flat, write_page
 from mfvpr.report.run_files import Difference
-from mfvpr.report.tables import Table, format_interval
+from mfvpr.report.tables import Table, format_estimate
 from mfvpr.utils.errors import InputError
 
 
@@ -77,8 +77,7 @@ def _recall(runs: Mapping[str, Run]) -> Section:
         cells = [""] * len(runs)
         for column, run in enumerate(runs.values()):
             if system in run.systems:
-                recall, interval = run.all_gains.recall(system)
-                cells[column] = f"{100 * recall:.1f} {format_interval(interval)}"
+                cells[column] = format_estimate(run.all_gains.recall(system))
         rows.append([system, *cells])
     header = ["system", *(f"{label}{run.within}" for label, run in runs.items())]
     words = "In %, of all queries, correct at the middle tolerance of each run; intervals are 95 % and know that "

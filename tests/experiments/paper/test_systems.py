@@ -207,12 +207,3 @@ def test_rows_that_lack_a_data_set_have_no_mean():
     evaluations = Evaluations(rows, {name: make_dataset(name) for name in names}, results)
     assert [*mean_recalls(evaluations).values()] == [{"SIFT-hist 50": 50.0}]
     assert tables_of(evaluations)["averages"].rows == [["SIFT-hist 50", "50.0", "50.0", "50.0"]]
-
-
-def test_data_sets_that_lack_images_are_called_so():
-    results = {("mix_hist_50", "gardens_point"): row_results([90.0] * 3)}
-    evaluations = Evaluations([MIX], {"gardens_point": make_dataset("gardens_point")}, results)
-    headings = {name: heading for name, heading, _ in paper_tables(evaluations)}
-    assert tables_of(evaluations)["recall"].header[1] == "gardens_point (incomplete) ±1"
-    assert "here over gardens_point (incomplete)" in headings["averages"]
-    assert "brackets" not in headings["depths"]
