@@ -141,7 +141,7 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
         for row in read_csv(sequence_folder(run, names, place) / "failures" / "histogram.csv"):
             if row["correct_image"] and _is_far(sequence, dataset.database, row):
                 failures.append((sequence, row))
-    failures.sort(key=lambda failure: -float(failure[1]["margin"]))
+    failures.sort(key=lambda failure: -float(failure[1]["margin"] or 0))  # empty between two infinite scores
     for sequence, row in failures[:_FAILURES]:
         where = " ".join(dict.fromkeys((dataset.name, sequence.name)))
         yield [

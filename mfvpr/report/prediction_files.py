@@ -127,30 +127,29 @@ def _require_known(name: str, known: Mapping[str, int], expected: str) -> None:
 
 def read_lines(path: Path) -> list[LocalizedImage]:
     """Read the lines of `mfvpr localize`; an image that could not be read has no place, and its error as reason."""
+
+    def image_of(line: Mapping[str, Any]) -> LocalizedImage:
+        if "error" in line:
+            return LocalizedImage(line["image"], cells={"reason": line["error"]})
+        low, high = line["shift_interval"] or [[None, None]] * 2
+        numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
+        cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
+        if line["place"] is None:
+            return LocalizedImage(line["image"], cells=cells | {"reason": line["reason"]})
+        candidates = [(each["name"], each["score"]) for each in line["alternatives"]]
+        return LocalizedImage(line["image"], line["place"], candidates, cells)
+
     with reading(path, mend="expected lines of mfvpr localize"):
         lines = path.read_text(encoding="utf-8").split("\n")
     images = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
             try:
-                images.append(_image_of(json.loads(line)))
+                images.append(image_of(json.loads(line)))
             except (AttributeError, LookupError, TypeError, ValueError, RecursionError):
                 words = f"expected a line of mfvpr localize, got {shorten(line)!r}"
                 raise InputError(f"{path}: line {number}: {words}") from None
     return images
-
-
-def _image_of(line: Mapping[str, Any]) -> LocalizedImage:
-    """The image of a line; raises what damaged lines make Python raise."""
-    name, place = line["image"], line.get("place")
-    if "error" in line:
-        return LocalizedImage(name, cells={"reason": line["error"]})
-    low, high = line["shift_interval"] or [[None, None]] * 2
-    numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
-    cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
-    if place is None:
-        return LocalizedImage(name, cells=cells | {"reason": line["reason"]})
-    return LocalizedImage(name, place, [(each["name"], each["score"]) for each in line["alternatives"]], cells)
 
 
 def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:

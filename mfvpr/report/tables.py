@@ -75,9 +75,11 @@ def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
 
 
 def read_table(path: Path) -> Table:
-    """The table of a file of `write_csv`."""
+    """The table of a file of `write_csv`; a ValueError if the file is cut off."""
     with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
         header, *rows = csv.reader(file)
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError(f"{path.name}: expected lines of {len(header)} cells")
     return Table(header, rows)
 
 

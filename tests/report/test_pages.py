@@ -258,7 +258,8 @@ def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypa
         ("gains.csv", None, "gains.csv"),
         ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "'place'"),
         ("confidence.csv", None, "confidence.csv"),
-        ("predictions/histogram.csv", "query,rank\na,1,1\n", "longer"),
+        ("precision_recall.csv", "system,by\na\n", "precision_recall.csv"),
+        ("predictions/histogram.csv", "query,rank\na,1,1\n", "histogram.csv: expected lines of 2"),
     ],
 )
 def test_damaged_files_are_errors_of_one_line(tmp_path, name, text, words):

@@ -1,6 +1,6 @@
 """The page of one run: an evaluation, a sweep, a learning comparison, or the jobs of a multirun."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -41,9 +41,27 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     if run.gains and tables["differences"].rows:
         words, tests = paired_tests("system", tables["differences"].rows)
         sections.append(Section("differences", "Differences", words, tables={"Every two systems": tests}))
-    sections += _sequence_section(run)
-    sections += _confidence_section(run)
-    sections += [_predictions_section(run), _costs_section(run), _settings_section(run)]
+    if "changes" in tables and tables["changes"].rows:
+        verdicts = {"1": "correct", "0": "incorrect", "": ""}
+        rows = [[*cells[:4], verdicts[cells[4]], cells[5], verdicts[cells[6]]] for cells in tables["changes"].rows]
+        columns = ["system", "sequence", "query", "alone", "", "with the other queries", ""]
+        changed = {"Changed predictions": Table(columns, rows, len(columns))}
+        words = "First predictions that the other queries of a drive change."
+        sections.append(Section("sequence", "Sequences", words, tables=changed))
+    if run.gains:
+        sections.append(_confidence_section(run))
+    sections += [_predictions_section(run), _costs_section(run)]
+    about = {name: run.about.get(name) for name in ("command", "commit")}
+    about |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
+    settings = {
+        "Run": values_table(about),
+        "Settings": values_table(run.about["settings"]),
+        "Versions": values_table(common["versions"]),
+        "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
+    }
+    if skipped := tables.get("skipped"):
+        settings["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
+    sections.append(Section("settings", "Settings and versions", tables=settings))
     title, dataset = common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
         title = " in ".join("/".join(Path(dataset[side]).parts[-2:]) for side in ("queries", "database"))
@@ -164,21 +182,8 @@ def paired_tests(kind: str, lines: Sequence[Sequence[str]]) -> tuple[str, Table]
     return words, Table(columns, rows, text_columns=2)
 
 
-def _sequence_section(run: Run) -> Iterator[Section]:
-    """Queries whose prediction a sequence changes."""
-    if (table := run.tables.get("changes")) and table.rows:
-        words = {"1": "correct", "0": "incorrect", "": ""}
-        rows = [[*cells[:4], words[cells[4]], cells[5], words[cells[6]]] for cells in table.rows]
-        columns = ["system", "sequence", "query", "alone", "", "with the other queries", ""]
-        tables = {"Changed predictions": Table(columns, rows, len(columns))}
-        text = "First predictions that the other queries of a drive change."
-        yield Section("sequence", "Sequences", text, tables=tables)
-
-
-def _confidence_section(run: Run) -> Iterator[Section]:
+def _confidence_section(run: Run) -> Section:
     """Precision against recall, and recall over the share that is re-ranked; with ground truth."""
-    if not run.gains:
-        return
     table, shares, curves = (
         run.tables["confidence"],
         run.tables["rerank_share"],
@@ -194,7 +199,7 @@ def _confidence_section(run: Run) -> Iterator[Section]:
         charts.append(line_chart("shares", title, points, axes=axes, scale="percent"))
     tables = {"Confidence of top predictions, in %": table} if table.rows else {}
     words = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
-    yield Section("confidence", "Precision and recall", f"{words}confidence.", charts, tables)
+    return Section("confidence", "Precision and recall", f"{words}confidence.", charts, tables)
 
 
 def _costs_section(run: Run) -> Section:
@@ -216,17 +221,3 @@ def _predictions_section(run: Run) -> Section:
     words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
     words += "prediction has the correct image below it. The table has the queries without a picture, too."
     return Section("predictions", "Predictions", words, gallery=gallery)
-
-
-def _settings_section(run: Run) -> Section:
-    about = {name: run.about.get(name) for name in ("command", "commit")}
-    about |= {name.replace("_", " "): run.common[name] for name in ("ground_truth", "data_fingerprint")}
-    tables = {
-        "Run": values_table(about),
-        "Settings": values_table(run.about["settings"]),
-        "Versions": values_table(run.common["versions"]),
-        "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
-    }
-    if skipped := run.tables.get("skipped"):
-        tables["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
-    return Section("settings", "Settings and versions", tables=tables)

@@ -1,12 +1,13 @@
 """Rows, settings and data sets of the evaluations, and the tables of their numbers."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from experiments.paper import systems
 from experiments.paper.pages import mean_recalls
-from experiments.paper.runs import input_fingerprints, settings_of
+from experiments.paper.runs import input_fingerprints, lock_output, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
@@ -114,6 +115,23 @@ def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
         inputs.append(input_fingerprints(settings, {}, dataset.positives_fingerprint([1])))
     assert {name for name in inputs[0] if inputs[0][name] != inputs[1][name]} == {"ground truth"}
     assert Dataset("corridor", folder, (QuerySequence("one", folder, None),)).positives_fingerprint([]) is None
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        (["figures"], "expected a new or empty folder"),
+        (["runs", "figures", "thesis.tex"], "expected a new or empty folder"),
+        ([], None),
+        (["runs", "tables", "figures", "report.html", ".DS_Store"], None),
+    ],
+)
+def test_a_folder_with_files_of_others_is_refused(tmp_path, entries, words):
+    for name in entries:
+        (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=words) if words else nullcontext(), lock_output(tmp_path):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {*entries}
 
 
 # Tables
