@@ -8,9 +8,9 @@ from PIL.PngImagePlugin import PngInfo
 
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.report import Table, write_json
-from mfvpr.report.evaluation_files import write_failures, write_predictions
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
+from mfvpr.report.run_files import write_failures, write_predictions
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import write_csv
 from mfvpr.utils.files import printable
@@ -46,7 +46,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
         "retrieval": {"name": HOSTILE[0]}, "features": {"name": HOSTILE[1]}, "matching": {}, "candidates": CANDIDATES,
         "queries": len(HOSTILE) * len(sequences), "database": len(HOSTILE), "dataset": sequences[0],
         "data_fingerprint": {"database": "0"}, "ground_truth": known, "seconds": {HOSTILE[2]: 1.5, "scores": 2.0},
-        "bytes_per_image": 1234, "versions": {"mfvpr": "</script>"}, **changes,
+        "versions": {"mfvpr": "</script>"}, **changes,
     }  # fmt: skip
     rows = []
     for system in ranks:
@@ -59,7 +59,8 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
                 of |= {"tolerance": tolerance, "recall_at": recall} if truth else {"recall_at": {}}
                 rows.append(of | common)
     write_json(folder / "results.json", rows)
-    write_json(folder / "run.json", {"command": HOSTILE[3], "commit": None, "settings": {"out": HOSTILE[5], "a": {}}})
+    settings = {"out": HOSTILE[5], "a": {}, "dataset": {}}
+    write_json(folder / "run.json", {"command": HOSTILE[3], "commit": None, "settings": settings})
     for number, name in enumerate(sequences):
         places = [*range(len(HOSTILE))] if several else [""] * len(HOSTILE)
         _write_answers(sequence_folder(folder, sequences, number), ranks, truth, places)
@@ -103,8 +104,8 @@ def _write_tables(folder, ranks, sequences):
               for name, first in ranks.items() for part in names or [None]]  # fmt: skip
     header = ["system", *(["sequence"] if names else []), "R@1 ±2"]
     (folder / "table.csv").write_text(Table(header, recall).csv(), encoding="utf-8")
-    pairs = [[*SYSTEMS[:2], 0, 5, 0.06, 2, 3, 0.25], [*SYSTEMS[1:], 2, 0, "1e-09", 2, 3, 0.25]]
-    write_csv(folder / "differences.csv", ["system", "other", *"abcdef"], pairs)
+    pairs = [[*SYSTEMS[:2], 0, 5, 0.06, 2, 0.25], [*SYSTEMS[1:], 2, 0, "1e-09", 2, 0.25]]
+    write_csv(folder / "differences.csv", ["system", "other", *"abcde"], pairs)
     write_csv(folder / "confidence.csv", ["system", "AP by score"], [[HEADLINE, "90.0"]])
     write_csv(folder / "rerank_share.csv", ["re-ranked", *SYSTEMS[1:]], [["0.00", 30.0, 30.0], ["1.00", 80.0, 70.0]])
     points = [[HEADLINE, "score", 3, 1, 0.25], [HEADLINE, "score", 2, 1, 0.5], [HEADLINE, "score", 1, 0.75, 0.75]]

@@ -3,7 +3,6 @@
 import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
@@ -11,15 +10,16 @@ from urllib.parse import quote
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 
-from experiments.paper.runs import STEPS
 from experiments.paper.tables import TOLERANCES, Evaluations, average, printed_tables
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import Table
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
-from mfvpr.report.pages.charts import Bar, Chart, amount_chart, bar_chart, line_chart
-from mfvpr.report.pages.rendering import MOST_PICTURES, PAGE, Gallery, Section, pictures, values_table, write_page
+from mfvpr.report.pages import one_run
+from mfvpr.report.pages.charts import Chart, bar_chart
+from mfvpr.report.pages.rendering import MOST_PICTURES, Gallery, Section, embed, pictures, values_table, write_page
 from mfvpr.report.pages.several_runs import write_comparison
 from mfvpr.report.plots import panels, save_figure
 from mfvpr.report.runs import Figure
@@ -41,8 +41,12 @@ _Image = tuple[np.ndarray, str]  # pixels and a title
 
 def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
     """The figures that there are numbers for; of each data set, the best row shows its histogram and failures."""
-    folders = {name: evaluations.folders[name, row.run] for name in evaluations.datasets
-               for row in reversed(evaluations.best_rows) if (name, row.run) in evaluations.folders}  # fmt: skip
+    folders = {
+        name: evaluations.folders[name, row.run]
+        for name in evaluations.datasets
+        for row in reversed(evaluations.best_rows)
+        if (name, row.run) in evaluations.folders
+    }
     histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("correct_*.png")))
     if histogram := next(histograms, None):
         yield "histogram.png", partial(_copy, source=histogram)
@@ -134,10 +138,10 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
     """Query, prediction and correct image of the clearest failures that retrieval did not cause."""
     names, failures = [sequence.name for sequence in dataset.sequences], []
     for place, sequence in enumerate(dataset.sequences):
-        file = sequence_folder(run, names, place) / "failures" / "histogram.csv"
-        failures += [(sequence, row) for row in read_csv(file)
-                     if row["correct_image"] and _is_far(sequence, dataset.database, row)]  # fmt: skip
-    failures.sort(key=lambda failure: -float(failure[1]["margin"]))
+        for row in read_csv(sequence_folder(run, names, place) / "failures" / "histogram.csv"):
+            if row["correct_image"] and _is_far(sequence, dataset.database, row):
+                failures.append((sequence, row))
+    failures.sort(key=lambda failure: -float(failure[1]["margin"] or 0))  # empty between two infinite scores
     for sequence, row in failures[:_FAILURES]:
         where = " ".join(dict.fromkeys((dataset.name, sequence.name)))
         yield [
@@ -179,7 +183,7 @@ def write_pages(
         if len(folders) > 1:
             links.append((f"{dataset}: all side by side", out / "comparisons" / f"{dataset}.html"))
             write_comparison([*folders.values()], links[-1][1])
-        links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
+        links += [(f"{dataset}: {run}", folder / one_run.PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
     recalls = dict(table for name, table in tables.items() if name not in (*_COSTS, *_ABOUT))
@@ -188,68 +192,49 @@ def write_pages(
         rows = [[*line.partition(": ")[::2]] for line in left_out]
         about["Left out"] = Table(["what", "why"], rows, text_columns=2)
     about["Versions"] = values_table(versions())
-    sections = [
-        Section("recall", "Recall", "In %. Where the paper prints a number, that and the difference stand beside ours.",
-                [_averages_chart(evaluations), *_by_sequence(evaluations)], recalls),
-        Section("pages", "Every evaluation", "Their own pages, and all of a data set side by side, with tests and "
-                "intervals.", links=addresses),
-        Section("predictions", "Predictions", "For every evaluation: queries and top predictions with their heaviest "
-                "matches, and the histogram of shifts. An incorrect prediction has the correct image below it.",
-                gallery=_gallery(evaluations)),
-        Section("costs", "Seconds and sizes", "", [*_cost_charts(evaluations)], costs),
-        Section("settings", "Data sets and settings", tables=about),
-    ]  # fmt: skip
+    paths = {path.stem: path for path in (out / "figures").glob("*.png")}
+    averages = {"Mean recall at 1 within 2 frames": embed(paths["averages"])} if "averages" in paths else {}
+    titles = {"speed": "Seconds of a query", "growth": "As a database grows"}
+    speed = {title: embed(paths[name]) for name, title in titles.items() if name in paths}
+    words = "In %. Where the paper prints a number, that and the difference stand beside ours."
+    sections = [Section("recall", "Recall", words, [*_by_sequence(evaluations)], recalls, images=averages)]
+    words = "Their own pages, and all of a data set side by side, with tests and intervals."
+    sections.append(Section("pages", "Every evaluation", words, links=addresses))
+    words = "For every evaluation: queries and top predictions with their heaviest matches, and the histogram of "
+    words += "shifts. An incorrect prediction has the correct image below it."
+    sections.append(Section("predictions", "Predictions", words, gallery=_gallery(evaluations)))
+    sections.append(Section("costs", "Seconds and sizes", tables=costs, images=speed))
+    sections.append(Section("settings", "Data sets and settings", tables=about))
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
-    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
-
-
-def _averages_chart(evaluations: Evaluations) -> Chart:
-    groups = {label: {title: Bar(value) for title, value in members.items()}
-              for label, members in mean_recalls(evaluations).items()}  # fmt: skip
-    return bar_chart("averages", "Mean recall at 1 within 2 frames", groups, axis="mean recall at 1, %")
+    write_page(out / one_run.PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
 
 
 def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:
     """Recall by sequence at the middle threshold, of data sets with several sequences."""
     for name, dataset in evaluations.datasets.items():
         thresholds, truth = evaluations.thresholds(name), dataset.sequences[0].truth
-        if len(dataset.sequences) < 2 or not thresholds:
+        if len(dataset.sequences) < 2 or truth is None or not thresholds:
             continue
-        threshold = middle(thresholds)
-        groups = {
-            row.title: {part.name: Bar(result.recall[part.name][threshold][1]) for part in dataset.sequences}
-            for row in evaluations.rows
-            if row.leads and (result := evaluations.results.get((row.name, name)))
-        }
+        groups, within = {}, threshold_words(truth.unit, middle(thresholds))
+        for row in evaluations.rows:
+            if row.leads and (result := evaluations.results.get((row.name, name))):
+                shares = {
+                    part.name: result.recall[part.name][middle(thresholds)][1] / 100 for part in dataset.sequences
+                }
+                groups[row.title] = {part: Estimate(share, (share, share)) for part, share in shares.items()}
         if groups:
-            within = threshold_words(truth.unit, threshold) if truth else ""
-            yield bar_chart(
-                f"sequences-{name}", f"{evaluations.title(name)}, by sequence{within}", groups, axis="recall at 1, %"
-            )
-
-
-def _cost_charts(evaluations: Evaluations) -> Iterator[Chart]:
-    if evaluations.seconds:
-        titles = {row.name: row.title for row in evaluations.rows}
-        totals = {titles[name]: sum(steps[step] for step in STEPS) for name, steps in evaluations.seconds.items()}
-        yield amount_chart("seconds", f"Seconds of a query of {evaluations.timed_on}", totals, axis="seconds")
-    if evaluations.growth:
-        curves = {title: [(float(size), value) for size, value in seconds.items()]
-                  for title, seconds in evaluations.growth.items()}  # fmt: skip
-        axes = "images of a database, whose descriptors are made up", "seconds of a query"
-        yield line_chart("growth", "As a database grows", curves, axes=axes, scale="log", marked=True, unit="s")
+            title = f"{evaluations.title(name)}, by sequence{within}"
+            yield bar_chart(f"sequences-{name}", title, groups, axis="recall at 1, %")
 
 
 def _gallery(evaluations: Evaluations) -> Gallery:
     """Pictures of every evaluation, as many as there is room for; sequences are named with their data set."""
-    each = max(1, MOST_PICTURES // max(1, len(evaluations.folders)))
-    shown = [
-        replace(
-            picture, system=f"{run}: {picture.system}",
-            sequence=dataset if picture.sequence in ("", dataset) else f"{dataset} {picture.sequence}",
-        )
-        for (dataset, run), folder in evaluations.folders.items() for picture in pictures(folder, most=each)
-    ]  # fmt: skip
-    systems, sequences = (dict.fromkeys(getattr(picture, name) for picture in shown) for name in ("system", "sequence"))
+    each, shown = max(1, MOST_PICTURES // max(1, len(evaluations.folders))), []
+    for (dataset, run), folder in evaluations.folders.items():
+        for picture in pictures(folder, most=each):
+            sequence = picture["sequence"]
+            sequence = dataset if sequence in ("", dataset) else f"{dataset} {sequence}"
+            shown.append(picture | {"system": f"{run}: {picture['system']}", "sequence": sequence})
+    systems, sequences = (dict.fromkeys(picture[name] for picture in shown) for name in ("system", "sequence"))
     return Gallery("", [*systems], [*sequences], shown)

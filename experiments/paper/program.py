@@ -1,7 +1,7 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
 import shutil
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,11 @@ def paper(settings: dict[str, Any]) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
     rows = systems.chosen_rows(settings["systems"])
     places, absent, refused = systems.places(settings["data"], settings["datasets"])
-    lacking = _missing_weights(rows, places[0], settings) if places else {}
+    lacking: dict[str, str] = {}  # a line for each evaluation whose networks are not installed
+    for run in _names(rows) if places else ():
+        if missing := systems.missing_weights(runs.settings_of(run, places[0], settings)):
+            needs = [f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing]
+            lacking[run] = f"{run}: needs {'; '.join(needs)}"
     rows = [row for row in rows if row.run not in lacking]
     left_out = [*absent.values(), *refused, *lacking.values()]
     if not places or not rows:
@@ -41,16 +45,6 @@ def paper(settings: dict[str, Any]) -> None:
         f"{len(_finished_runs(rows, known, settings))} of {len(names) * len(places)} finished; then tables, seconds of "
         f"a query, and figures in {settings['out']}"
     )
-    _announce_missing(settings, absent, lacking, refused)
-    out = expand_user(settings["out"])
-    with runs.lock_output(out):
-        _evaluate_and_report(rows, places, settings, out, left_out)
-
-
-def _announce_missing(
-    settings: Mapping[str, Any], absent: Collection[str], lacking: Collection[str], refused: Sequence[str]
-) -> None:
-    """Print what is left out: data sets and evaluations in one line, and a line for each folder that is refused."""
     groups = {
         f"data sets that are not in {settings['data'] or 'data=DIR'}, see `mfvpr data list`": absent,
         "evaluations without their weights, see `mfvpr weights list`": lacking,
@@ -58,21 +52,14 @@ def _announce_missing(
     parts = [f"{len(members)} {words} ({', '.join(members)})" for words, members in groups.items() if members]
     for line in [*(["; ".join(parts)] if parts else []), *refused]:
         tell(f"left out: {line}")
+    out = expand_user(settings["out"])
+    with runs.lock_output(out):
+        _evaluate_and_report(rows, places, settings, out, left_out)
 
 
 def _names(rows: Sequence[Row]) -> list[str]:
     """Evaluations that give the rows."""
     return list(dict.fromkeys(row.run for row in rows))
-
-
-def _missing_weights(rows: Sequence[Row], place: Place, settings: Mapping[str, Any]) -> dict[str, str]:
-    """A line for each evaluation whose networks are not installed, by name."""
-    entries = {run: systems.missing_weights(runs.settings_of(run, place, settings)) for run in _names(rows)}
-    return {
-        run: f"{run}: needs " + "; ".join(f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing)
-        for run, missing in entries.items()
-        if missing
-    }
 
 
 def _evaluate_and_report(
@@ -93,8 +80,8 @@ def _evaluate_and_report(
         if name in ("recall", "averages"):
             print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
     times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
-    evaluations = replace(evaluations, seconds={row.name: times[row.run] for row in rows
-                                                if row.run in times and row.leads})  # fmt: skip
+    leading = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
+    evaluations = replace(evaluations, seconds=leading)
     evaluations = replace(evaluations, growth=_measure_growth(evaluations, out))
     for name in ("figures", "comparisons"):  # they may have those of other rows and data sets
         shutil.rmtree(out / name, ignore_errors=True)
@@ -108,9 +95,11 @@ def _evaluate_and_report(
 
 
 def evaluate_all(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any],
+    rows: Sequence[Row],
+    places: Sequence[Place],
+    settings: Mapping[str, Any],
     write_tables: Callable[[Mapping[str, Dataset]], None],
-) -> tuple[dict[str, Dataset], list[str]]:  # fmt: skip
+) -> tuple[dict[str, Dataset], list[str]]:
     """Evaluate, writing tables after each data set; return readable data sets, and a line per failed evaluation."""
     names = _names(rows)
     total, finished = len(places) * len(names), 0
@@ -189,7 +178,7 @@ def measure_times(
     for (_, run), folder in _finished_runs(rows, [place.name], settings).items():
         path = out / "seconds" / f"{run}.json"
         about = {"data_set": place.name, "of": runs.read_json(folder / runs.INPUTS)} | runs.device()
-        times[run] = runs.read_object(path)
+        times[run] = runs.read_json(path) or {}
         if any(times[run].get(name) != value for name, value in about.items()):
             tell(f"timing: {run} on {place.name}")
             try:
@@ -204,19 +193,18 @@ def measure_times(
 def _measure_growth(evaluations: Evaluations, out: Path) -> dict[str, dict[int, float]]:
     """Seconds of a query of some systems by the size of the database; the search is measured once."""
     path, device = out / "seconds" / "growth.json", runs.device()
-    known = runs.read_object(path)
+    known = runs.read_json(path) or {}
     if known.get("device") != device:
         known = {"device": device, "search": {}}
-    lengths = {run: int(runs.read_json(folder / runs.SIZES)["descriptor"])
-               for (_, run), folder in evaluations.folders.items()}  # fmt: skip
     growth = {}
     for row in (row for row in evaluations.best_rows if row.name in evaluations.seconds):
-        length = str(lengths[row.run])
-        if length not in known["search"]:
-            known["search"][length] = {str(size): value for size, value in runs.search(lengths[row.run]).items()}
+        folder = next(folder for (_, run), folder in evaluations.folders.items() if run == row.run)
+        length = int(runs.read_json(folder / runs.SIZES)["descriptor"])
+        if str(length) not in known["search"]:
+            known["search"][str(length)] = {str(size): value for size, value in runs.search(length).items()}
             write_json(path, known)
         rest = sum(evaluations.seconds[row.name][step] for step in runs.STEPS)
-        growth[row.title] = {int(size): rest + value for size, value in known["search"][length].items()}
+        growth[row.title] = {int(size): rest + value for size, value in known["search"][str(length)].items()}
     return growth
 
 

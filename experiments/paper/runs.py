@@ -17,7 +17,7 @@ from mfvpr.checkpoints import REGISTRY, files
 from mfvpr.cli import evaluation, run_folder, schema
 from mfvpr.cli.command_line import checked, compose
 from mfvpr.cli.inputs import Inputs
-from mfvpr.datasets import Dataset, ImageFolder
+from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
@@ -94,10 +94,12 @@ def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], t
     names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
     weights = {name: files.read_manifest(name).sha256 for name in names if name in REGISTRY}
     return {
-        "settings": fingerprint(fixed), "images": fingerprint(dict(images)),
-        "ground truth": truth or "none", "weights": fingerprint(weights),
+        "settings": fingerprint(fixed),
+        "images": fingerprint(dict(images)),
+        "ground truth": truth or "none",
+        "weights": fingerprint(weights),
         "version": versions()["mfvpr"],
-    }  # fmt: skip
+    }
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
@@ -105,15 +107,13 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
     if not (folder / LAST).is_file():
         return False
     for name in (LAST, "run.json", SIZES):
-        try:
-            read_json(folder / name)
-        except (OSError, ValueError):
-            raise InputError(f"{folder}/{name}: is damaged, or missing; remove the folder, and run this again, or "
-                                "name another with out=DIR") from None  # fmt: skip
-    before = read_object(folder / INPUTS)
+        if not read_json(folder / name):
+            mend = "remove the folder, and run this again, or name another with out=DIR"
+            raise InputError(f"{folder}/{name}: is damaged, or missing; {mend}")
+    before = read_json(folder / INPUTS) or {}
     if other := [name for name, value in inputs.items() if before.get(name) != value]:
-        raise InputError(f"{folder}: a finished run of other {' and '.join(other)} is there; remove it, or name "
-                            "another folder with out=DIR")  # fmt: skip
+        mend = "remove it, or name another folder with out=DIR"
+        raise InputError(f"{folder}: a finished run of other {' and '.join(other)} is there; {mend}")
     return True
 
 
@@ -150,17 +150,11 @@ def bytes_of_an_image(inputs: Inputs) -> dict[str, float]:
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file."""
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """The object of a JSON file; an empty one for a missing or damaged file."""
+    """The value of a JSON file; None for a missing or damaged file."""
     try:
-        value = read_json(path)
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
+        return None
 
 
 def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
@@ -175,18 +169,20 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     candidates = settings["candidates"]
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
-    extractor = assembly.extractor(settings["features"], None)
-    retriever, matcher = (
-        assembly.retriever(settings["retrieval"], extractor, None),
-        assembly.matcher(settings["matching"], None),
-    )
+    extractor, matcher = assembly.extractor(settings["features"], None), assembly.matcher(settings["matching"], None)
+    retriever = assembly.retriever(settings["retrieval"], extractor, None)
     scorers, seconds = assembly.scorers(settings["scorer"]), dict[str, float]()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
         cache = FeatureCache(Path(folder) / "cache")
         system = System(Pipeline(extractor, retriever, matcher, candidates), {main: scorers[main]})
         for turn in ("first", "second"):
-            images = _link_under_new_names(sequence.images, number, Path(folder) / turn)
+            renamed = Path(folder) / turn
+            renamed.mkdir()
+            names = [f"{turn}{row:04d}{path.suffix}" for row, path in enumerate(sequence.images.paths[:number])]
+            for name, path in zip(names, sequence.images.paths, strict=False):
+                (renamed / name).symlink_to(path.absolute())
+            images = replace(sequence.images, root=renamed, names=tuple(names))
             part = replace(sequence, images=images, truth=None, excluded=None)
             seconds = rank_dataset(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
     return {step: seconds.get(step, 0.0) / number for step in STEPS}
@@ -195,15 +191,6 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
 def device() -> dict[str, Any]:
     """The device that the seconds are measured on, and versions."""
     return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": versions()}
-
-
-def _link_under_new_names(images: ImageFolder, number: int, folder: Path) -> ImageFolder:
-    """The first images under other names, in a folder of their own."""
-    folder.mkdir()
-    names = [f"{folder.name}{row:04d}{path.suffix}" for row, path in enumerate(images.paths[:number])]
-    for name, path in zip(names, images.paths, strict=False):
-        (folder / name).symlink_to(path.absolute())
-    return replace(images, root=folder, names=tuple(names))
 
 
 def search(descriptor: int) -> dict[int, float]:

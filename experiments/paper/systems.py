@@ -1,6 +1,5 @@
 """Rows of the tables, the evaluations that give them, and the data sets at hand."""
 
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,8 +63,12 @@ _PAPER = (
     *(Row(f"mix_{name}", f"Mix-{title}", f"mix_{name}") for name, title in _MIX.items()),
     Row("mix_hist_aliked_50", "Mix-hist 50, ALIKED", "mix_hist_aliked_50"),
 )
-_SCORES = {"count": "count", "rapid": "rapid", "sum": "sum", "anchor": "anchor", "histogram": "hist 50",
-           "homography_8": "RAN 8 px", "homography_24": "RAN 24 px", COMBINED: "hist-comb 50"}  # fmt: skip
+_SCORES = {name: name for name in ("count", "rapid", "sum", "anchor")} | {
+    "histogram": "hist 50",
+    "homography_8": "RAN 8 px",
+    "homography_24": "RAN 24 px",
+    COMBINED: "hist-comb 50",
+}
 _NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran_24", COMBINED: "hist_comb_50"}
 
 
@@ -112,11 +115,8 @@ def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
 
 
 def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]) -> None:
-    for name in names or ():
-        if name not in known:
-            nearest = difflib.get_close_matches(name, known, n=1) or [choice for choice in known if name in choice]
-            hint = f"; the nearest is {nearest[0]}" if nearest else ""
-            raise InputError(f"{setting}=[{name}]: expected some of {', '.join(known)}{hint}")
+    if unknown := [name for name in names or () if name not in known]:
+        raise InputError(f"{setting}=[{unknown[0]}]: expected some of {', '.join(known)}")
 
 
 def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], dict[str, str], list[str]]:
@@ -134,8 +134,6 @@ def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], 
         present = [root / folder for folder in folders if root and folder not in located and (root / folder).is_dir()]
         if name == DRAWN:
             available.append(Place(name, (f"dataset={name}",)))
-            if root and (root / name).is_dir():
-                refused.append(f"{root / name}: the drawn data set has this name; rename the folder")
         elif name in located and name in (*REAL, *PUBLISHED):
             refused.append(f"{name}: expected another layout than that of names with positions; rename the folder")
         elif name in located and not DATA_SET_NAME.holds(name):

@@ -84,9 +84,10 @@ class Evaluations:
         names = six if len(six) == len(BERLIN) + len(OTHERS) else names
         means = {}
         for row in self.rows:
-            results = [self.results.get((row.name, name)) for name in names]
-            recalls = {name: [result.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
-                       for name, result in zip(names, results, strict=True) if result}  # fmt: skip
+            recalls = {}
+            for name in names:
+                if result := self.results.get((row.name, name)):
+                    recalls[name] = [result.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
             if names and len(recalls) == len(names):
                 macro = average(recalls) if names == six else None
                 means[row.name] = np.mean([*recalls.values()], axis=0) if macro is None else macro
@@ -156,24 +157,26 @@ def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
 
 def paper_tables(evaluations: Evaluations) -> Iterator[tuple[str, str, Table]]:
     """(name, heading, table) of each that is not empty."""
-    candidates = (
+    names = [(evaluations.title(name), name, OVERALL) for name in evaluations.datasets]
+    tables = [
         ("data_sets", "Data sets (Table I)", _data_sets(evaluations)),
         ("settings", "Settings (Table II)", _settings(evaluations)),
-        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)",
-         _recalls(evaluations, [(evaluations.title(name), name, OVERALL) for name in evaluations.datasets])),
-        *(
-            (f"sequences_{name}", f"Recall@1 in %, sequences of {evaluations.title(name)} (Table IV)",
-             _recalls(evaluations, [*((part.name, name, part.name) for part in dataset.sequences),
-                                    ("mean", name, OVERALL)]))
-            for name, dataset in evaluations.datasets.items() if len(dataset.sequences) > 1
-        ),
-        ("averages", f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}", _averages(evaluations)),
+        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", _recalls(evaluations, names)),
+    ]
+    for name, dataset in evaluations.datasets.items():
+        if len(dataset.sequences) > 1:
+            parts = [*((part.name, name, part.name) for part in dataset.sequences), ("mean", name, OVERALL)]
+            heading = f"Recall@1 in %, sequences of {evaluations.title(name)} (Table IV)"
+            tables.append((f"sequences_{name}", heading, _recalls(evaluations, parts)))
+    averages = f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}"
+    device = f"RobotCar's snow, an RTX 2080 Ti; here {evaluations.timed_on}"
+    tables += [
+        ("averages", averages, _averages(evaluations)),
         ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", _depths(evaluations)),
         ("sizes", "Size of the database in MiB, of float32 (Table V)", _sizes(evaluations)),
-        ("seconds", "Seconds of a query by step (Table VI: "
-         f"RobotCar's snow, an RTX 2080 Ti; here {evaluations.timed_on})", _seconds(evaluations)),
-    )  # fmt: skip
-    for name, heading, table in candidates:
+        ("seconds", f"Seconds of a query by step (Table VI: {device})", _seconds(evaluations)),
+    ]
+    for name, heading, table in tables:
         if table.rows:
             has_printed = any("(" in cell.replace(INCOMPLETE, "") for row in table.rows for cell in row[1:])
             yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
@@ -226,12 +229,11 @@ def _filled(header: Sequence[str], cells: Mapping[str, Sequence[str]]) -> Table:
 def _averages(evaluations: Evaluations) -> Table:
     """Means over the data sets that are here, see `Evaluations.means`, and the printed ones beside those of all six."""
     names, means = evaluations.means
-    is_papers, no_values = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES)
-    cells = {}
+    is_papers, no_values, cells = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES), {}
     for row in evaluations.rows:
-        printed_mean, ours = average(printed_tables()["recall"].get(row.name, {})), means.get(row.name, no_values)
-        theirs = no_values if printed_mean is None else printed_mean
-        cells[row.title] = [beside(*both) for both in zip(ours if is_papers else no_values, theirs, strict=True)]
+        ours, theirs = means.get(row.name, no_values), average(printed_tables()["recall"].get(row.name, {}))
+        pairs = zip(ours if is_papers else no_values, no_values if theirs is None else theirs, strict=True)
+        cells[row.title] = [beside(*pair) for pair in pairs]
         cells[row.title] += [beside(value, None) for value in (no_values if is_papers else ours)]
     words = "of the paper's six", f"of {len(names)} here"
     table = _filled([f"{name} ±{tolerance}" for name in words for tolerance in TOLERANCES], cells)
@@ -256,12 +258,10 @@ def _depths(evaluations: Evaluations) -> Table:
 
 def _sizes(evaluations: Evaluations) -> Table:
     """Sizes of the databases."""
-    printed = printed_tables()["sizes"]
-    cells = {
-        row.title: [beside(evaluations.sizes.get((row.name, name)), printed.get(row.name, {}).get(name))
-                    for name in evaluations.datasets]
-        for row in evaluations.rows
-    }  # fmt: skip
+    cells = {}
+    for row in evaluations.rows:
+        printed, sizes = printed_tables()["sizes"].get(row.name, {}), evaluations.sizes
+        cells[row.title] = [beside(sizes.get((row.name, name)), printed.get(name)) for name in evaluations.datasets]
     return _filled([*map(evaluations.title, evaluations.datasets)], cells)
 
 

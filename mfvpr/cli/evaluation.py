@@ -52,10 +52,8 @@ def evaluation_of(settings: dict[str, Any]) -> Outcome:
     ranked = rank_dataset(inputs.dataset, system, cache=inputs.cache)
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings["threshold"] is None else evidence_against(ranked, inputs.cache)
-    report = EvaluationReport.of(
-        ranked, inputs.thresholds, settings["recall"]["ks"],
-        confidences=confidence and confidence.systems, least_confidence=settings["threshold"], lacking=lacking,
-    )  # fmt: skip
+    systems, ks = confidence and confidence.systems, settings["recall"]["ks"]
+    report = EvaluationReport(ranked, inputs.thresholds, ks, systems, settings["threshold"], lacking)
     figures = query_figures(report, figure_queries) + (confidence_figures(report) if figure_queries else [])
     return Outcome(inputs, report, _describe(settings, inputs, system), figures)
 

@@ -1,6 +1,6 @@
 """Results for people: tables, figures, pages, and the files of a run folder.
 
-Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations, evaluation_files and run_files
+Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations and run_files
 (files of an evaluation), sweeps, comparisons (of learning), figures, then pages/ (HTML).
 """
 

@@ -13,10 +13,10 @@ from mfvpr.baselines.learned_weight import LearnedWeight
 from mfvpr.baselines.weight_registry import write_weight
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
-from mfvpr.evaluation.statistics import estimate, mcnemar, path_test, recall_interval
+from mfvpr.evaluation.statistics import mcnemar, path_test, recall_interval
 from mfvpr.report.plots import curves_figure, weights_figure
 from mfvpr.report.runs import Figure
-from mfvpr.report.tables import Table, format_value
+from mfvpr.report.tables import Table, format_interval, format_values
 from mfvpr.tuning.learning.comparison import Comparison
 from mfvpr.tuning.learning.training import Fit
 from mfvpr.utils.numerics import compiled
@@ -30,17 +30,15 @@ def comparison_table(comparison: Comparison) -> Table:
     p is McNemar's, which takes queries for independent, and that of `path_test`.
     """
     protocol = comparison.protocol
-    lines, first = [], None
-    for name, hits, _ in comparison.rows():
-        first = hits if first is None else first
-        low, high = estimate(hits[protocol.main]).interval
-        differences = [""] * 3
-        if hits is not first:
-            pair = hits[protocol.main], first[protocol.main]
+    lines, first = [], next(comparison.rows())[1]
+    for number, (name, hits, _) in enumerate(comparison.rows()):
+        deciding, differences = hits[protocol.main], [""] * 3
+        if number > 0:
+            pair = deciding, first[protocol.main]
             test, path = mcnemar(*pair), path_test(*pair)
             differences = [f"+{test.only_first} -{test.only_second}", f"{test.p_value:.2g}", f"{path.p_value:.2g}"]
-        recalls = [f"{100 * values.mean():.1f}" for values in (*hits, *_by_set(protocol, hits[protocol.main]).values())]
-        lines.append([name, *recalls, f"[{100 * low:.1f}, {100 * high:.1f}]", *differences])
+        recalls = [f"{100 * values.mean():.1f}" for values in (*hits, *_by_set(protocol, deciding).values())]
+        lines.append([name, *recalls, format_interval(recall_interval(deciding)), *differences])
     words = threshold_words(protocol.unit, protocol.thresholds[protocol.main])
     header = [protocol.label(1, threshold) for threshold in protocol.thresholds]
     header += [f"{name}{words}" for name in protocol.reported_sets]
@@ -56,13 +54,12 @@ def _by_set(protocol: EvaluationProtocol, hits: np.ndarray) -> dict[str, np.ndar
 
 def comparison_text(comparison: Comparison) -> str:
     """The table, and the values that were chosen or learned."""
-    lines = []
+    lines = [comparison_table(comparison).text()]
     for name, _, halves in comparison.rows():
-        for row in (row for row in halves if row.values):
-            values = ", ".join(f"{key} = {format_value(value)}" for key, value in row.values.items())
+        for row in halves:
             steps = f"; best after {row.fitted.step} steps, {row.fitted.ended}" if row.fitted else ""
-            lines.append(f"{name}, {row.half}: {values}{steps}")
-    return "\n".join([comparison_table(comparison).text(), *lines])
+            lines += [f"{name}, {row.half}: {format_values(row.values)}{steps}"] if row.values else []
+    return "\n".join(lines)
 
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
@@ -73,31 +70,36 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
     def by_threshold(values: Iterable[Any]) -> dict[str, Any]:
         return dict(zip([f"{threshold:g}" for threshold in protocol.thresholds], values, strict=True))
 
-    rows = [
-        {
-            "score": name,
-            "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
-            "interval": by_threshold(map(recall_interval, hits)),
-            "against_first": by_threshold(
-                {"mcnemar": mcnemar(*pair)._asdict(), "path_test": path_test(*pair)._asdict()}
-                for pair in zip(hits, first, strict=True)
-            ),
-            "by_set": {set_name: by_threshold(set_hits.mean(axis=0).tolist())
-                       for set_name, set_hits in _by_set(protocol, hits.T).items()},
-            "halves": {
-                row.half: {"values": dict(row.values), "recall_at_1": row.hits.mean(axis=1).tolist()}
-                | ({"steps": row.fitted.step, "history": row.fitted.history} if row.fitted else {})
-                for row in halves
-            },
-        }
-        for name, hits, halves in comparison.rows()
-    ]  # fmt: skip
+    rows = []
+    for name, hits, halves in comparison.rows():
+        tests = [
+            {"mcnemar": mcnemar(*pair)._asdict(), "path_test": path_test(*pair)._asdict()}
+            for pair in zip(hits, first, strict=True)
+        ]
+        parts = {}
+        for row in halves:
+            parts[row.half] = {"values": dict(row.values), "recall_at_1": row.hits.mean(axis=1).tolist()}
+            parts[row.half] |= {"steps": row.fitted.step, "history": row.fitted.history} if row.fitted else {}
+        sets = _by_set(protocol, hits.T)
+        rows.append(
+            {
+                "score": name,
+                "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
+                "interval": by_threshold(map(recall_interval, hits)),
+                "against_first": by_threshold(tests),
+                "by_set": {set_name: by_threshold(each.mean(axis=0).tolist()) for set_name, each in sets.items()},
+                "halves": parts,
+            }
+        )
     return {
-        "unit": protocol.unit, "thresholds": list(protocol.thresholds),
-        "queries": {"reported": [half.report.tolist() for half in protocol.halves],
-                    "chosen_on": [half.tune.tolist() for half in protocol.halves]},
+        "unit": protocol.unit,
+        "thresholds": list(protocol.thresholds),
+        "queries": {
+            "reported": [half.report.tolist() for half in protocol.halves],
+            "chosen_on": [half.tune.tolist() for half in protocol.halves],
+        },
         "rows": rows,
-    }  # fmt: skip
+    }
 
 
 def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str, Any]) -> None:
@@ -133,8 +135,10 @@ def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, Le
     pairs = [(comparison.match_set[query], correct) for query, correct in zip(shown, positives, strict=True)]
     inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches, _ in pairs])
     correct = np.concatenate([np.repeat(correct, matches.mask.sum(axis=1)) for matches, correct in pairs])
-    by_training = {name: np.concatenate([np.asarray(_weigh(weight, matches))[matches.mask] for matches, _ in pairs])
-                   for name, weight in weights.items()}  # fmt: skip
+    by_training = {}
+    for name, weight in weights.items():
+        weighed = [np.asarray(_weigh(weight, matches))[matches.mask] for matches, _ in pairs]
+        by_training[name] = np.concatenate(weighed)
     weights_figure(path, first.names, inputs, by_training, correct)
 
 

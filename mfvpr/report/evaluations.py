@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
-from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
+from mfvpr.datasets.ground_truth import Truth, middle, threshold_words
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.confidence import Confidence
 from mfvpr.evaluation.confidence_calibration import CalibrationData, absent_rankings, calibration_data
@@ -24,8 +24,7 @@ from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 
-_THRESHOLD_NAMES: dict[Unit, str] = {"frames": "tolerance", "m": "radius"}  # in results
-_SEQUENCES = "sequences"  # the folder of a run in which each of several sequences has its own
+NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,9 @@ class EvaluationReport:
 
     Attributes:
         ranked: rankings of all sequences.
-        thresholds: distances within which a prediction is correct, ascending; none without ground truth.
-        ks: depths of recall.
+        thresholds: distances within which a prediction is correct, sorted; empty = those that the programs have by
+            default. There are none without ground truth.
+        ks: depths of recall, sorted.
         confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
             confidence that was fitted on the other half.
         least_confidence: below which the prediction is `NO_PLACE`; None = no prediction is refused.
@@ -44,22 +44,17 @@ class EvaluationReport:
     """
 
     ranked: RankedDataset
-    thresholds: Sequence[float]
-    ks: Sequence[int]
+    thresholds: Sequence[float] = ()
+    ks: Sequence[int] = KS
     confidences: Mapping[str, Confidence] | None = None
     least_confidence: float | None = None
     lacking: Sequence[Sequence[Reason | None]] | None = None
 
-    @classmethod
-    def of(
-        cls, ranked: RankedDataset, thresholds: Sequence[float] | None = None, ks: Sequence[int] = KS, *,
-        confidences: Mapping[str, Confidence] | None = None, least_confidence: float | None = None,
-        lacking: Sequence[Sequence[Reason | None]] | None = None,
-    ) -> "EvaluationReport":  # fmt: skip
-        """The report with criteria in any order; without thresholds, those that the programs have by default."""
-        truth = ranked.dataset.sequences[0].truth
-        known = [] if truth is None else truth.thresholds() if thresholds is None else thresholds
-        return cls(ranked, sorted({*known}), sorted({*ks}), confidences, least_confidence, lacking)
+    def __post_init__(self) -> None:
+        truth = self.sequences[0].truth
+        thresholds = [] if truth is None else self.thresholds or truth.thresholds()
+        object.__setattr__(self, "thresholds", sorted({*thresholds}))
+        object.__setattr__(self, "ks", sorted({*self.ks}))
 
     @property
     def headline(self) -> str:
@@ -70,9 +65,8 @@ class EvaluationReport:
     def histogram(self) -> HistogramOfShifts | None:
         """The main scorer of the final score that decides, if it is a histogram of shifts."""
         system = self.ranked.system
-        scorers = system.final_scores[self.headline].scorers
-        main = system.scorers[scorers[0]] if scorers else None
-        return main if isinstance(main, HistogramOfShifts) else None
+        scorers = [system.scorers[name] for name in system.final_scores[self.headline].scorers]
+        return scorers[0] if scorers and isinstance(scorers[0], HistogramOfShifts) else None
 
     @property
     def threshold(self) -> float:
@@ -98,15 +92,17 @@ class EvaluationReport:
 
     def rows(self, system: str) -> list[dict[str, Any]]:
         """Threshold and recall by K; for several sequences, of each sequence and their means."""
-        truth, several = self.sequences[0].truth, len(self.sequences) > 1
-        name = _THRESHOLD_NAMES.get(truth.unit) if truth else None
-        return [
-            ({"sequence": sequence} if several else {})
-            | ({name: threshold} if name else {})
-            | {"recall_at": {str(k): round(float(value), 6) for k, value in zip(self.ks, values, strict=True)}}
-            for sequence, recall in (self.parts(system) if self.thresholds else ())
-            for threshold, values in zip(self.thresholds, recall, strict=True)
-        ] or [{"recall_at": {}}]
+        truth = self.sequences[0].truth
+        if truth is None or not self.thresholds:
+            return [{"recall_at": {}}]
+        name, rows = {"frames": "tolerance", "m": "radius"}.get(truth.unit), []
+        for sequence, recall in self.parts(system):
+            for threshold, values in zip(self.thresholds, recall, strict=True):
+                row: dict[str, Any] = {"sequence": sequence} if len(self.sequences) > 1 else {}
+                row |= {name: threshold} if name else {}
+                recall_at = {str(k): round(float(value), 6) for k, value in zip(self.ks, values, strict=True)}
+                rows.append(row | {"recall_at": recall_at})
+        return rows
 
     @cached_property
     def positives(self) -> Sequence[Positives | None]:
@@ -141,25 +137,30 @@ class EvaluationReport:
         """Confidence by system, NaN without a prediction, or without anything to fit on."""
         if self.confidences is None:
             return {name: present for name, (present, _) in self._cross_fitted.items()}
-        return {name: np.concatenate([self.confidences[name](*pair) for pair in self._pairs(name)])
-                for name in self.confidences if name in self.ranked.systems}  # fmt: skip
+        known = {name: fitted for name, fitted in self.confidences.items() if name in self.ranked.systems}
+        return {name: np.concatenate([fitted(*pair) for pair in self._pairs(name)]) for name, fitted in known.items()}
 
     @cached_property
     def absent_probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
         """Confidence by system of the queries without the images of their place; nothing without ground truth."""
         if self.confidences is None or not self.thresholds:
             return {name: absent for name, (_, absent) in self._cross_fitted.items()}
-        return {name: np.concatenate([self.confidences[name](*absent_rankings(*pair, truth, self.threshold))
-                                      for pair, truth in zip(self._pairs(name), self._truths, strict=True)])
-                for name in self.probabilities}  # fmt: skip
+        probabilities = {}
+        for name in self.probabilities:
+            pairs = zip(self._pairs(name), self._truths, strict=True)
+            absent = (absent_rankings(*pair, truth, self.threshold) for pair, truth in pairs)
+            probabilities[name] = np.concatenate([self.confidences[name](*pair) for pair in absent])
+        return probabilities
 
     @cached_property
     def calibration(self) -> dict[str, CalibrationData]:
         """Data that the confidence of a system is fitted on, by system; nothing without ground truth."""
-        parts = {name: [calibration_data(*pair, truth, self.threshold)
-                        for pair, truth in zip(self._pairs(name), self._truths, strict=True)]
-                 for name in self.ranked.systems if self.thresholds}  # fmt: skip
-        return {name: CalibrationData(*map(np.concatenate, zip(*each, strict=True))) for name, each in parts.items()}
+        calibration = {}
+        for name in self.ranked.systems if self.thresholds else ():
+            pairs = zip(self._pairs(name), self._truths, strict=True)
+            parts = [calibration_data(*pair, truth, self.threshold) for pair, truth in pairs]
+            calibration[name] = CalibrationData(*map(np.concatenate, zip(*parts, strict=True)))
+        return calibration
 
     def scores(self, system: str) -> Float[np.ndarray, " queries"]:
         """Scores of the first predictions, NaN without one."""
@@ -183,17 +184,13 @@ class EvaluationReport:
             return np.zeros(self.num_queries, bool)
         return np.array([reason is not None for reason in self.reasons(system)])
 
-    @cached_property
-    def refused(self) -> list[Bool[np.ndarray, " _"]]:
-        """Refusals of each sequence, by the system that decides."""
-        return self.by_sequence(self.refusals(self.headline))
-
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by the confidence where it is known; with ground truth."""
         has_positives = np.concatenate([part.counts > 0 for part in self.positives if part is not None])
-        by_kind = {"score": self.scores(system), "confidence": self.probabilities.get(system)}
-        return {by: precision_recall(values, self.hits(system), has_positives)
-                for by, values in by_kind.items() if values is not None}  # fmt: skip
+        values = {"score": self.scores(system)}
+        if system in self.probabilities:
+            values["confidence"] = self.probabilities[system]
+        return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
 
     @cached_property
     def _cross_fitted(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
@@ -227,21 +224,21 @@ class EvaluationReport:
 
 def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
     """The folder of one sequence's files: the run's, or one below it if there are several sequences."""
-    return run / _SEQUENCES / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
+    return run / "sequences" / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
 def recall_table(evaluation: EvaluationReport) -> Table:
     """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
-    truth, ks, main = evaluation.sequences[0].truth, evaluation.ks, len(evaluation.thresholds) // 2
-    if not evaluation.thresholds:
+    thresholds, ks, truth = evaluation.thresholds, evaluation.ks, evaluation.sequences[0].truth
+    if truth is None or not thresholds:
         raise InputError(f"{evaluation.ranked.dataset.name}: there is no ground truth, so no recall; see `predictions`")
-    cells = [(place, 0) for place in range(len(evaluation.thresholds))] + [(main, depth) for depth in range(1, len(ks))]
-    unit = "exact" if truth is None else truth.unit
-    labels = [f"R@{ks[depth]}{threshold_words(unit, evaluation.thresholds[place])}" for place, depth in cells]
-    several = len(evaluation.sequences) > 1
-    lines = [
-        [system, *([name] if several else []), *(f"{100 * recall[cell]:.1f}" for cell in cells)]
-        for system in evaluation.ranked.systems
-        for name, recall in evaluation.parts(system)
-    ]
-    return Table(["system", *(["sequence"] if several else []), *labels], lines, text_columns=1 + several)
+    cells = [(place, 0) for place in range(len(thresholds))]
+    cells += [(len(thresholds) // 2, depth) for depth in range(1, len(ks))]
+    labels = [f"R@{ks[depth]}{threshold_words(truth.unit, thresholds[place])}" for place, depth in cells]
+    several, lines = len(evaluation.sequences) > 1, []
+    for system in evaluation.ranked.systems:
+        for name, recall in evaluation.parts(system):
+            names = [system, name] if several else [system]
+            lines.append([*names, *(f"{100 * recall[cell]:.1f}" for cell in cells)])
+    names = ["system", "sequence"] if several else ["system"]
+    return Table([*names, *labels], lines, text_columns=len(names))

@@ -12,7 +12,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
 from mfvpr.core.types import Matches
-from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.image_reading import resize
 from mfvpr.evaluation.stages import Explanation
 from mfvpr.report.plots import panels, save_figure
@@ -88,33 +88,33 @@ def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.nd
 
 
 def _draw_pair(axes: Axes, query: np.ndarray, candidate: Candidate) -> None:
-    offset = query.shape[1] + _GAP
-    height = max(len(query), len(candidate.image))
-    canvas = np.full((height, offset + candidate.image.shape[1], 3), 255, np.uint8)
+    """Draw query and candidate side by side, with the heaviest matches."""
+    offset, image, matches, explanation = (
+        query.shape[1] + _GAP,
+        candidate.image,
+        candidate.matches,
+        candidate.explanation,
+    )
+    canvas = np.full((max(len(query), len(image)), offset + image.shape[1], 3), 255, np.uint8)
     canvas[: len(query), : query.shape[1]] = query
-    canvas[: len(candidate.image), offset:] = candidate.image
+    canvas[: len(image), offset:] = image
     axes.imshow(canvas)
     axes.set_axis_off()
     words = "query | candidate"
-    if candidate.matches is not None and candidate.explanation is not None:
-        words = _draw_matches(axes, offset, candidate.matches, candidate.explanation)
+    if matches is not None and explanation is not None:
+        count = int(matches.mask.sum())
+        weights = np.where(matches.mask, explanation.weights, -np.inf)
+        heaviest = np.lexsort((matches.distance, -weights))[: min(_MATCHES, count)]  # of equal weights the nearest
+        start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
+        colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
+        lines = np.stack([start, end], axis=1)
+        axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
+        for points in (start, end):
+            axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
+        drawn, agree = explanation.agrees[heaviest].sum(), explanation.agrees.sum()
+        words += f"; blue matches agree with the peak: {drawn} of {len(heaviest)} drawn, {agree} of {count}"
     caption = clip_middle(printable(candidate.caption), _CAPTION_LENGTH)
     axes.set_title(f"{caption}\n{words}", fontsize=9, parse_math=False)
-
-
-def _draw_matches(axes: Axes, offset: int, matches: Matches, explanation: Explanation) -> str:
-    """Draw the heaviest matches; return a caption."""
-    count = int(matches.mask.sum())
-    weights = np.where(matches.mask, explanation.weights, -np.inf)
-    heaviest = np.lexsort((matches.distance, -weights))[: min(_MATCHES, count)]  # of equal weights the nearest
-    start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
-    colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
-    lines = np.stack([start, end], axis=1)
-    axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
-    for points in (start, end):
-        axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
-    drawn, agree = explanation.agrees[heaviest].sum(), explanation.agrees.sum()
-    return f"query | candidate; blue matches agree with the peak: {drawn} of {len(heaviest)} drawn, {agree} of {count}"
 
 
 def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesImage:
@@ -144,8 +144,19 @@ def contact_sheet(path: Path, dataset: Dataset) -> None:
 
     Without ground truth, queries stand alone.
     """
-    each = max(2, -(-_PAIRS // len(dataset.sequences)))
-    pairs = [pair for sequence in dataset.sequences for pair in _pairs(sequence, dataset.database, each)]
+
+    def read(folder: ImageFolder, row: int, sequence: str) -> LabeledImage:
+        try:
+            return with_longest_side(folder.read(row), _SIDE), f"{sequence} {folder.names[row]}".strip()
+        except InputError:
+            return None, f"{folder.names[row]} cannot be read"
+
+    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[LabeledImage]]()
+    for sequence in dataset.sequences:
+        for query in np.unique(np.linspace(0, len(sequence.images) - 1, each).round().astype(int)).tolist():
+            place = None if sequence.truth is None else sequence.truth.place(query)
+            places = [] if place is None else [read(dataset.database, place, "")]
+            pairs.append([read(sequence.images, query, sequence.name), *places])
     shapes = [image.shape for pair in pairs for image, _ in pair if image is not None]
     height = _WIDTH * float(np.median([rows / columns for rows, columns, _ in shapes] or [0.75]))
     rows, columns = -(-len(pairs) // _PAIRS_IN_A_ROW), 2 * _PAIRS_IN_A_ROW
@@ -161,21 +172,3 @@ def contact_sheet(path: Path, dataset: Dataset) -> None:
         if len(pair) < 2:
             axes[2 * number + 1].text(0.5, 0.5, "no place", ha="center")
     save_figure(figure, path, dpi=80)
-
-
-def _pairs(sequence: QuerySequence, database: ImageFolder, number: int) -> list[list[LabeledImage]]:
-    """Queries, each with its place where that is known."""
-    pairs = []
-    for query in np.unique(np.linspace(0, len(sequence.images) - 1, number).round().astype(int)).tolist():
-        place = None if sequence.truth is None else sequence.truth.place(query)
-        places = [] if place is None else [_image(database, place, "")]
-        pairs.append([_image(sequence.images, query, sequence.name), *places])
-    return pairs
-
-
-def _image(folder: ImageFolder, row: int, sequence: str) -> LabeledImage:
-    name = folder.names[row]
-    try:
-        return with_longest_side(folder.read(row), _SIDE), f"{sequence} {name}".strip()
-    except InputError:
-        return None, f"{name} cannot be read"

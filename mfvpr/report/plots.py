@@ -1,4 +1,4 @@
-"""Figures of numbers: precision and recall, calibration, sweeps, trainings; canvas and colors of all figures."""
+"""Figures of numbers: calibration, sweeps, trainings; canvas and colors of all figures."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,14 +12,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mfvpr.evaluation.reliability import PrecisionRecall, Reliability
+from mfvpr.evaluation.reliability import Reliability
 from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
 
 BINS = 12  # of the matches, by the value of an input
 COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
 _FIRST = "#8a8f98"  # of what all others are compared with
 _DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
-_LINE_STYLES = {"solid": "solid", "dash": "dashed", "dot": "dotted", "dashdot": "dashdot"}  # by plotly's words
 _TITLE_LENGTH = 34  # characters that fit above a panel
 _LOSS, _MARK, _SHARE = "#2fa8ff", "#e8482c", "#888888"
 _SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
@@ -53,25 +52,10 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -
 
 
 def color_and_dash(place: int) -> tuple[str, str]:
-    """Color and plotly's name of the dash of the system at a place of the table, the same in figures and pages."""
+    """Color and plotly's name of the dash of the system at a place of the table."""
     if place == 0:
         return _FIRST, "solid"
     return COLORS[(place - 1) % len(COLORS)], _DASHES[(place - 1) // len(COLORS) % len(_DASHES)]
-
-
-def precision_recall_figure(path: Path, curves: Mapping[str, Mapping[str, PrecisionRecall]]) -> None:
-    """Draw a panel by "score" and one by "confidence", each with a curve per system; `curves[system][by]`."""
-    kinds = list(dict.fromkeys(kind for by_kind in curves.values() for kind in by_kind))
-    figure, axes = panels(len(kinds), 5.0, 5.0)
-    for panel, kind in zip(axes, kinds, strict=True):
-        for place, (name, by_kind) in enumerate(curves.items()):
-            if curve := by_kind.get(kind):
-                label = f"{_short(name)}: AP {100 * curve.average_precision:.1f}"
-                panel.plot(curve.recall, curve.precision, label=label, **_line(place))
-        panel.set_title(f"by {kind}", fontsize=9)
-        _label(panel, "recall of the queries with a correct image", "precision of the predictions")
-        panel.legend(fontsize=7, loc="lower left")
-    save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel
 
 
 def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> None:
@@ -81,35 +65,13 @@ def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> 
         panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
         sizes = 200 * bins.count / max(bins.count.sum(), 1) + 4
         panel.scatter(bins.probability, bins.correct, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
-        panel.set_title(f"{_short(name)}\nECE {100 * bins.calibration_error:.1f} %", fontsize=8, parse_math=False)
-        _label(panel, "confidence", "correct")
-    save_figure(figure, path, bbox_inches="tight")
-
-
-def shares_figure(path: Path, shares: Sequence[float], recall: Mapping[str, Float[np.ndarray, " shares"]]) -> None:
-    """Draw recall at 1 (by system, without retrieval) over the share of queries that are re-ranked."""
-    figure, [panel] = panels(1, 5.0, 5.0)
-    for place, (name, values) in enumerate(recall.items(), start=1):
-        panel.plot(shares, values, label=_short(name), **_line(place))
-    _label(panel, "share of queries re-ranked", "recall at 1")
-    panel.legend(fontsize=7)
-    save_figure(figure, path, bbox_inches="tight")
-
-
-def _line(place: int) -> dict[str, Any]:
-    color, dash = color_and_dash(place)
-    return {"color": color, "linestyle": _LINE_STYLES[dash], "linewidth": 1.2}
-
-
-def _short(name: str) -> str:
-    return clip_middle(printable(name), _TITLE_LENGTH)
-
-
-def _label(panel: Axes, x: str, y: str) -> None:
-    panel.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    panel.set_xlabel(x, fontsize=8)
-    panel.set_ylabel(y, fontsize=8)
-    panel.grid(alpha=0.3)
+        title = f"{clip_middle(printable(name), _TITLE_LENGTH)}\nECE {100 * bins.calibration_error:.1f} %"
+        panel.set_title(title, fontsize=8, parse_math=False)
+        panel.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+        panel.set_xlabel("confidence", fontsize=8)
+        panel.set_ylabel("correct", fontsize=8)
+        panel.grid(alpha=0.3)
+    save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel
 
 
 def heat_map_figure(

@@ -1,7 +1,6 @@
 """Predictions as files of other programs: candidates, trajectories, and a table of shifts with times."""
 
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.io.containers import reading, shorten
 from mfvpr.io.shortlists import write_shortlist
 from mfvpr.io.trajectories import SECOND, read_poses, write_trajectory
-from mfvpr.report.evaluation_files import NO_PLACE
+from mfvpr.report.evaluations import NO_PLACE
 from mfvpr.report.tables import read_csv, write_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
@@ -46,25 +45,34 @@ class LocalizedImage:
 
 
 def write_candidates(
-    path: Path | str, shortlist: Shortlist, queries: ImageFolder, database: ImageFolder, layout: CandidateLayout,
-    positives: Positives | None = None, *, prefixes: tuple[str, str] = ("", ""),
-) -> None:  # fmt: skip
+    path: Path | str,
+    shortlist: Shortlist,
+    queries: ImageFolder,
+    database: ImageFolder,
+    layout: CandidateLayout,
+    positives: Positives | None = None,
+    *,
+    prefixes: tuple[str, str] = ("", ""),
+) -> None:
     """Write candidates as `mfvpr.io.write_shortlist`; `preds` has full paths, and the correct images if known.
 
     Other layouts have `prefixes` before the names of queries and database images.
     """
-    sides = (queries, prefixes[0]), (database, prefixes[1])
-    names = [[prefix + name for name in side.names] for side, prefix in sides]
-    if layout == "preds":
-        names = [[os.path.abspath(path) for path in side.paths] for side, _ in sides]
+    names = []
+    for side, prefix in zip((queries, database), prefixes, strict=True):
+        paths = [os.path.abspath(path) for path in side.paths] if layout == "preds" else side.names
+        names.append([prefix + path for path in paths])
     correct = None if positives is None else [positives.of(row).tolist() for row in range(len(queries))]
     write_shortlist(path, shortlist, *names, layout=layout, positives=correct)
 
 
 def write_poses(
-    path: Path | str, images: Sequence[LocalizedImage], poses: Path, database: Sequence[str],
+    path: Path | str,
+    images: Sequence[LocalizedImage],
+    poses: Path,
+    database: Sequence[str],
     stamps: Sequence[int] | None,
-) -> None:  # fmt: skip
+) -> None:
     """Write the pose of each first candidate, as `mfvpr.io.write_trajectory`; `stamps` None = KITTI.
 
     `poses` is a file of the `database` images, as `mfvpr.io.read_poses` reads it.
@@ -72,14 +80,16 @@ def write_poses(
     by_name = dict(zip(database, read_poses(poses, database), strict=True))
     texts = []
     for image in images:
-        if image.place is not None and not image.candidates:
-            raise InputError(f"{shorten(image.name)}: expected the name of its place, got no alternatives; localize "
-                             "with alternatives=1 or more")  # fmt: skip
-        name = None if image.place is None else image.candidates[0][0]
-        if name is not None and name not in by_name:
-            raise InputError(f"{shorten(image.name)}: expected a database image with a pose, got {shorten(name)}; name "
-                             "the folder of the database")  # fmt: skip
-        texts.append(name and by_name[name])
+        if image.place is None:
+            texts.append(None)
+        elif not image.candidates:
+            words = "expected the name of its place, got no alternatives; localize with alternatives=1 or more"
+            raise InputError(f"{shorten(image.name)}: {words}")
+        elif (name := image.candidates[0][0]) not in by_name:
+            words = f"expected a database image with a pose, got {shorten(name)}; name the folder of the database"
+            raise InputError(f"{shorten(image.name)}: {words}")
+        else:
+            texts.append(by_name[name])
     write_trajectory(path, texts, stamps)
 
 
@@ -89,15 +99,12 @@ def write_shift_table(path: Path, images: Sequence[LocalizedImage], stamps: Sequ
     The file must be new. Unknown numbers, and the place of an image without one, are empty cells.
     """
     require_replaceable(path)
-    write_csv(path, SHIFT_COLUMNS, (
-        [stamps[row] // SECOND, stamps[row] % SECOND, _FRAME, _place_text(images[row].place),
-         *(images[row].cells.get(name, "") for name in _CELLS), images[row].name]
-        for row in sorted(range(len(images)), key=stamps.__getitem__)
-    ))  # fmt: skip
-
-
-def _place_text(place: Any) -> str:
-    return "" if place is None else place if isinstance(place, str) else json.dumps(place, ensure_ascii=False)
+    lines = []
+    for row in sorted(range(len(images)), key=stamps.__getitem__):
+        place, cells = images[row].place, [images[row].cells.get(name, "") for name in _CELLS]
+        text = "" if place is None else place if isinstance(place, str) else json.dumps(place, ensure_ascii=False)
+        lines.append([stamps[row] // SECOND, stamps[row] % SECOND, _FRAME, text, *cells, images[row].name])
+    write_csv(path, SHIFT_COLUMNS, lines)
 
 
 def shortlist_of(images: Sequence[LocalizedImage], database: Sequence[str]) -> Shortlist:
@@ -107,54 +114,50 @@ def shortlist_of(images: Sequence[LocalizedImage], database: Sequence[str]) -> S
     indices, scores = np.full((len(images), depth), -1, np.int32), np.zeros((len(images), depth), np.float32)
     for query, image in enumerate(images):
         for rank, (name, score) in enumerate(image.candidates):
-            if name not in rows:
-                raise InputError(f"{shorten(name)}: expected an image of the database, got none; the data set has "
-                                 "changed since the run")  # fmt: skip
+            _require_known(name, rows, "an image of the database")
             indices[query, rank], scores[query, rank] = rows[name], score
     return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
+def _require_known(name: str, known: Mapping[str, int], expected: str) -> None:
+    if name not in known:
+        raise InputError(f"{shorten(name)}: expected {expected}, got none; the data set has changed since the run")
+
+
 def read_lines(path: Path) -> list[LocalizedImage]:
     """Read the lines of `mfvpr localize`; an image that could not be read has no place, and its error as reason."""
+
+    def image_of(line: Mapping[str, Any]) -> LocalizedImage:
+        if "error" in line:
+            return LocalizedImage(line["image"], cells={"reason": line["error"]})
+        low, high = line["shift_interval"] or [[None, None]] * 2
+        numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
+        cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
+        if line["place"] is None:
+            return LocalizedImage(line["image"], cells=cells | {"reason": line["reason"]})
+        candidates = [(each["name"], each["score"]) for each in line["alternatives"]]
+        return LocalizedImage(line["image"], line["place"], candidates, cells)
+
     with reading(path, mend="expected lines of mfvpr localize"):
         lines = path.read_text(encoding="utf-8").split("\n")
     images = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
             try:
-                images.append(_image_of(json.loads(line)))
+                images.append(image_of(json.loads(line)))
             except (AttributeError, LookupError, TypeError, ValueError, RecursionError):
-                raise InputError(f"{path}: line {number}: expected a line of mfvpr localize, got "
-                                 f"{shorten(line)!r}") from None  # fmt: skip
+                words = f"expected a line of mfvpr localize, got {shorten(line)!r}"
+                raise InputError(f"{path}: line {number}: {words}") from None
     return images
-
-
-def _image_of(line: Mapping[str, Any]) -> LocalizedImage:
-    """The image of a line; raises what damaged lines make Python raise."""
-    name, place = line["image"], line.get("place")
-    if not isinstance(name, str):
-        raise TypeError("a name that is no text")
-    if "error" in line:
-        return LocalizedImage(name, cells={"reason": str(line["error"])})
-    low, high = line["shift_interval"] or [[None, None]] * 2
-    numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
-    if not all(number is None or math.isfinite(number) for number in numbers):
-        raise ValueError("a number that is not finite")
-    cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
-    candidates = [(str(each["name"]), each["score"]) for each in line["alternatives"]]
-    if place is None:
-        return LocalizedImage(name, cells=cells | {"reason": str(line["reason"])})
-    return LocalizedImage(name, place, candidates, cells)
 
 
 def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:
     """Localized images of a sequence of an evaluation, from the files in its folder; refused queries have no place."""
-    candidates, cells, known = dict[str, list[tuple[str, float]]](), dict[str, dict[str, str]](), {*queries}
+    candidates, cells = dict[str, list[tuple[str, float]]](), dict[str, dict[str, str]]()
+    known = {name: row for row, name in enumerate(queries)}
     with reading(folder / "predictions.csv", mend="expected the folder of an evaluation"):
         for row in read_csv(folder / "predictions.csv"):
-            if row["query"] not in known:
-                raise InputError(f"expected queries of the data set, got {shorten(row['query'])}; the data set has "
-                                 "changed since the run")  # fmt: skip
+            _require_known(row["query"], known, "a query of the data set")
             if row["database"] != NO_PLACE:
                 candidates.setdefault(row["query"], []).append((row["database"], float(row["score"])))
     for name in ("top_predictions.csv", "shifts.csv"):

@@ -37,10 +37,9 @@ def query_figures(evaluation: EvaluationReport, shown: int | Sequence[int]) -> l
     for place, sequence in enumerate(evaluation.sequences):
         drawings = SequenceFigures(evaluation, place)
         folder = f"{folders[sequence.name]}/" if several else ""
-        figures += [
-            (f"{folder}{verdict}_{query:04d}.png", partial(drawings.draw, query=query, verdict=verdict))
-            for query, verdict in drawings.verdicts(shown).items()
-        ]
+        for query, verdict in drawings.verdicts(shown).items():
+            draw = partial(drawings.draw, query=query, verdict=verdict)
+            figures.append((f"{folder}{verdict}_{query:04d}.png", draw))
     return figures
 
 
@@ -63,9 +62,12 @@ class SequenceFigures:
         verdicts = np.where(is_first, words[0], words[-1])
         if not isinstance(selection, int):
             return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
-        numbers = map(len, np.array_split(range(selection), len(words)))
-        return {query: verdict for verdict, number in zip(words, numbers, strict=True)
-                for query in _pick_evenly(np.flatnonzero(has_prediction & (verdicts == verdict)), number)}  # fmt: skip
+        chosen: dict[int, str] = {}
+        for word, numbers in zip(words, np.array_split(range(selection), len(words)), strict=True):
+            queries = np.flatnonzero(has_prediction & (verdicts == word))
+            spread = np.linspace(0, len(queries) - 1, min(len(numbers), len(queries))).round().astype(int)
+            chosen |= dict.fromkeys(queries[spread].tolist(), word)
+        return chosen
 
     def title(self, query: int, verdict: str) -> str:
         """The score, whether the prediction is correct within the threshold, and both names."""
@@ -157,8 +159,3 @@ def localization_figure(
 
 def _short(name: str) -> str:
     return clip_middle(printable(name), _NAME_LENGTH)
-
-
-def _pick_evenly(values: np.ndarray, number: int) -> list[int]:
-    chosen = np.linspace(0, len(values) - 1, min(number, len(values))).round().astype(int)
-    return values[chosen].tolist()

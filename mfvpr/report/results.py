@@ -104,8 +104,10 @@ class Result:
     def only(self) -> RankedDataset:
         """Rankings of the only data set by the only system; InputError if there are several."""
         if len(self.parts) > 1:
-            raise InputError(f"result: expected one data set and one system, got {len(self.parts)} pairs; choose one "
-                             f"of parts: {', '.join(map(str, self.parts))}")  # fmt: skip
+            raise InputError(
+                f"result: expected one data set and one system, got {len(self.parts)} pairs; choose one of parts: "
+                f"{', '.join(map(str, self.parts))}"
+            )
         return next(iter(self.parts.values()))
 
     def table(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> Table:
@@ -134,14 +136,14 @@ class Result:
 
     def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
         """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold."""
-        return data_frame([
-            {"data set": dataset, "system": system, "score": score, "decides": score == report.headline}
-            | {name: value for name, value in row.items() if name != "recall_at"}
-            | {f"R@{k}": recall for k, recall in row["recall_at"].items()}
-            for (dataset, system), report in self._reports(thresholds, ks)
-            for score in report.ranked.systems
-            for row in report.rows(score)
-        ])  # fmt: skip
+        rows = []
+        for (dataset, system), report in self._reports(thresholds, ks):
+            for score in report.ranked.systems:
+                names = {"data set": dataset, "system": system, "score": score, "decides": score == report.headline}
+                for row in report.rows(score):
+                    recall = {f"R@{k}": value for k, value in row.pop("recall_at").items()}
+                    rows.append(names | row | recall)
+        return data_frame(rows)
 
     @cached_property
     def predictions(self) -> list[TopPrediction]:
@@ -182,15 +184,13 @@ class Result:
         result.write_predictions("preds")  # a folder of VPR-methods-evaluation, with full paths and correct images
         result.write_predictions("pairs.txt", layout="hloc")
         """
-        report = EvaluationReport.of(self.only)
+        report = EvaluationReport(self.only)
         files = file_names([sequence.name for sequence in report.sequences])
         for place, sequence in enumerate(report.sequences):
             target = Path(path) / files[sequence.name] if len(files) > 1 else Path(path)
-            shortlist, database = (
-                report.ranked.systems[report.headline][place].shortlist,
-                report.ranked.dataset.database,
-            )
-            write_candidates(target, shortlist, sequence.images, database, layout, report.positives[place])
+            shortlist = report.ranked.systems[report.headline][place].shortlist
+            sides = sequence.images, report.ranked.dataset.database
+            write_candidates(target, shortlist, *sides, layout, report.positives[place])
 
     def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""
@@ -207,4 +207,4 @@ class Result:
         return list(dict.fromkeys(names[place] for names in self.parts))
 
     def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> list[tuple[tuple[str, str], EvaluationReport]]:
-        return [(names, EvaluationReport.of(ranked, thresholds, ks)) for names, ranked in self.parts.items()]
+        return [(names, EvaluationReport(ranked, thresholds or (), ks)) for names, ranked in self.parts.items()]

@@ -1,5 +1,6 @@
 """Run folders: each belongs to one run, and its files appear together; the jobs of a multirun; names of files."""
 
+import itertools
 import json
 import os
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets.ground_truth import threshold_words
-from mfvpr.report.tables import Table, format_value, read_csv
+from mfvpr.report.tables import Table, format_values, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import fingerprint
@@ -27,7 +28,6 @@ LAST = "results.json"  # the file of a run that appears last
 
 _MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
 _PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')
-_HASHED = re.compile(r".*-[0-9a-f]{16}", re.IGNORECASE | re.DOTALL)
 
 Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
 
@@ -51,14 +51,29 @@ def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False)
     Raises:
         InputError: the folder cannot be made or written to, is not empty, or another run uses it.
     """
-    above = [parent for parent in folder.absolute().parents if not parent.exists()]
+    first, above = folder, [parent for parent in folder.absolute().parents if not parent.exists()]
     with ExitStack() as stack:
         try:
-            folder = _make(folder, numbered)
+            if folder.is_symlink() or folder.is_file():
+                raise InputError(f"{folder}: expected a new or empty run folder, got a link or a file; name another")
+            for number in itertools.count(2):
+                try:
+                    folder.mkdir(parents=True, exist_ok=not numbered)
+                    break
+                except FileExistsError:
+                    folder = first.with_name(f"{first.name}-{number}")
             in_use = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
             with suppress(OSError):  # a file system without locks of folders, such as NFS
                 stack.enter_context(lock_folder(folder, in_use))
-            _clear(folder, own)  # a folder that is refused must stay
+            names = {path.name for path in folder.iterdir()}
+            if own and LAST not in names:
+                for path in folder.iterdir():
+                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            elif names - {_UNFINISHED}:  # the folder stays as it is
+                raise InputError(f"{folder}: expected a new or empty run folder; name another")
+            shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
+            with tempfile.TemporaryFile(dir=folder):
+                pass
         except OSError as error:
             raise InputError(f"{folder}: cannot be written to ({error.strerror}); name another run folder") from None
         try:
@@ -67,36 +82,6 @@ def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False)
             with suppress(OSError):  # not empty
                 for path in (folder, *above):
                     path.rmdir()
-
-
-def _make(folder: Path, numbered: bool) -> Path:
-    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise InputError(f"{folder}: expected a new or empty run folder, got a link or a file; name another")
-    free, number = folder, 1
-    while True:
-        try:
-            free.mkdir(parents=True, exist_ok=not numbered)
-            return free
-        except FileExistsError:
-            number += 1
-            free = folder.with_name(f"{folder.name}-{number}")
-
-
-def _clear(folder: Path, only_runs: bool) -> None:
-    """Remove files of a killed run, and check that the folder is empty and writable."""
-    paths = [*folder.iterdir()]
-    names = {path.name for path in paths}
-    if only_runs and LAST not in names:
-        for path in paths:
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-    elif names - {_UNFINISHED}:
-        raise InputError(f"{folder}: expected a new or empty run folder; name another")
-    shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
-    with tempfile.TemporaryFile(dir=folder):
-        pass
 
 
 @contextmanager
@@ -129,10 +114,8 @@ def write_about(
     folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], command: str | None = None
 ) -> None:
     """Write `run.json`: how a run was made."""
-    write_json(folder / "run.json", {
-        "command": command, "settings": settings, "ground_truth": ground_truth, "commit": commit(Path()),
-        "versions": versions(),
-    })  # fmt: skip
+    about = {"command": command, "settings": settings, "ground_truth": ground_truth}
+    write_json(folder / "run.json", {**about, "commit": commit(Path()), "versions": versions()})
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -158,11 +141,11 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
         names = dict.fromkeys(name for job in jobs for name in job["overrides"])
         differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1 and name != "out"]
         columns = list(dict.fromkeys(name for job in jobs for row in job["rows"] for name in row))
-        lines = [
-            [str(job["job"]), *(job["overrides"].get(name, "") for name in differing),
-             *(row.get(name, "") for name in columns), job["run"]]
-            for job in jobs for row in job["rows"]
-        ]  # fmt: skip
+        lines = []
+        for job in jobs:
+            settings = [job["overrides"].get(name, "") for name in differing]
+            for row in job["rows"]:
+                lines.append([str(job["job"]), *settings, *(row.get(name, "") for name in columns), job["run"]])
         table = Table(["job", *differing, *columns, "run"], lines, text_columns=len(differing) + 2)
         write_table(multirun, table, f"{len(jobs)} jobs")
         write_json(multirun / LAST, {"jobs": jobs})
@@ -172,11 +155,11 @@ def _rows(run: Path) -> Iterator[dict[str, str]]:
     """Cells by column of every system of a run: an evaluation, a sweep or a learning comparison."""
     results = json.loads((run / LAST).read_text("utf-8"))
     if isinstance(results, dict) and "axes" in results:
-        chosen = ("; ".join(f"{name} = {format_value(value)}" for name, value in setting.items())
-                  for setting in results["chosen"])  # fmt: skip
-        recalls = {f"R@1{threshold_words(results['unit'], verdict['threshold'])}":
-                   f"{100 * verdict['chosen']['recall']:.1f}" for verdict in results["report"]}  # fmt: skip
-        yield {"system": results["scorer"]["method"], **recalls, "chosen": " / ".join(chosen)}
+        row = {"system": results["scorer"]["method"]}
+        for verdict in results["report"]:
+            column = f"R@1{threshold_words(results['unit'], verdict['threshold'])}"
+            row[column] = f"{100 * verdict['chosen']['recall']:.1f}"
+        yield row | {"chosen": " / ".join(map(format_values, results["chosen"]))}
     elif (run / "table.csv").exists():
         for row in read_csv(run / "table.csv"):
             yield {"system" if name == "score" else name: cell for name, cell in row.items()}
@@ -195,15 +178,10 @@ def file_names(names: Sequence[str]) -> dict[str, str]:
     """
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")
-    plain = {name: name.replace(" + ", "_") for name in names}
-    counts = Counter(map(_fold_case, plain.values()))
-    files = {}
-    for name, file in plain.items():
-        is_safe = _PLAIN.fullmatch(file) and not _HASHED.fullmatch(file) and len(file.encode()) <= _MOST_BYTES
-        hashed = f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
-        files[name] = file if is_safe and counts[_fold_case(file)] == 1 else hashed
+    files = {name: name.replace(" + ", "_") for name in names}
+    folded = {name: unicodedata.normalize("NFC", file.casefold()) for name, file in files.items()}
+    counts = Counter(folded.values())
+    for name, file in files.items():
+        if counts[folded[name]] > 1 or not _PLAIN.fullmatch(file) or len(file.encode()) > _MOST_BYTES:
+            files[name] = f"{re.sub('[^A-Za-z0-9]+', '_', name)[:60]}-{fingerprint(name)}"
     return files
-
-
-def _fold_case(file: str) -> str:
-    return unicodedata.normalize("NFC", file.casefold())

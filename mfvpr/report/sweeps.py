@@ -3,7 +3,7 @@
 import itertools
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import runs
 from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
 from mfvpr.report.runs import Figure, file_names
-from mfvpr.report.tables import Table, data_frame, format_value
+from mfvpr.report.tables import Table, data_frame, format_estimate, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Outcome
 from mfvpr.tuning.sweeps.sweep_axes import Axes
 from mfvpr.utils.errors import InputError
@@ -46,9 +46,9 @@ class Sweep:
     outcome: Outcome
 
     def __repr__(self) -> str:
-        axes = self.outcome.axes
-        return (f"Sweep({self.dataset}, {self.scorer}: {axes.size} settings of {', '.join(axes.values)}; best "
-                f"{_in_words(self.best)}; {_label(self.outcome)} {_with_interval(self.interval)})")  # fmt: skip
+        axes, recall = self.outcome.axes, f"{_label(self.outcome)} {format_estimate(self.interval)}"
+        about = f"{self.dataset}, {self.scorer}: {axes.size} settings of {', '.join(axes.values)}"
+        return f"Sweep({about}; best {format_values(self.best)}; {recall})"
 
     @property
     def best(self) -> dict[str, Any]:
@@ -101,9 +101,9 @@ class Sweep:
             InputError: the folder is neither new nor empty, nor one of a sweep.
         """
         folder = Path(folder)
-        names = {path.name for path in folder.iterdir()} if folder.is_dir() else {*filter(Path.exists, [folder])}
-        is_interrupted = "blocks" in names and runs.LAST not in names
-        if names and not is_interrupted and not _is_sweep(folder / runs.LAST):
+        last = folder / runs.LAST
+        has_sweep = (last.exists() and b'"axes"' in last.read_bytes()) or (folder / "blocks").exists()
+        if folder.exists() and not has_sweep and (folder.is_file() or any(folder.iterdir())):
             raise InputError(f"{folder}: expected a new or empty folder, or one of a sweep; name another")
         shutil.rmtree(folder / "figures", ignore_errors=True)
         for name, draw in sweep_figures(self.outcome):
@@ -112,15 +112,6 @@ class Sweep:
         heading = f"{self.dataset}: {sizes} of {self.scorer}"
         about = {"dataset": self.dataset, "scorer": {"method": self.scorer}, "versions": versions()}
         write_sweep(folder, self.outcome, heading, about | sweep_json(self.outcome))
-
-
-def _is_sweep(path: Path) -> bool:
-    """Whether a file holds the results of a sweep."""
-    try:
-        results = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return False
-    return isinstance(results, dict) and "axes" in results
 
 
 def write_sweep(folder: Path, outcome: Outcome, heading: str, results: Mapping[str, Any]) -> None:
@@ -137,11 +128,10 @@ def settings_table(outcome: Outcome, numbers: Iterable[int] | None = None) -> Ta
     """
     numbers = range(len(outcome.settings)) if numbers is None else numbers
     header, recalls = _recalls(outcome, numbers)
-    lines = [
-        [*(format_value(outcome.settings[number][name]) for name in outcome.axes.values),
-         *(f"{100 * value:.1f}" for value in recall)]
-        for number, recall in zip(numbers, recalls, strict=True)
-    ]  # fmt: skip
+    lines = []
+    for number, recall in zip(numbers, recalls, strict=True):
+        values = [format_value(outcome.settings[number][name]) for name in outcome.axes.values]
+        lines.append([*values, *(f"{100 * value:.1f}" for value in recall)])
     return Table([*outcome.axes.values, *header], lines, text_columns=0)
 
 
@@ -164,24 +154,27 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
     """The sweep as JSON values."""
     protocol, ks = outcome.protocol, outcome.ks
     recall = np.stack([protocol.recall(outcome.rows[0], k) for k in ks], axis=-1)  # [S, thresholds, ks]
+    settings = []
+    for setting, by_threshold in zip(outcome.settings, recall.round(6).tolist(), strict=True):
+        recall_at = {}
+        for threshold, values in zip(protocol.thresholds, by_threshold, strict=True):
+            recall_at[f"{threshold:g}"] = dict(zip(map(str, ks), values, strict=True))
+        settings.append({"parameters": setting, "recall_at": recall_at})
+    report = [verdict._asdict() for verdict in outcome.report]
+    for verdict in report:
+        verdict |= {name: verdict[name]._asdict() for name in ("chosen", "own", "mcnemar", "path_test")}
     values = {
-        "axes": axes_json(outcome.axes), "own": dict(outcome.axes.own),
+        "axes": axes_json(outcome.axes),
+        "own": dict(outcome.axes.own),
         "search": "grid" if outcome.is_grid else "optuna",
-        "unit": protocol.unit, "thresholds": list(protocol.thresholds), "ks": list(ks), "split": protocol.split,
+        "unit": protocol.unit,
+        "thresholds": list(protocol.thresholds),
+        "ks": list(ks),
+        "split": protocol.split,
         "chosen": [outcome.settings[number] for number in outcome.chosen],
-        "report": [
-            {"threshold": verdict.threshold, "queries": verdict.queries, "chosen": verdict.chosen._asdict(),
-             "own": verdict.own._asdict(), "mcnemar": verdict.mcnemar._asdict(),
-             "path_test": verdict.path_test._asdict()}
-            for verdict in outcome.report
-        ],
-        "settings": [
-            {"parameters": setting, "recall_at": {
-                f"{threshold:g}": {str(k): round(float(recall[number, place, depth]), 6) for depth, k in enumerate(ks)}
-                for place, threshold in enumerate(protocol.thresholds)}}
-            for number, setting in enumerate(outcome.settings)
-        ],
-    }  # fmt: skip
+        "report": report,
+        "settings": settings,
+    }
     return json.loads(json.dumps(values, default=str))  # weights that are no words
 
 
@@ -200,39 +193,23 @@ def sweep_summary(outcome: Outcome, heading: str) -> str:
         around = evaluation.neighboring_settings(outcome.axes.values, outcome.chosen[0])
         table = settings_table(outcome, [outcome.chosen[0], *around])
         parts += ["The best, and its neighbors in the grid:", table.text()] if around else []
-    return "\n".join([*parts, *_verdicts(outcome)])
-
-
-def _verdicts(outcome: Outcome) -> Iterator[str]:
-    protocol = outcome.protocol
-    words = [_in_words(outcome.settings[number]) for number in outcome.chosen]
-    for name, half, setting in zip(protocol.names, protocol.halves, words, strict=False):
-        yield (f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half: "
-               f"{setting}")  # fmt: skip
+    for name, half, number in zip(protocol.names, protocol.halves, outcome.chosen, strict=False):
+        sizes = f"chosen on {len(half.tune)} queries of {name}, reported on the {len(half.report)} of the other half"
+        parts.append(f"{sizes}: {format_values(outcome.settings[number])}")
     if not protocol.halves:
-        yield f"chosen: {words[0]}"
-    yield "Recall at 1 in %, with 95 % intervals in brackets:"
-    for verdict in outcome.report:
-        yield (
-            f"{protocol.label(1, verdict.threshold)}: chosen {_with_interval(verdict.chosen)}, own values "
-            f"{_with_interval(verdict.own)}; only one of them correct: {verdict.mcnemar.only_first} and "
-            f"{verdict.mcnemar.only_second} queries, McNemar p = {verdict.mcnemar.p_value:.2g}, "
-            f"along the path p = {verdict.path_test.p_value:.2g}"
-        )
+        parts.append(f"chosen: {format_values(outcome.settings[outcome.chosen[0]])}")
+    parts.append("Recall at 1 in %, with 95 % intervals in brackets:")
+    for threshold, _, chosen, own, test, path in outcome.report:
+        recalls = f"chosen {format_estimate(chosen)}, own values {format_estimate(own)}"
+        counts = f"only one of them correct: {test.only_first} and {test.only_second} queries"
+        probabilities = f"McNemar p = {test.p_value:.2g}, along the path p = {path.p_value:.2g}"
+        parts.append(f"{protocol.label(1, threshold)}: {recalls}; {counts}, {probabilities}")
     if not protocol.halves:
-        yield (
+        parts.append(
             "Chosen and reported on the same queries, so this flatters; split=both chooses on one half of the path "
             "and reports on the other."
         )
-
-
-def _in_words(setting: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} = {format_value(value)}" for name, value in setting.items())
-
-
-def _with_interval(estimate: Estimate) -> str:
-    low, high = estimate.interval
-    return f"{100 * estimate.recall:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+    return "\n".join(parts)
 
 
 def sweep_figures(outcome: Outcome) -> list[Figure]:
@@ -244,8 +221,10 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
         return [("trials.png", partial(trials_figure, recall=recall, values=values, label=_label(outcome)))]
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
-    return [(f"{file}.png", partial(_draw, outcome, *pair))
-            for pair, file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False)]  # fmt: skip
+    figures = []
+    for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
+        figures.append((f"{file}.png", partial(_draw, outcome, first, second)))
+    return figures
 
 
 def _draw(outcome: Outcome, first: str, second: str, path: Path) -> None:
@@ -265,11 +244,9 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
         plane = plane.T
     fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
     in_grid = own[first] in values[first] and own[second] in values[second]
-    return heat_map_figure(
-        plane, (first, _short(values[first])), (second, _short(values[second])), best=(best[first], best[second]),
-        defaults=(values[first].index(own[first]), values[second].index(own[second])) if in_grid else None,
-        title="; ".join([_label(outcome), *fixed]),
-    )  # fmt: skip
+    defaults = (values[first].index(own[first]), values[second].index(own[second])) if in_grid else None
+    sides, title = ((name, _short(values[name])) for name in (first, second)), "; ".join([_label(outcome), *fixed])
+    return heat_map_figure(plane, *sides, best=(best[first], best[second]), defaults=defaults, title=title)
 
 
 def _label(outcome: Outcome) -> str:

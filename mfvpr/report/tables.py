@@ -36,9 +36,13 @@ class Table:
     def text(self) -> str:
         """Text for the terminal."""
         widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
-        aligns = [str.ljust] * self.text_columns + [str.rjust] * (len(self.header) - self.text_columns)
-        lines = ["  ".join(align(cell, width) for align, cell, width in zip(aligns, row, widths, strict=True)).rstrip()
-                 for row in (self.header, *self.rows)]  # fmt: skip
+        lines = []
+        for row in (self.header, *self.rows):
+            cells = [
+                cell.ljust(width) if column < self.text_columns else cell.rjust(width)
+                for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ]
+            lines.append("  ".join(cells).rstrip())
         return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]]) + "\n"
 
     def markdown(self) -> str:
@@ -70,10 +74,19 @@ def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
     return pandas.DataFrame(rows)
 
 
+def read_table(path: Path) -> Table:
+    """The table of a file of `write_csv`; a ValueError if the file is cut off."""
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+        header, *rows = csv.reader(file)
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError(f"{path.name}: expected lines of {len(header)} cells")
+    return Table(header, rows)
+
+
 def read_csv(path: Path) -> list[dict[str, str]]:
     """Rows of a file of `write_csv` by column."""
-    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
-        return [*csv.DictReader(file)]
+    table = read_table(path)
+    return [dict(zip(table.header, row, strict=True)) for row in table.rows]
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
@@ -92,8 +105,8 @@ def _write_rows(file: TextIO, rows: Iterable[Sequence[str | int]]) -> None:
 
 
 def format_number(value: Any) -> str:
-    """A number in a CSV file."""
-    return f"{value:.7g}"
+    """A number in a CSV file; empty for NaN."""
+    return "" if np.isnan(value) else f"{value:.7g}"
 
 
 def format_value(value: Any) -> str:
@@ -101,3 +114,20 @@ def format_value(value: Any) -> str:
     if value is None:
         return "none"
     return f"{value:g}" if isinstance(value, float | np.floating) else str(value)
+
+
+def format_values(values: Mapping[str, Any]) -> str:
+    """Parameters and their values in a line."""
+    return ", ".join(f"{name} = {format_value(value)}" for name, value in values.items())
+
+
+def format_interval(interval: tuple[float, float]) -> str:
+    """An interval of fractions, in %."""
+    low, high = interval
+    return f"[{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def format_estimate(estimate: tuple[float, tuple[float, float]]) -> str:
+    """A fraction with its interval, in %."""
+    recall, interval = estimate
+    return f"{100 * recall:.1f} {format_interval(interval)}"

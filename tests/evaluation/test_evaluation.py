@@ -19,8 +19,8 @@ from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.report.evaluation_files import differences, write_gains, write_rankings
 from mfvpr.report.evaluations import EvaluationReport, recall_table
+from mfvpr.report.run_files import differences, write_gains, write_rankings
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache

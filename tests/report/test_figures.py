@@ -5,9 +5,8 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
-from mfvpr.evaluation import precision_recall, reliability
+from mfvpr.evaluation import reliability
 from mfvpr.report import figures, plots
-from mfvpr.report.pages.charts import line_chart
 
 SYSTEMS = ["retrieval", *(f"histogram + anchor + sum + retrieval {number}" for number in range(10))]
 QUERY = np.zeros((90, 90, 3), np.uint8)
@@ -51,17 +50,3 @@ def test_titles_of_panels_are_not_cut_off(tmp_path):
     plots.reliability_figure(tmp_path / "a.png", {name: reliability(P, RIGHT) for name in SYSTEMS[:4]})
     image = pixels(tmp_path / "a.png")
     assert {*np.concatenate([image[:, 0], image[:, -1], image[0], image[-1]]).tolist()} == {255}
-
-
-def test_systems_have_the_same_colors_in_figures_and_pages(tmp_path, monkeypatch):
-    curve = precision_recall(P, RIGHT, np.ones(20, bool))
-    saved = []
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path, **_: saved.append(figure))
-    plots.precision_recall_figure(tmp_path / "a.png", {name: {"score": curve} for name in SYSTEMS})
-    plots.shares_figure(tmp_path / "b.png", [0, 1], {name: np.zeros(2) for name in SYSTEMS[1:]})
-    chart = line_chart("name", "title", {name: [(0, 0), (1, 1)] for name in SYSTEMS}, axes=("x", "y"))
-    expected = [trace["line"]["color"] for trace in chart.figure["data"]]
-    colors = [[line.get_color() for line in figure.axes[0].lines] for figure in saved]
-    assert colors == [expected, expected[1:]]
-    styles = [line.get_linestyle() for line in saved[0].axes[0].lines]
-    assert len({*zip(expected, styles, strict=True)}) == len(SYSTEMS)

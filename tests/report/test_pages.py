@@ -14,7 +14,6 @@ import pytest
 
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test, recall_interval
-from mfvpr.report import write_json
 from mfvpr.report.pages import one_run, several_runs
 from mfvpr.report.pages.files import read_run
 from mfvpr.report.pages.one_run import write_report
@@ -171,7 +170,7 @@ def test_answers_are_pictures_and_rows(page, several, run):
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
-    assert len([row for row in several.rows if len(row) == 7 and row[0] in SYSTEMS]) == 60
+    assert len([row for row in several.rows if len(row) == 7 and row[1] in TWO]) == 60
 
 
 def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, monkeypatch):
@@ -210,19 +209,6 @@ def test_runs_are_compared_query_by_query(tmp_path):
     assert [bar["x"] for bar in page.charts["intervals"]["data"]] == [[80.0, 50.0]]
     assert "Not comparable" not in "".join(page.text)
     assert len(page.scripts) == 3
-
-
-def test_recall_over_tolerance_is_of_the_smallest_depth(run, tmp_path):
-    results = json.loads((run / "results.json").read_text("utf-8"))
-    for row in results:
-        row["recall_at"] = {"2": row["recall_at"]["2"]}
-    folder = shutil.copytree(run, tmp_path / "run")
-    write_json(folder / "results.json", results)
-    page = Parsed(write_report(folder))
-    chart = page.charts["tolerances"]
-    assert chart["layout"]["yaxis"]["title"]["text"] == "recall at 2, %"
-    recalls = [100 * row["recall_at"]["2"] for row in results if row["system"] == SYSTEMS[0]]
-    assert chart["data"][0]["y"] == recalls
 
 
 @pytest.mark.parametrize(
@@ -264,37 +250,24 @@ def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypa
         assert stderr.startswith(f"error: {folders[0]}")
 
 
-@pytest.fixture
-def error_with(run, tmp_path, monkeypatch):
-    """The error of a run folder with another text in a file, or without it (None); None if it has a page."""
-    monkeypatch.setattr(one_run, "write_page", lambda *_, **parts: None)
-    monkeypatch.setattr(one_run, "pictures", lambda *_: [])
-    shutil.copytree(run, tmp_path / "run")
-
-    def error_with(name, text):
-        path = tmp_path / "run" / name
-        before = path.read_bytes()
-        path.unlink() if text is None else path.write_text(text, "utf-8", "surrogateescape")
-        try:
-            write_report(tmp_path / "run")
-            return None
-        except InputError as error:
-            return str(error).removeprefix(f"{tmp_path}/run: ")
-        finally:
-            path.write_bytes(before)
-
-    return error_with
-
-
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("results.json", '{"settings": []}', "no rows"), ("run.json", "{", "JSONDecode"),
-        ("gains.csv", None, "gains.csv"), ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "'place'"),
+        ("results.json", '{"settings": []}', "no rows"),
+        ("run.json", "{", "JSONDecode"),
+        ("gains.csv", None, "gains.csv"),
+        ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "'place'"),
+        ("confidence.csv", None, "confidence.csv"),
+        ("precision_recall.csv", "system,by\na\n", "precision_recall.csv"),
+        ("predictions/histogram.csv", "query,rank\na,1,1\n", "histogram.csv: expected lines of 2"),
     ],
-)  # fmt: skip
-def test_files_of_other_programs_are_errors(error_with, name, text, words):
-    assert words in error_with(name, text)
+)
+def test_damaged_files_are_errors_of_one_line(tmp_path, name, text, words):
+    path = write_run(tmp_path / "run") / name
+    path.unlink() if text is None else path.write_text(text)
+    with pytest.raises(InputError, match=words) as error:
+        write_report(tmp_path / "run")
+    assert str(error.value).startswith(f"{tmp_path}/run: expected the run folder of an evaluation of this version")
 
 
 def test_the_library_and_its_evaluation_wait_for_no_optional_package():

@@ -88,12 +88,9 @@ def test_trajectory_leaves_out_images_without_a_place(write, tmp_path):
     "line",
     [
         "{", "[]", "3", '"text"', "{}", "[" * 100_000,
-        {"image": 3, "error": "none"},
         {"image": "a.png"},
         {**LINES[0], "shift": [1.0]},
-        {**LINES[0], "shift": ["a", "b"]},
         {**LINES[0], "shift_interval": [1, 2]},
-        {**LINES[0], "confidence": float("nan")},
         {**LINES[0], "alternatives": [{"row": 3}]},
         {name: value for name, value in LINES[2].items() if name != "reason"},
     ],
@@ -122,7 +119,7 @@ def test_files_of_a_run(tmp_path):
         "query,prediction,refused,score,confidence,reason\n"
         "a.png,no place,,,,too few features\nb.png,2.png,,5,0.75,\nc.png,no place,1.png,9,0.25,low confidence\n"
     )
-    (tmp_path / "shifts.csv").write_text(f"{','.join(SHIFTS)}\nb.png,2.png,1.5,-2,1,2,-3,-1,336,240\n")
+    (tmp_path / "shifts.csv").write_text(f"query,prediction,{','.join(SHIFTS)}\nb.png,2.png,1.5,-2,1,2,-3,-1,336,240\n")
     images = read_run_images(tmp_path, ["a.png", "b.png", "c.png"])
     assert [image.place for image in images] == [None, "2.png", None]
     assert [image.cells.get("reason") for image in images] == ["too few features", None, "low confidence"]
@@ -131,7 +128,7 @@ def test_files_of_a_run(tmp_path):
     shortlist = shortlist_of(images, DATABASE)
     assert shortlist.indices.tolist() == [[-1, -1], [2, 0], [-1, -1]]
     assert shortlist.scores.tolist() == [[0, 0], [5, 4.5], [0, 0]]
-    with one_line_error(r"expected queries of the data set, got c\.png"):
+    with one_line_error(r"c\.png: expected a query of the data set"):
         read_run_images(tmp_path, ["a.png", "b.png"])
     with one_line_error(r"2\.png: expected an image of the database"):
         shortlist_of(images, DATABASE[:2])

@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
 from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
-from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
+from mfvpr.evaluation import DriveFilter, Fusion
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages.files import read_run
@@ -150,15 +150,6 @@ def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
     assert list(last) == ["data set", "system", "score", "decides", "sequence", "tolerance", "R@1", "R@5"]
     recall = result.parts["two", "mine"].recall([1], [1, 5])["my + count + retrieval"]
     np.testing.assert_allclose([last["R@1"], last["R@5"]], recall.pooled[0])
-
-
-def test_names_of_scores_are_not_taken_apart(systems):
-    correlated = {"my + count + retrieval": FrameCorrelation()}
-    scores = replace(systems["mine"], correlated=correlated).final_scores
-    assert {name: score.scorers for name, score in scores.items()} == {
-        "retrieval": (), "histogram": ("histogram",), "my + count": ("my + count",),
-        "my + count + retrieval": ("my + count",), "my + count + retrieval + frames": ("my + count",),
-    }  # fmt: skip
 
 
 def test_defaults_are_those_of_the_programs():

@@ -5,40 +5,33 @@ import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.evaluation.statistics import Estimate, estimate
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.runs import LAST, file_names
-from mfvpr.report.tables import Table, read_csv
+from mfvpr.report.tables import Table, read_csv, read_table
 from mfvpr.utils.errors import InputError
 
-_TABLES = (
-    "table.csv",
-    "differences.csv",
-    "confidence.csv",
-    "rerank_share.csv",
-    "precision_recall.csv",
-    "changes.csv",
-    "skipped.csv",
-)
+_TABLES = ("table", "differences", "confidence", "rerank_share", "precision_recall")  # with ground truth
+_MORE_TABLES = ("changes", "skipped")  # of some runs
 
 
-@dataclass(frozen=True)
-class Gains:
+class Gains(NamedTuple):
     """Ranks of the first correct candidates for the Q queries of one sequence, or of several, one after the other.
 
     `queries` are names, `places` are along the map, `ranks` are by system, 0 = no candidate is correct.
     """
 
-    queries: tuple[str, ...]
+    queries: Sequence[str]
     places: Int[np.ndarray, " queries"]
     ranks: Mapping[str, Int[np.ndarray, " queries"]]
 
@@ -47,48 +40,44 @@ class Gains:
         ranks = self.ranks[system]
         return ((ranks > 0) & (ranks <= k))[np.argsort(self.places, kind="stable")]
 
-
-@dataclass(frozen=True)
-class Prediction:
-    """The first prediction of a system for a query, as texts of the files.
-
-    `outcome` is "correct", "incorrect", or "best" without ground truth. Without a prediction, `prediction` and `score`
-    are empty. `rank` is of the first correct candidate, empty if there is none or if it is unknown.
-    """
-
-    system: str
-    sequence: str
-    query: str
-    prediction: str
-    score: str
-    outcome: str
-    rank: str
+    def recall(self, system: str) -> Estimate:
+        """Recall at 1 and its 95 % interval."""
+        return estimate(self.hits(system))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, the rows of its `results.json`, and its `run.json`."""
+    """The content of a run folder.
+
+    Attributes:
+        results: rows of `results.json`.
+        about: the content of `run.json`.
+        tables: of CSV files, by name without suffix.
+        gains: by sequence; none without ground truth.
+    """
 
     folder: Path
     results: Sequence[Mapping[str, Any]]
     about: Mapping[str, Any]
+    tables: Mapping[str, Table]
+    gains: Mapping[str, Gains]
 
     @property
     def common(self) -> Mapping[str, Any]:
         """Values that all rows of the results share: the data set, seconds, versions and so on."""
         return self.results[0]
 
-    @cached_property
+    @property
     def systems(self) -> list[str]:
         """Names of the systems, in the order of the results."""
         return list(dict.fromkeys(row["system"] for row in self.results))
 
-    @cached_property
+    @property
     def headline(self) -> str:
         """The system that decides."""
         return next(row["system"] for row in self.results if row["decides"])
 
-    @cached_property
+    @property
     def sequences(self) -> list[str]:
         """Names of the sequences; a single one without a name has the data set's."""
         if "sequence" not in self.common:
@@ -106,86 +95,68 @@ class Run:
         return threshold_words(self.common["ground_truth"]["unit"], middle(self.thresholds))
 
     @cached_property
-    def tables(self) -> Mapping[str, Table]:
-        """Tables of the CSV files, by name."""
-        return {name: read_table(self.folder / name) for name in _TABLES if (self.folder / name).exists()}
-
-    @cached_property
-    def gains(self) -> Mapping[str, Gains]:
-        """Gains by sequence; none without ground truth."""
-        if not self.thresholds:
-            return {}
-        folders = (sequence_folder(self.folder, self.sequences, place) for place in range(len(self.sequences)))
-        return {name: _gains(folder / "gains.csv") for name, folder in zip(self.sequences, folders, strict=True)}
-
-    @cached_property
     def all_gains(self) -> Gains:
         """Gains of all sequences, with ground truth."""
         parts = [*self.gains.values()]
-        return Gains(
-            tuple(query for gains in parts for query in gains.queries),
-            np.concatenate([gains.places for gains in parts]),
-            {name: np.concatenate([gains.ranks[name] for gains in parts]) for name in self.systems},
-        )
+        queries = [query for gains in parts for query in gains.queries]
+        ranks = {name: np.concatenate([gains.ranks[name] for gains in parts]) for name in self.systems}
+        return Gains(queries, np.concatenate([gains.places for gains in parts]), ranks)
 
-    def predictions(self) -> Iterator[Prediction]:
-        """The first predictions of all systems, those of the system that decides first."""
+    def predictions(self) -> Iterator[dict[str, str]]:
+        """The first predictions of all systems for each query, those of the system that decides first.
+
+        A row has texts: `system`, `sequence`, `query`, `prediction` and `score`, empty without one; `outcome`, which
+        is "correct", "incorrect", or "best" without ground truth; and `rank` of the first correct candidate, empty if
+        there is none or if it is unknown.
+        """
         systems, files = sorted(self.systems, key=lambda name: name != self.headline), file_names(self.systems)
-        with errors_as_input_errors(self.folder):
-            for system, (place, sequence) in itertools.product(systems, enumerate(self.sequences)):
-                folder = sequence_folder(self.folder, self.sequences, place) / "predictions"
+        for system, (place, sequence) in itertools.product(systems, enumerate(self.sequences)):
+            folder = sequence_folder(self.folder, self.sequences, place) / "predictions"
+            with reading_run(self.folder):
                 first = {row["query"]: row for row in read_csv(folder / f"{files[system]}.csv") if row["rank"] == "1"}
-                ranks: Mapping[str, int | None] = dict.fromkeys(first)
-                if gains := self.gains.get(sequence):
-                    ranks = dict(zip(gains.queries, gains.ranks[system].tolist(), strict=True))
-                for query, rank in ranks.items():
-                    row, outcome = first.get(query), "best" if rank is None else "correct" if rank == 1 else "incorrect"
-                    texts = (row["database"], row["score"]) if row else ("", "")
-                    yield Prediction(system, sequence, query, *texts, outcome, str(rank or ""))
+            ranks: Mapping[str, int | None] = dict.fromkeys(first)
+            if gains := self.gains.get(sequence):
+                ranks = dict(zip(gains.queries, gains.ranks[system].tolist(), strict=True))
+            for query, rank in ranks.items():
+                row, outcome = first.get(query, {}), "best" if rank is None else "correct" if rank == 1 else "incorrect"
+                names = {"system": system, "sequence": sequence, "query": query, "prediction": row.get("database", "")}
+                yield names | {"score": row.get("score", ""), "outcome": outcome, "rank": str(rank or "")}
 
 
 def read_results(folder: Path, name: str = LAST) -> Any:
     """The content of a JSON file of a run folder; InputError if there is none."""
     if not (folder / name).is_file():
         raise InputError(f"{folder}: expected a run folder, got one without {name}")
-    with errors_as_input_errors(folder):
+    with reading_run(folder):
         return json.loads((folder / name).read_text("utf-8"))
 
 
 def read_run(folder: Path) -> Run:
     """Read the files of a run folder; InputError if they are not those of an evaluation."""
     results, about = read_results(folder), read_results(folder, "run.json")
-    with errors_as_input_errors(folder):
-        run = Run(folder, results, about)
-        if not (run.headline and run.sequences and run.gains.keys() <= {*run.sequences} and "settings" in about):
-            raise ValueError("no rows of an evaluation")
-        return run
+    with reading_run(folder):
+        run, gains = Run(folder, results, about, {}, {}), {}
+        names = [name for name in _MORE_TABLES if (folder / f"{name}.csv").exists()]
+        names += _TABLES if run.thresholds else ()
+        tables = {name: read_table(folder / f"{name}.csv") for name in names}
+        for place, name in enumerate(run.sequences if run.thresholds else ()):
+            lines = read_csv(sequence_folder(folder, run.sequences, place) / "gains.csv")
+            systems = [column.removesuffix(" rank") for column in lines[0] if column.endswith(" rank")]
+            ranks = {system: np.array([int(line[f"{system} rank"] or 0) for line in lines]) for system in systems}
+            places = np.array([int(line["place"] or number) for number, line in enumerate(lines)])
+            gains[name] = Gains([line["query"] for line in lines], places, ranks)
+        return replace(run, tables=tables, gains=gains)
 
 
 @contextmanager
-def errors_as_input_errors(folder: Path) -> Iterator[None]:
+def reading_run(folder: Path) -> Iterator[None]:
     """Turn the errors of files that are not those of an evaluation into an InputError of one line."""
     try:
         yield
-    except (ValueError, LookupError, TypeError, AttributeError, OSError, StopIteration, csv.Error) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, OSError, csv.Error) as error:
         raise InputError(
             f"{folder}: expected the run folder of an evaluation of this version, got other files "
             f"({type(error).__name__}: {' '.join(str(error).split())})"
         ) from None
-
-
-def read_table(path: Path) -> Table:
-    """The table of a CSV file, all cells as text."""
-    with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
-        header, *rows = csv.reader(file)
-    return Table(header, rows)
-
-
-def _gains(path: Path) -> Gains:
-    lines = read_csv(path)
-    names = [name.removesuffix(" rank") for name in lines[0] if name.endswith(" rank")]
-    ranks = {name: np.array([int(line[f"{name} rank"] or 0) for line in lines]) for name in names}
-    places = [int(line["place"] or place) for place, line in enumerate(lines)]
-    return Gains(tuple(line["query"] for line in lines), np.array(places), ranks)

@@ -14,7 +14,6 @@ from PIL import Image
 from mfvpr.datasets.image_reading import open_image
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.pages.charts import Chart
-from mfvpr.report.pages.files import Prediction
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
@@ -28,33 +27,18 @@ _TEMPLATES = Path(__file__).parent / "templates"
 
 
 @dataclass(frozen=True)
-class Picture:
-    """The figure of a query and its prediction, as a `data:` URI; `size` is width and height, px."""
-
-    system: str
-    sequence: str
-    outcome: str
-    query: str
-    prediction: str
-    source: str
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class Gallery:
-    """Predictions for queries, which can be filtered; `left_out` counts those that the page does not list."""
+    """Predictions for queries, which can be filtered; `left_out` counts those that the page does not list.
 
-    system: str
+    `shown_system` is chosen at first. `pictures` are of `pictures`, `predictions` of `Run.predictions`.
+    """
+
+    shown_system: str
     systems: Sequence[str]
     sequences: Sequence[str]
-    pictures: Sequence[Picture]
-    predictions: Sequence[Prediction] = ()
+    pictures: Sequence[Mapping[str, Any]]
+    predictions: Sequence[Mapping[str, str]] = ()
     left_out: int = 0
-
-    @property
-    def outcomes(self) -> list[str]:
-        """Outcomes that occur."""
-        return sorted({shown.outcome for shown in (*self.pictures, *self.predictions)})
 
 
 @dataclass(frozen=True)
@@ -87,20 +71,29 @@ def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], 
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
 
+    loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False}
     scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
+    hashes = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
     text = environment.get_template("page.html").render(
-        title=title, words=words, facts=facts, sections=sections,
+        title=title,
+        words=words,
+        facts=facts,
+        sections=sections,
         charts={chart.name: chart.figure for section in sections for chart in section.charts},
-        scripts=[Markup(script) for script in scripts],  # of this package and of plotly, as is the style
+        scripts=map(Markup, scripts),  # of this package and of plotly, as is the style
         style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
-        hashes=" ".join(f"'sha256-{b64encode(sha256(script.encode()).digest()).decode()}'" for script in scripts),
-    )  # fmt: skip
+        hashes=" ".join(f"'sha256-{each}'" for each in hashes),
+    )
     write_text(path, text)
+
+
+def embed(path: Path) -> str:
+    """A PNG file as a `data:` URI."""
+    return f"data:image/png;base64,{b64encode(path.read_bytes()).decode()}"
 
 
 def values_table(values: Mapping[str, Any]) -> Table:
@@ -117,9 +110,12 @@ def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
-    """Figures that have the keywords `ABOUT`, by their files; evenly chosen if there are more than `most`."""
-    paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[Picture]()
+def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[dict[str, Any]]:
+    """Figures of queries and their predictions, by their files; evenly chosen if there are more than `most`.
+
+    A picture has the values of the keywords `ABOUT`, its `source` as a `data:` URI, and its `size`, px.
+    """
+    paths, shown = sorted((run / "figures").rglob("*_[0-9]*.png")), list[dict[str, Any]]()
     for path in paths[:: max(1, -(-len(paths) // most))]:
         try:
             with open_image(path) as image:
@@ -133,5 +129,5 @@ def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[Picture]:
             small.save(file, "JPEG", quality=_QUALITY, optimize=True)
             source = f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
             about = {name: str(image.info[name]) for name in ABOUT}
-            shown.append(Picture(**about, source=source, size=small.size))
+            shown.append(about | {"source": source, "size": small.size})
     return shown

@@ -7,25 +7,31 @@ from pathlib import Path
 import numpy as np
 
 from mfvpr.evaluation.statistics import mcnemar, path_test
-from mfvpr.report.evaluation_files import Difference
 from mfvpr.report.pages import one_run
 from mfvpr.report.pages.charts import bar_chart
 from mfvpr.report.pages.files import Run, read_run
 from mfvpr.report.pages.rendering import Section, flat, write_page
-from mfvpr.report.tables import Table
+from mfvpr.report.run_files import Difference
+from mfvpr.report.tables import Table, format_estimate
 from mfvpr.utils.errors import InputError
 
 
 def write_comparison(folders: Sequence[Path], path: Path) -> None:
     """Write a page of several runs side by side; InputError for a folder twice, or of no evaluation."""
     runs = dict(zip(_labels(folders), map(read_run, folders), strict=True))
-    evaluation = {label: run for label, run in runs.items() if run.gains}
-    sections = [_overview(runs), *([_recall(evaluation), _pairs(runs)] if evaluation else []), _settings(runs)]
+    overview, facts = [], {}
+    for label, run in runs.items():
+        seconds = f"{sum(run.common['seconds'].values()):.1f}"
+        overview.append([label, run.common["dataset"], run.headline, one_run.description(run), seconds])
+        if run.gains:
+            facts[f"{label}, R@1{run.within}"] = f"{100 * run.all_gains.recall(run.headline).recall:.1f} %"
+    header = ["run", "data set", "decides", "what was evaluated", "seconds"]
+    sections = [Section("runs", "Runs", tables={"Runs": Table(header, overview, 4)})]
+    if facts:
+        sections += [_recall({label: run for label, run in runs.items() if run.gains}), _pairs(runs)]
     words = "The systems that decide, beside each other; each run has a page of its own."
-    names = ", ".join(dict.fromkeys(str(run.common["dataset"]) for run in runs.values()))
-    facts = {f"{label}, R@1{run.within}": f"{one_run.recall_bar(run.all_gains, run.headline).percent:.1f} %"
-             for label, run in evaluation.items()}  # fmt: skip
-    write_page(path, title=f"{names}: {len(runs)} runs compared", words=words, facts=facts, sections=sections)
+    title = f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared"
+    write_page(path, title=title, words=words, facts=facts, sections=[*sections, _settings(runs)])
 
 
 def why_not(first: Run, second: Run) -> str | None:
@@ -34,9 +40,10 @@ def why_not(first: Run, second: Run) -> str | None:
         return "a run has no ground truth"
     if first.common["data_fingerprint"] != second.common["data_fingerprint"]:
         return "other images"
-    differ = [name for name in ("kind", "files", "unit", "thresholds", "exclude_neighbors", "fingerprint")
-              if first.common["ground_truth"].get(name) != second.common["ground_truth"].get(name)]  # fmt: skip
-    if differ:
+    names, truths = ("kind", "files", "unit", "thresholds", "exclude_neighbors", "fingerprint"), []
+    for run in (first, second):
+        truths.append([run.common["ground_truth"].get(name) for name in names])
+    if differ := [name for name, ours, theirs in zip(names, *truths, strict=True) if ours != theirs]:
         return f"another ground truth ({', '.join(differ)})"
     ours, theirs = first.all_gains, second.all_gains
     if ours.queries != theirs.queries or [*first.gains] != [*second.gains]:
@@ -55,32 +62,23 @@ def _labels(folders: Sequence[Path]) -> list[str]:
     raise InputError(f"{twice}: expected different run folders, got this one twice")
 
 
-def _overview(runs: Mapping[str, Run]) -> Section:
-    rows = [
-        [label, str(run.common["dataset"]), run.headline, one_run.description(run),
-         f"{sum(run.common['seconds'].values()):.1f}"]
-        for label, run in runs.items()
-    ]  # fmt: skip
-    header = ["run", "data set", "decides", "what was evaluated", "seconds"]
-    return Section("runs", "Runs", tables={"Runs": Table(header, rows, 4)})
-
-
 def _recall(runs: Mapping[str, Run]) -> Section:
     """Recall of all systems side by side; of the headline systems with intervals and over K."""
     curves = {label: (run, run.headline) for label, run in runs.items()}
-    headlines = {label: one_run.recall_bar(run.all_gains, run.headline) for label, run in runs.items()}
+    headlines = {"recall": {label: run.all_gains.recall(run.headline) for label, run in runs.items()}}
     charts = [
-        bar_chart("intervals", "Recall at 1, with intervals", {"recall": headlines}, axis="recall at 1, %"),
-        one_run.depths_chart("Recall over K", curves), *one_run.tolerance_charts(curves),
+        bar_chart("intervals", "Recall at 1, with intervals", headlines, axis="recall at 1, %"),
+        one_run.depths_chart("Recall over K", curves),
+        *one_run.tolerance_charts(curves),
         *one_run.precision_charts(curves),
-    ]  # fmt: skip
-    systems = dict.fromkeys(name for run in runs.values() for name in run.systems)
+    ]
     rows = []
-    for system in systems:
-        recalls = [
-            one_run.recall_bar(run.all_gains, system) if system in run.systems else None for run in runs.values()
-        ]
-        rows.append([system, *(f"{bar.percent:.1f} {bar.interval_words}" if bar else "" for bar in recalls)])
+    for system in dict.fromkeys(name for run in runs.values() for name in run.systems):
+        cells = [""] * len(runs)
+        for column, run in enumerate(runs.values()):
+            if system in run.systems:
+                cells[column] = format_estimate(run.all_gains.recall(system))
+        rows.append([system, *cells])
     header = ["system", *(f"{label}{run.within}" for label, run in runs.items())]
     words = "In %, of all queries, correct at the middle tolerance of each run; intervals are 95 % and know that "
     words += "neighbors along the path fail together."
@@ -115,10 +113,8 @@ def _settings(runs: Mapping[str, Run]) -> Section:
         settings[label] = dict(flat(about))
     names = dict.fromkeys(name for values in settings.values() for name in values)
     rows = [[name, *(values.get(name, "") for values in settings.values())] for name in names]
-    differ = [row for row in rows if len({*row[1:]}) > 1]
-    alike = [row[:2] for row in rows if len({*row[1:]}) == 1]
     tables = {
-        "What differs": Table(["name", *settings], differ, 1 + len(settings)),
-        "What is alike": Table(["name", "value"], alike, 2),
+        "What differs": Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings)),
+        "What is alike": Table(["name", "value"], [row[:2] for row in rows if len({*row[1:]}) == 1], 2),
     }
     return Section("settings", "Settings and versions", tables=tables)

@@ -12,10 +12,8 @@ import time
 
 import pytest
 
-from experiments.paper import program, systems
 from experiments.paper.runs import lock_output
-from mfvpr.report import Table
-from tests.programs import ROOT, composed, output_of
+from tests.programs import ROOT, output_of
 from tests.programs import run as run_program
 
 pytestmark = pytest.mark.slow
@@ -110,16 +108,6 @@ def test_runs_of_a_data_set_stand_side_by_side(copy, paper):
     assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
 
 
-def test_leftovers_of_a_run_that_was_killed_while_its_files_moved_are_no_obstacle(copy, paper):
-    folder = copy / RUN
-    before = files(folder)
-    (folder / ".unfinished").mkdir()
-    (folder / "results.json").rename(folder / ".unfinished/results.json")
-    (folder / "of another.csv").touch()
-    paper(copy)
-    assert files(folder) == before
-
-
 def test_seconds_of_something_else_are_measured_again(copy, paper):
     path = copy / "seconds/sift_10.json"
     seconds = json.loads(path.read_text())
@@ -137,33 +125,6 @@ def test_damaged_runs_are_errors(copy, paper, name):
     (copy / RUN / name).write_text("[")
     _, stderr = paper(copy, code=2)
     assert f"sift_10/{name}: is damaged" in stderr
-
-
-def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatch, capsys):
-    place, table = systems.Place("streets_seasons", ("dataset=streets_seasons",)), Table(["system"], [["SIFT"]])
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    def evaluate_all(rows, places, settings, write_tables):
-        write_tables({place.name: None})
-        assert (tmp_path / "out" / "tables" / "recall.csv").exists()  # before the other data sets
-        return {place.name: None}, []
-
-    left_out = {"corridor": "needs a folder", "nordland_1415": "needs another"}, ["street: expected another layout"]
-    monkeypatch.setattr(program.systems, "places", lambda *_: ([place], *left_out))
-    monkeypatch.setattr(program, "evaluate_all", evaluate_all)
-    monkeypatch.setattr(program, "paper_tables", lambda _: [("recall", "heading", table)])
-    monkeypatch.setattr(program, "measure_times", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        program.paper(composed("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
-    assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
-    stdout, stderr = capsys.readouterr()
-    assert "SIFT" in stdout
-    first, *rest = stderr.splitlines()
-    assert first.startswith("plan: 1 evaluations (sift_10) on each of 1 data sets (streets_seasons), 0 of 1 finished")
-    absent = "2 data sets that are not in data=DIR, see `mfvpr data list` (corridor, nordland_1415)"
-    assert rest == [f"left out: {absent}", "left out: street: expected another layout"]
 
 
 def test_two_do_not_evaluate_into_one_folder(finished, paper):

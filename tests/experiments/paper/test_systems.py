@@ -1,12 +1,13 @@
 """Rows, settings and data sets of the evaluations, and the tables of their numbers."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from experiments.paper import systems
 from experiments.paper.pages import mean_recalls
-from experiments.paper.runs import input_fingerprints, settings_of
+from experiments.paper.runs import input_fingerprints, lock_output, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
@@ -116,6 +117,23 @@ def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
     assert Dataset("corridor", folder, (QuerySequence("one", folder, None),)).positives_fingerprint([]) is None
 
 
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        (["figures"], "expected a new or empty folder"),
+        (["runs", "figures", "thesis.tex"], "expected a new or empty folder"),
+        ([], None),
+        (["runs", "tables", "figures", "report.html", ".DS_Store"], None),
+    ],
+)
+def test_a_folder_with_files_of_others_is_refused(tmp_path, entries, words):
+    for name in entries:
+        (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match=words) if words else nullcontext(), lock_output(tmp_path):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {*entries}
+
+
 # Tables
 
 MIX = next(row for row in ROWS if row.name == "mix_hist_50")
@@ -207,12 +225,3 @@ def test_rows_that_lack_a_data_set_have_no_mean():
     evaluations = Evaluations(rows, {name: make_dataset(name) for name in names}, results)
     assert [*mean_recalls(evaluations).values()] == [{"SIFT-hist 50": 50.0}]
     assert tables_of(evaluations)["averages"].rows == [["SIFT-hist 50", "50.0", "50.0", "50.0"]]
-
-
-def test_data_sets_that_lack_images_are_called_so():
-    results = {("mix_hist_50", "gardens_point"): row_results([90.0] * 3)}
-    evaluations = Evaluations([MIX], {"gardens_point": make_dataset("gardens_point")}, results)
-    headings = {name: heading for name, heading, _ in paper_tables(evaluations)}
-    assert tables_of(evaluations)["recall"].header[1] == "gardens_point (incomplete) ±1"
-    assert "here over gardens_point (incomplete)" in headings["averages"]
-    assert "brackets" not in headings["depths"]

@@ -80,7 +80,18 @@ theme.addEventListener("click", () => {
 });
 dark.addEventListener("change", paint);
 const options = { responsive: true, displayModeBar: false };
-const drawn = Object.entries(charts).map(([name, { data, layout }]) => Plotly.newPlot(`chart-${name}`, data, layout, options));
+const look = {
+  paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", dragmode: false, barmode: "group",
+  margin: { l: 56, r: 12, t: 12, b: 48 }, font: { family: "system-ui, sans-serif", size: 13 },
+  legend: { orientation: "h", yanchor: "bottom", y: 1.02, x: 0 }, hoverlabel: { namelength: -1 },
+};
+const axis = ({ title, ...rest }) => (
+  { fixedrange: true, automargin: true, zeroline: false, ...rest, title: { ...title, font: { size: 13 } } }
+);
+const drawn = Object.entries(charts).map(([name, { data, layout }]) => {
+  const axes = { xaxis: axis(layout.xaxis), yaxis: axis(layout.yaxis) };
+  return Plotly.newPlot(`chart-${name}`, data, { ...look, ...layout, ...axes }, options);
+});
 Promise.all(drawn).then(() => {
   paint();
   document.documentElement.dataset.ready = "";
