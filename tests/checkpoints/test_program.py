@@ -123,10 +123,9 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
         source = f"from tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
         assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
     tensors = random_checkpoint(SOURCE_SHAPES)
-    tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
     code, stdout, _ = program("add", write_zip(tiny_checkpoint, tensors))
     assert code == 0
-    assert f": tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32, from a file" in stdout
+    assert f": tiny, {PARAMETERS} parameters, from a file" in stdout
     monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=file_sha256(tiny_checkpoint)))
     assert program("verify") == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
 
