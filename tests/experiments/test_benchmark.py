@@ -11,7 +11,6 @@ from experiments.benchmark.__main__ import BENCHMARKS
 from experiments.benchmark.__main__ import run as run_benchmark
 from mfvpr import InputError
 from tests.needs import skip_without
-from tests.programs import run
 
 pytestmark = pytest.mark.slow
 
@@ -101,10 +100,3 @@ def test_the_file_of_others_stays(tmp_path):
     (tmp_path / "precious.json").write_text("{}")
     with pytest.raises(InputError, match="expected a new file"):
         run_benchmark("scores", [], 1, tmp_path / "precious.json")
-
-
-def test_help_needs_no_jax():
-    done = run("--help", program="benchmark", PYTHONPROFILEIMPORTTIME="1")
-    assert done.returncode == 0
-    assert all(f"{name} " in done.stdout and about in done.stdout for name, about in BENCHMARKS.items())
-    assert " jax\n" not in done.stderr

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
-from mfvpr.features import FeatureSet, InMemory
+from mfvpr.features import FeatureSet
 from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
 from tests.builders import make_features
 
@@ -102,14 +102,6 @@ def test_own_features_that_do_not_fit_are_refused(changes, message):
     assert "\n" not in str(error.value)
 
 
-def test_rows_that_are_not_there_have_no_keypoints():
-    [image] = images_of([5])
-    feature_set = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})
-    assert feature_set.counts.tolist() == [0, 0, 5, 0]
-    assert [row for row, _ in feature_set.read(range(4))] == [2]
-    assert [row for row, _ in feature_set.source.read()] == [2]
-
-
 # Memory
 
 
@@ -146,11 +138,6 @@ def test_what_was_used_longest_ago_makes_room(requests):
         assert [places[row] for row in rows] == slots
         assert len(set(places.values())) == len(places)
         assert set(places.values()) <= set(range(4))
-
-
-def test_more_rows_than_slots_are_refused():
-    with pytest.raises(ValueError, match="at most 2 rows at the same time, got 3"):
-        Recent(2).take([4, 5, 6])
 
 
 COUNTS = [30, 25, 0, 200, 31, 1, 180, 29, 200, 32]

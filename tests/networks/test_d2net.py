@@ -263,14 +263,6 @@ def test_the_smallest_images_are_taken(model, size, multiscale, slots):
     assert levels[0].keypoints.shape == (1, slots, 2)
 
 
-def test_the_forecast_grows_with_the_map(model):
-    assert D2NetFeatures(model).scales[0].typical_count == 740
-    assert D2NetFeatures(model).scales[0].dimension == 512
-    assert D2NetFeatures(model, (320, 320)).scales[0].typical_count == pytest.approx(684, abs=20)
-    assert D2NetFeatures(model, multiscale=True).scales[0].typical_count > 740
-    assert D2NetFeatures(model, max_keypoints=100).scales[0].typical_count == 100
-
-
 def test_relu_is_an_option(model, images):
     open_ended = nnx.merge(*nnx.split(model))
     open_ended.relu = False

@@ -8,7 +8,7 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from mfvpr.utils import InputError, compiled_programs, numerics
+from mfvpr.utils import compiled_programs, numerics
 from tests.programs import ROOT
 
 PROGRAM = """
@@ -123,9 +123,3 @@ def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path
     folders.append(compiled_programs._folder())
     assert folders[0] == folders[2]
     assert len({*folders}) == 4
-
-
-def test_a_wrong_word_is_an_error(monkeypatch):
-    monkeypatch.setenv("MFVPR_COMPILED", "no")
-    with pytest.raises(InputError, match=r"^MFVPR_COMPILED='no': expected one of true, false$"):
-        compiled_programs.keep_compiled_programs()
