@@ -105,11 +105,19 @@ def test_both_byte_orders(path, arrays):
 def test_files_of_torch_are_read_as_torch_reads_them(torch, path, zipped):
     grid = torch.arange(24.0).reshape(2, 3, 4)
     tensors = {
-        "plain": grid, "turned": grid.permute(2, 0, 1), "part": grid[1:, ::2, 1:], "scalar": torch.tensor(7),
-        "same": grid, "parameter": torch.nn.Parameter(torch.randn(3, dtype=torch.float64)), "empty": torch.zeros(0, 3),
-        "int": torch.tensor([-1], dtype=torch.int32), "bool": torch.tensor([True, False]), "int16": grid.short(),
-        "int8": torch.tensor(-3, dtype=torch.int8), "uint8": torch.tensor([255], dtype=torch.uint8),
-    }  # fmt: skip
+        "plain": grid,
+        "turned": grid.permute(2, 0, 1),
+        "part": grid[1:, ::2, 1:],
+        "scalar": torch.tensor(7),
+        "same": grid,
+        "parameter": torch.nn.Parameter(torch.randn(3, dtype=torch.float64)),
+        "empty": torch.zeros(0, 3),
+        "int": torch.tensor([-1], dtype=torch.int32),
+        "bool": torch.tensor([True, False]),
+        "int16": grid.short(),
+        "int8": torch.tensor(-3, dtype=torch.int8),
+        "uint8": torch.tensor([255], dtype=torch.uint8),
+    }
     network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4))
     for content in (tensors, network.state_dict(), {"state_dict": network.state_dict(), "lr": [0.1, None]}):
         torch.save(content, path, _use_new_zipfile_serialization=zipped)

@@ -19,11 +19,15 @@ pytestmark = pytest.mark.thorough
 
 PUBLIC = {
     "d2_tf": d2net_shapes(),
-    "mixvpr_4096": mixvpr_shapes(1024, 4), "mixvpr_512": mixvpr_shapes(256, 2), "mixvpr_128": mixvpr_shapes(64, 2),
+    "mixvpr_4096": mixvpr_shapes(1024, 4),
+    "mixvpr_512": mixvpr_shapes(256, 2),
+    "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
     "aliked-t16": checkpoints.aliked_shapes(),
-    **{f"aliked-n{kind}": checkpoints.aliked_shapes((16, 32, 64, 128), 128, positions)
-       for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))},
+    **{
+        f"aliked-n{kind}": checkpoints.aliked_shapes((16, 32, 64, 128), 128, positions)
+        for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))
+    },
     "aliked_lightglue": checkpoints.lightglue_shapes(),
     **{f"patchnetvlad_mapillary_{outputs}": checkpoints.netvlad_shapes(16, outputs) for outputs in (4096, 512, 128)},
     **{f"patchnetvlad_pitts_{outputs}": checkpoints.netvlad_shapes(64, outputs) for outputs in (4096, 512, 128)},
@@ -32,11 +36,13 @@ PUBLIC = {
     **{f"netvlad_{training}": checkpoints.matlab_shapes() for training in ("pitts30k", "tokyotm")},
     "cosplace_vgg16_512": checkpoints.gem_shapes("vgg16", 512),
     **{f"cosplace_resnet50_{outputs}": checkpoints.gem_shapes("resnet50", outputs) for outputs in (512, 2048)},
-    **{f"dinov2_vit{size}14": checkpoints.dinov2_shapes(width, depth)
-       for size, width, depth in (("s", 384, 12), ("b", 768, 12), ("l", 1024, 24))},
+    **{
+        f"dinov2_vit{size}14": checkpoints.dinov2_shapes(width, depth)
+        for size, width, depth in (("s", 384, 12), ("b", 768, 12), ("l", 1024, 24))
+    },
     **{f"selavpr_{training}": checkpoints.selavpr_shapes() for training in ("pitts30k", "msls")},
     "selavpr_msls_registers": checkpoints.selavpr_shapes(registers=4),
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -149,8 +155,10 @@ def test_places365_in_files_of_torch(change, full):
 
 def test_biases_of_places365_may_have_more_axes():
     shapes = {key: (1, *shape, 1, 1) if "bias" in key else shape for key, shape in places365_shapes(full=False).items()}
-    source = {key: np.arange(np.prod(shape), dtype=np.float32).reshape(shape) if "bias" in key else value
-              for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)}  # fmt: skip
+    source = {
+        key: np.arange(np.prod(shape), dtype=np.float32).reshape(shape) if "bias" in key else value
+        for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)
+    }
     np.testing.assert_array_equal(places365(source)["vgg.conv1_1.bias"], np.arange(64))
     source["conv1_1.bias"] = np.zeros((8, 8))
     with pytest.raises(InputError, match=r"conv1_1.bias .*: expected \(64,\), got \(8, 8\)"):

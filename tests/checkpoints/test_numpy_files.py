@@ -71,11 +71,20 @@ def test_files_of_python_2(path, arrays, protocol):
 def test_layouts_of_values(path):
     grid = np.arange(24.0).reshape(2, 3, 4)
     arrays = {
-        "a.big": grid.astype(">f4"), "a.fortran": np.asfortranarray(grid), "a.turned": grid.transpose(2, 0, 1),
-        "a.both": np.asfortranarray(grid.astype(">f8")), "a.part": grid[:, ::2, 1:], "a.scalar": np.array(2.5),
-        "a.none": np.zeros((0, 3)), "b.i8": np.array([-1]), "b.i4": np.array([2], "i4"), "b.i2": np.array([2], ">i2"),
-        "b.i1": np.array([-3], "i1"), "b.u1": np.array([255], "u1"), "b.bool": np.array([True, False]),
-    }  # fmt: skip
+        "a.big": grid.astype(">f4"),
+        "a.fortran": np.asfortranarray(grid),
+        "a.turned": grid.transpose(2, 0, 1),
+        "a.both": np.asfortranarray(grid.astype(">f8")),
+        "a.part": grid[:, ::2, 1:],
+        "a.scalar": np.array(2.5),
+        "a.none": np.zeros((0, 3)),
+        "b.i8": np.array([-1]),
+        "b.i4": np.array([2], "i4"),
+        "b.i2": np.array([2], ">i2"),
+        "b.i1": np.array([-3], "i1"),
+        "b.u1": np.array([255], "u1"),
+        "b.bool": np.array([True, False]),
+    }
     loaded = read_checkpoint(write_numpy(path, layered(arrays), protocol=3))
     assert_same(loaded, {key: value.astype(value.dtype.newbyteorder("=")) for key, value in arrays.items()})
     assert not any(value.flags.writeable for key, value in loaded.items() if value.size and key == "a.fortran")

@@ -111,8 +111,11 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
 
 
 def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
-    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "add d2_tf.pth"),
-                          ("mixvpr_512", "add 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
+    for name, command in (
+        ("aliked-n16", "download aliked-n16"),
+        ("d2_tf", "add d2_tf.pth"),
+        ("mixvpr_512", "add 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'"),
+    ):
         with pytest.raises(SystemExit) as caught, one_line():
             load_model(name)
         assert caught.value.code == 2
@@ -152,8 +155,12 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
         assert program("verify", *arguments)[1] == f"own/mine: good, {PARAMETERS} parameters as converted, {source}\n"
     published, listed = (line.split() for line in program("list")[1].splitlines()[-2:])
     assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (
-        "tiny", "no", "own/mine", ["yours,", "as", "tiny"], "yes"
-    )  # fmt: skip
+        "tiny",
+        "no",
+        "own/mine",
+        ["yours,", "as", "tiny"],
+        "yes",
+    )
     assert assembly._network("features", ("tiny",), "own/mine").conv is not None
     with pytest.raises(InputError, match=r"features.weights=tiny\b.*|tiny: not installed"):
         assembly._network("features", ("tiny",), "tiny")

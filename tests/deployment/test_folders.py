@@ -72,12 +72,15 @@ def test_a_program_takes_arrays_of_jax_and_other_libraries(written):
         np.testing.assert_array_equal(values, expected[name])
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got .* \[3, 21, 2\]"),
-    ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
-    ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
-    ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got .* \[3, 21, 2\]"),
+        ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
+        ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
+        ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
+    ],
+)
 def test_wrong_inputs_are_refused(written, change, message):
     program = mfvpr.load_exported(written)
     with pytest.raises(InputError, match=message):
@@ -86,10 +89,16 @@ def test_wrong_inputs_are_refused(written, change, message):
         program()
 
 
-@pytest.mark.parametrize(("name", "size"), [
-    ("image_size0", [0, 0]), ("image_size0", [-320, 240]), ("image_size0", [np.nan, 240]), ("image_size0", [240, 320]),
-    ("image_size1", [[320, 240], [240, 320], [320, 240]]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("image_size0", [0, 0]),
+        ("image_size0", [-320, 240]),
+        ("image_size0", [np.nan, 240]),
+        ("image_size0", [240, 320]),
+        ("image_size1", [[320, 240], [240, 320], [320, 240]]),
+    ],
+)
 def test_image_sizes_that_cannot_be_right_are_refused(written, name, size):
     program = mfvpr.load_exported(written)
     with pytest.raises(InputError, match=rf"^{name}: expected \(width, height\)"):

@@ -12,10 +12,13 @@ from mfvpr.utils.errors import InputError
 from tests.needs import skip_without
 
 
-@pytest.mark.parametrize("parts", [
-    (accelerator_checks.search_tasks,),
-    pytest.param(accelerator_checks.PARTS, marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (accelerator_checks.search_tasks,),
+        pytest.param(accelerator_checks.PARTS, marks=pytest.mark.slow),
+    ],
+)
 def test_results_are_exact_and_times_are_reported(parts, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(accelerator_checks, "PARTS", parts)
     report = accelerator.run(2, tmp_path / "report.json", ["correct", "rates"])
@@ -31,8 +34,9 @@ def test_results_are_exact_and_times_are_reported(parts, monkeypatch, tmp_path, 
 def test_matches_by_products_of_few_digits_differ():
     images = accelerator_checks.images()
     high_bits = np.uint32(0xFFFFE000)  # bits of TF32
-    rounded = tuple(replace(image, descriptors=(image.descriptors.view(np.uint32) & high_bits).view(np.float32))
-                    for image in images)  # fmt: skip
+    rounded = tuple(
+        replace(image, descriptors=(image.descriptors.view(np.uint32) & high_bits).view(np.float32)) for image in images
+    )
     assert accelerator_checks.match(images, {})[2] == 0
     assert accelerator_checks.match(images, {}, rounded)[2] > 10
 
@@ -52,16 +56,19 @@ def test_groups_are_named(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("make", "sizes", "options"), [
-    (accelerator.scoring, (6,), {"name": "histogram"}),
-    (accelerator.scoring, (6,), {"name": "anchor"}),
-    (accelerator.scoring, (6,), {"name": "sum"}),
-    (accelerator.matching, (4, 60, 32), {}),
-    (accelerator.searching, (5, 2000, 32), {}),
-    (accelerator.ranking, (1, 4, 60, 32), {}),
-    (accelerator.ranking, (3, 4, 60, 32), {}),
-    (accelerator.grid, (2, 3), {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("make", "sizes", "options"),
+    [
+        (accelerator.scoring, (6,), {"name": "histogram"}),
+        (accelerator.scoring, (6,), {"name": "anchor"}),
+        (accelerator.scoring, (6,), {"name": "sum"}),
+        (accelerator.matching, (4, 60, 32), {}),
+        (accelerator.searching, (5, 2000, 32), {}),
+        (accelerator.ranking, (1, 4, 60, 32), {}),
+        (accelerator.ranking, (3, 4, 60, 32), {}),
+        (accelerator.grid, (2, 3), {}),
+    ],
+)
 def test_torch_computes_the_same(make, sizes, options):
     skip_without("torch")
     calls = make(*sizes, **options)[0]

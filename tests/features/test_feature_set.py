@@ -88,13 +88,16 @@ AXES = {"keypoints": (2, 5, 2), "descriptors": (2, 5, 16), "scores": (2, 5), "ma
 STACKED = {name: np.ones(shape, bool if name == "mask" else float) for name, shape in AXES.items()}
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ([], "at least one image, got none"),
-    ([{}, {"image_size": None}], r"image 1: .*image_size \[2\].* got shapes \(5,\) and \(\)"),
-    ([STACKED], r"mask \[N\]"),
-    ([{}, {"descriptors": np.full((5, 16), 2.0)}], "image 1: .*unit length, got 8;"),
-    ([{}, {"descriptors": np.ones((5, 8)) / np.sqrt(8)}], "image 1: .*16 .*, got 8;"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ([], "at least one image, got none"),
+        ([{}, {"image_size": None}], r"image 1: .*image_size \[2\].* got shapes \(5,\) and \(\)"),
+        ([STACKED], r"mask \[N\]"),
+        ([{}, {"descriptors": np.full((5, 16), 2.0)}], "image 1: .*unit length, got 8;"),
+        ([{}, {"descriptors": np.ones((5, 8)) / np.sqrt(8)}], "image 1: .*16 .*, got 8;"),
+    ],
+)
 def test_own_features_that_do_not_fit_are_refused(changes, message):
     [image] = images_of([5])
     with pytest.raises(InputError, match=message) as error:

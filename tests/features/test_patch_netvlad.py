@@ -46,12 +46,16 @@ def test_patches_are_where_the_public_code_has_them(model, position):
     assert scale == (16, len(expected), 1.0)
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    ({"patch_sizes": ()}, r"patch_sizes=\(\): expected a list of one or more"),
-    ({"patch_sizes": (9,)}, "expected sizes from 1 to 8, .*10 x 8"), ({"patch_sizes": (0, 2)}, "from 1"),
-    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
-    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"patch_sizes": ()}, r"patch_sizes=\(\): expected a list of one or more"),
+        ({"patch_sizes": (9,)}, "expected sizes from 1 to 8, .*10 x 8"),
+        ({"patch_sizes": (0, 2)}, "from 1"),
+        ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
+        ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
+    ],
+)
 def test_what_cannot_be_is_refused(model, options, words):
     with pytest.raises(InputError, match=words):
         PatchNetVladFeatures(model, SIZE, **options)
@@ -98,11 +102,19 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
 
 @pytest.mark.optimized
 @pytest.mark.first_case
-@pytest.mark.parametrize(("matcher", "scorer", "unit"), [
-    ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
-        size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True), 256),
-    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("matcher", "scorer", "unit"),
+    [
+        (
+            "spatialApproximator",
+            lambda patch: mfvpr.RapidSpatialScore(
+                size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True
+            ),
+            256,
+        ),
+        ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
+    ],
+)
 def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
     """Every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
 
@@ -113,8 +125,10 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
     for patch in patch_scores.PATCHES:
         [places] = PatchNetVladFeatures(model, (width, height), patch_sizes=(patch,))(image((width, height)))
         query, candidates = patch_scores.descriptors(patch)
-        everywhere = jax.tree.map(partial(np.repeat, repeats=len(candidates), axis=0),
-                                  jax.tree.map(lambda field: field[None], places.features))  # fmt: skip
+        everywhere = jax.tree.map(
+            partial(np.repeat, repeats=len(candidates), axis=0),
+            jax.tree.map(lambda field: field[None], places.features),
+        )
         matches = mfvpr.match_candidates(
             replace(places.features, descriptors=query), replace(everywhere, descriptors=candidates)
         )
@@ -143,9 +157,14 @@ def program(run_program, weights, street_settings, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "scorer"), [
-    ("patch_netvlad_performance", "homography"), ("patch_netvlad_speed", "rapid"), ("patch_netvlad_storage", "rapid"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("system", "scorer"),
+    [
+        ("patch_netvlad_performance", "homography"),
+        ("patch_netvlad_speed", "rapid"),
+        ("patch_netvlad_storage", "rapid"),
+    ],
+)
 def test_its_configurations_run_by_name(program, system, scorer):
     reach = () if scorer == "homography" else ("scorer.size=[80,48]",)
     if reach:  # at another size of images, that of the configuration is another score

@@ -56,9 +56,11 @@ def learned(cells, dataset):
 @pytest.mark.parametrize(("shape", "size", "stride"), [((5, 7, 2), 3, 1), ((8, 5, 3), 3, 2), ((4, 4, 1), 4, 1)])
 def test_windows_are_those_of_the_loops(shape, size, stride):
     image_map, positions = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
-    expected = [image_map[row : row + size, column : column + size].reshape(-1)
-                for row in range(0, shape[0] - size + 1, stride)
-                for column in range(0, shape[1] - size + 1, stride)]  # fmt: skip
+    expected = [
+        image_map[row : row + size, column : column + size].reshape(-1)
+        for row in range(0, shape[0] - size + 1, stride)
+        for column in range(0, shape[1] - size + 1, stride)
+    ]
     assert positions.count == len(expected) == np.prod(positions.grid)
     np.testing.assert_array_equal(positions.take(image_map, np.arange(positions.count)), expected)
     places = np.array([1, 0]) % positions.count
@@ -183,13 +185,25 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     recipes = [cache.recipes.of_folder(dataset.database, extractor) for extractor in extractors]
     assert "whitening" in difference(*recipes)
     variants = [
-        cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
-        replace(cells, image_size=(40, 48)), replace(cells, interpolation="cv2_area"), SsmWindows(model),
-        *(replace(cells, whitening=replace(how, **change)) for change in (
-            {"dimension": 5}, {"seed": 2}, {"zero_row": True}, {"max_images": 9}, {"max_windows": 99},
-            {"dtype": "float64"},
-        )),
-    ]  # fmt: skip
+        cells,
+        replace(cells, model=other),
+        replace(cells, preprocessing="caffe"),
+        replace(cells, stride=2),
+        replace(cells, image_size=(40, 48)),
+        replace(cells, interpolation="cv2_area"),
+        SsmWindows(model),
+        *(
+            replace(cells, whitening=replace(how, **change))
+            for change in (
+                {"dimension": 5},
+                {"seed": 2},
+                {"zero_row": True},
+                {"max_images": 9},
+                {"max_windows": 99},
+                {"dtype": "float64"},
+            )
+        ),
+    ]
     recipes = [whitening_recipe(extractor, extractor.whitening, cache) for extractor in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
     assert whitening_recipe(replace(cells, batch_size=1), how, cache) == recipes[0]
@@ -199,8 +213,12 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, data
     image = np.zeros((1, 40, 48, 3), np.uint8)
     turned = {"image_size": (40, 48)}
     for change in (
-        {"model": published(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2}, turned,
-    ):  # fmt: skip
+        {"model": published(1)},
+        {"preprocessing": "caffe"},
+        {"interpolation": "cv2_area"},
+        {"stride": 2},
+        turned,
+    ):
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image.swapaxes(1, 2) if change is turned else image)
     with pytest.raises(InputError, match="SsmCells: expected images of 48 x 40 px, got 40 x 48"):

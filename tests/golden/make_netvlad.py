@@ -92,10 +92,13 @@ def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
     for clusters, outputs, size, seed in CASES:
         config = ConfigParser()
         config["global_params"] = {
-            "pooling": "patchnetvlad" if outputs else "netvlad", "num_clusters": str(clusters), "vladv2": "False",
-            "num_pcs": str(outputs), "patch_sizes": ",".join(map(str, PATCHES.get(outputs or 0, (1,)))),
+            "pooling": "patchnetvlad" if outputs else "netvlad",
+            "num_clusters": str(clusters),
+            "vladv2": "False",
+            "num_pcs": str(outputs),
+            "patch_sizes": ",".join(map(str, PATCHES.get(outputs or 0, (1,)))),
             "strides": ",".join("1" for _ in PATCHES.get(outputs or 0, (1,))),
-        }  # fmt: skip
+        }
         channels, encoder = get_backend()
         model = get_model(encoder, channels, config["global_params"], append_pca_layer=outputs is not None)
         fill(model, random_checkpoint(netvlad_shapes(clusters, outputs), seed)).double()

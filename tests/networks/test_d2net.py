@@ -154,9 +154,14 @@ def test_detection_agrees_with_the_oracle(seed, offset):
 FLAT = np.ones((6, 5, 6), np.float32)
 
 
-@pytest.mark.parametrize(("maps", "num_empty"), [
-    ((smooth(0, 4, 7), smooth(1, 9, 15), smooth(2, 20, 31)), 0), ((FLAT, smooth(1)), 1),
-], ids=["textured", "flat"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("maps", "num_empty"),
+    [
+        ((smooth(0, 4, 7), smooth(1, 9, 15), smooth(2, 20, 31)), 0),
+        ((FLAT, smooth(1)), 1),
+    ],
+    ids=["textured", "flat"],
+)
 def test_scales_agree_with_the_oracle(maps, num_empty):
     """A scale without keypoints adds nothing to the next."""
     expected = oracle.pyramid([dense.astype(np.float64) for dense in maps])

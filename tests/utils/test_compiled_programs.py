@@ -27,9 +27,13 @@ def run(cache, **variables):
     """The printed result, whether programs were read, and JAX's folder, of a new process."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     done = subprocess.run(
-        [sys.executable, "-W", "ignore:Error", "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, check=True,
+        [sys.executable, "-W", "ignore:Error", "-c", PROGRAM],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
         env=environment | {"MFVPR_CACHE": str(cache), "JAX_PLATFORMS": "cpu"} | variables,
-    )  # fmt: skip
+    )
     return done.stdout.split()
 
 
