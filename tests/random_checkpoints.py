@@ -15,9 +15,17 @@ import numpy as np
 from scipy.io import savemat
 
 KINDS = {
-    "f4": "FloatStorage", "f8": "DoubleStorage", "f2": "HalfStorage", "i8": "LongStorage", "i4": "IntStorage",
-    "i2": "ShortStorage", "i1": "CharStorage", "u1": "ByteStorage", "b1": "BoolStorage", "c8": "ComplexFloatStorage",
-}  # fmt: skip
+    "f4": "FloatStorage",
+    "f8": "DoubleStorage",
+    "f2": "HalfStorage",
+    "i8": "LongStorage",
+    "i4": "IntStorage",
+    "i2": "ShortStorage",
+    "i1": "CharStorage",
+    "u1": "ByteStorage",
+    "b1": "BoolStorage",
+    "c8": "ComplexFloatStorage",
+}
 Shapes = dict[str, tuple[int, ...]]
 
 
@@ -190,8 +198,21 @@ def with_biases(weights: Shapes) -> Shapes:
     }
 
 
-_VGG16 = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256),
-          17: (256, 512), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (512, 512), 28: (512, 512)}  # fmt: skip
+_VGG16 = {
+    0: (3, 64),
+    2: (64, 64),
+    5: (64, 128),
+    7: (128, 128),
+    10: (128, 256),
+    12: (256, 256),
+    14: (256, 256),
+    17: (256, 512),
+    19: (512, 512),
+    21: (512, 512),
+    24: (512, 512),
+    26: (512, 512),
+    28: (512, 512),
+}
 
 
 def _vgg16(prefix: str, last: int = 28) -> Shapes:
@@ -224,18 +245,29 @@ def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> Shapes:
 def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> Shapes:
     """The tensors of CosPlace's checkpoints."""
     channels = {"vgg16": 512, "resnet50": 2048}[backbone]
-    shapes = _vgg16("backbone") if backbone == "vgg16" else {
-        "backbone.0.weight": (64, 3, 7, 7), **_norm("backbone.1", 64),
-        **_bottlenecks([f"backbone.{place}" for place in (4, 5, 6, 7)]),
-    }  # fmt: skip
+    shapes = (
+        _vgg16("backbone")
+        if backbone == "vgg16"
+        else {
+            "backbone.0.weight": (64, 3, 7, 7),
+            **_norm("backbone.1", 64),
+            **_bottlenecks([f"backbone.{place}" for place in (4, 5, 6, 7)]),
+        }
+    )
     return shapes | {"aggregation.1.p": (1,)} | with_biases({"aggregation.3": (outputs, channels)})
 
 
 def dinov2_shapes(width: int, depth: int, registers: int = 0, prefix: str = "", *, adapted: bool = False) -> Shapes:
     """The tensors of DINOv2's checkpoints; `adapted` those of SelaVPR's backbone."""
-    shapes = {"cls_token": (1, 1, width), "pos_embed": (1, 1370, width), "mask_token": (1, width),
-              "patch_embed.proj.weight": (width, 3, 14, 14), "patch_embed.proj.bias": (width,),
-              "norm.weight": (width,), "norm.bias": (width,)}  # fmt: skip
+    shapes = {
+        "cls_token": (1, 1, width),
+        "pos_embed": (1, 1370, width),
+        "mask_token": (1, width),
+        "patch_embed.proj.weight": (width, 3, 14, 14),
+        "patch_embed.proj.bias": (width,),
+        "norm.weight": (width,),
+        "norm.bias": (width,),
+    }
     if registers:
         shapes["register_tokens"] = (1, registers, width)
     linear = {"attn.qkv": (3, 1), "attn.proj": (1, 1), "mlp.fc1": (4, 1), "mlp.fc2": (1, 4)}
@@ -243,8 +275,12 @@ def dinov2_shapes(width: int, depth: int, registers: int = 0, prefix: str = "", 
         adapters = (f"adapter{number}.D_fc{place}" for number in (1, 2) for place in (1, 2))
         linear |= {name: (0.5, 1) if name.endswith("1") else (1, 0.5) for name in adapters}
     for block in (f"blocks.{place}" for place in range(depth)):
-        shapes |= with_biases({f"{block}.{name}": (int(outputs * width), int(inputs * width))
-                               for name, (outputs, inputs) in linear.items()})  # fmt: skip
+        shapes |= with_biases(
+            {
+                f"{block}.{name}": (int(outputs * width), int(inputs * width))
+                for name, (outputs, inputs) in linear.items()
+            }
+        )
         for number in (1, 2):
             shapes[f"{block}.ls{number}.gamma"] = (width,)
             shapes |= {f"{block}.norm{number}.{part}": (width,) for part in ("weight", "bias")}
@@ -253,8 +289,13 @@ def dinov2_shapes(width: int, depth: int, registers: int = 0, prefix: str = "", 
 
 def selavpr_shapes(width: int = 1024, depth: int = 24, registers: int = 0, prefix: str = "module.") -> Shapes:
     """The tensors of SelaVPR's checkpoints, which hold them below `model_state_dict`."""
-    head = {"aggregation.1.p": (1,), "LocalAdapt.upconv1.weight": (width, 256, 3, 3), "LocalAdapt.upconv1.bias": (256,),
-            "LocalAdapt.upconv2.weight": (256, 128, 3, 3), "LocalAdapt.upconv2.bias": (128,)}  # fmt: skip
+    head = {
+        "aggregation.1.p": (1,),
+        "LocalAdapt.upconv1.weight": (width, 256, 3, 3),
+        "LocalAdapt.upconv1.bias": (256,),
+        "LocalAdapt.upconv2.weight": (256, 128, 3, 3),
+        "LocalAdapt.upconv2.bias": (128,),
+    }
     backbone = dinov2_shapes(width, depth, registers, f"{prefix}backbone.", adapted=True)
     return backbone | {f"{prefix}{name}": shape for name, shape in head.items()}
 
@@ -273,8 +314,13 @@ def matlab_shapes(clusters: int = 64, outputs: int = 4096) -> Shapes:
 def matlab_netvlad(clusters: int = 64, outputs: int = 4096, seed: int = 0) -> dict[str, Any]:
     """Content of the original's files, as SciPy writes it: `net.layers{i}.weights{j}` and the average image."""
     tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
-    weights = {position: [tensors[f"encoder.{position}.weight"].transpose(2, 3, 1, 0),
-                          tensors[f"encoder.{position}.bias"][None]] for position in _VGG16}  # fmt: skip
+    weights = {
+        position: [
+            tensors[f"encoder.{position}.weight"].transpose(2, 3, 1, 0),
+            tensors[f"encoder.{position}.bias"][None],
+        ]
+        for position in _VGG16
+    }
     weights[30] = [tensors["pool.conv.weight"][:, :, 0, 0].T, -tensors["pool.centroids"].T]
     weights[33] = [tensors["WPCA.0.weight"][:, :, 0, 0].T[None, None], tensors["WPCA.0.bias"][None]]
     layers = [{"name": f"layer{position}", "type": "relu"} for position in range(35)]
@@ -337,8 +383,10 @@ def lightglue_shapes(inputs: int = 128, width: int = 256, layers: int = 9, heads
         for block in (within, across):
             linear |= {f"{block}.ffn.0": (2 * width, 2 * width), f"{block}.ffn.3": (width, 2 * width)}
             shapes |= {f"{block}.ffn.1.{name}": (2 * width,) for name in ("weight", "bias")}
-        linear |= {f"log_assignment.{layer}.{name}": (size, width) for name, size in
-                   (("final_proj", width), ("matchability", 1))}  # fmt: skip
+        linear |= {
+            f"log_assignment.{layer}.{name}": (size, width)
+            for name, size in (("final_proj", width), ("matchability", 1))
+        }
     linear |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
     return shapes | with_biases(linear)
 

@@ -29,9 +29,8 @@ from mfvpr.retrieval import fit_to_database
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import expand_user, remove_leftovers
+from mfvpr.utils.files import expand_user, lock_folder
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.locks import lock_folder
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
 
@@ -66,7 +65,6 @@ def lock_output(out: Path) -> Iterator[None]:
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
             raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
-        remove_leftovers(out)
         yield
 
 

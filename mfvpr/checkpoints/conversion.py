@@ -69,7 +69,7 @@ def convert(
     parameters: dict[str, np.ndarray] = {}
     problems: list[str] = []
     for key, value in source.items():
-        if is_ignored(key, table):
+        if any(re.fullmatch(pattern, key) for pattern in table.ignored):
             for pattern, shape in table.expected.items():
                 if re.fullmatch(pattern, key) and value.shape != shape:
                     problems.append(f"{key} of another shape: expected {shape}, got {value.shape}")
@@ -86,11 +86,6 @@ def convert(
         examples = "; ".join(problems[:_MOST_EXAMPLES])
         raise InputError(f"keys do not fit the network in {len(problems)} places: {examples}")
     return parameters
-
-
-def is_ignored(key: str, table: Table) -> bool:
-    """Whether the network does not need the tensor of this key."""
-    return any(re.fullmatch(pattern, key) for pattern in table.ignored)
 
 
 def _convert_tensor(value: np.ndarray, layout: Layout, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:

@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ import numpy as np
 import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
-from mfvpr.checkpoints.conversion import convert, is_ignored
+from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint
 from mfvpr.checkpoints.registry import OWN, REGISTRY, Entry, entry_of, how_to_install, own_entry
 from mfvpr.utils.errors import InputError
@@ -22,22 +22,18 @@ from mfvpr.utils.files import replacing, require_file, write_text
 if TYPE_CHECKING:
     from flax import nnx
 
-FORMAT = 1
 _MEND = "install it again"
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """Name, hash and size of a runtime file, and the checkpoint it comes from."""
+    """Name and hash of a runtime file, and the checkpoint it comes from."""
 
     name: str
     sha256: str
-    size: int
     parameters: int  # of the network, without running statistics
     source_file: str
     source_sha256: str
-    format: int = FORMAT
-    rounded: int = 0  # tensors of the source that were rounded from float64 to float32
     like: str = ""  # weights of one's own: the published weights of the same network
 
 
@@ -83,9 +79,7 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
         arrays = convert(tensors, network.table, plan.shapes)
     except InputError as error:
         raise InputError(f"{checkpoint}: {error}; use the official {entry_of(name).file}") from error
-    needed = (tensor for key, tensor in tensors.items() if not is_ignored(key, network.table))
-    rounded = sum(tensor.dtype == np.float64 for tensor in needed)
-    return save(entry, arrays, checkpoint, parameters=plan.parameters, rounded=rounded)
+    return save(entry, arrays, checkpoint, parameters=plan.parameters)
 
 
 def check_published(checkpoint: Path, entry: Entry) -> None:
@@ -103,10 +97,10 @@ def check_sha256(sha256: str, entry: Entry, origin: object) -> None:
         raise InputError(f"{origin}: expected the sha256 of {entry.name}, {str(entry.sha256)[:12]}..., got {got}")
 
 
-def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int, rounded: int = 0) -> Path:
+def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int) -> Path:
     """Write the arrays by dotted path, then the manifest; `load` raises an error for a file without a manifest.
 
-    `source` is the checkpoint of the arrays; `parameters` and `rounded` are those of the manifest.
+    `source` is the checkpoint of the arrays; `parameters` is their number, of the network.
 
     Raises:
         InputError: values are not finite.
@@ -119,10 +113,8 @@ def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parame
     with replacing(target) as temporary:
         temporary.write_bytes(content)
     sha256 = hashlib.sha256(content).hexdigest()
-    origin = source.name, file_sha256(source)
-    manifest = Manifest(entry.name, sha256, len(content), parameters, *origin, rounded=rounded, like=entry.like or "")
-    values = {name: value for name, value in asdict(manifest).items() if value != ""}
-    write_text(target.with_suffix(".json"), json.dumps(values, indent=1) + "\n")
+    manifest = Manifest(entry.name, sha256, parameters, source.name, file_sha256(source), entry.like or "")
+    write_text(target.with_suffix(".json"), json.dumps(asdict(manifest), indent=1) + "\n")
     return target
 
 
@@ -183,7 +175,7 @@ def read_manifest(name: str) -> Manifest:
     """Read the manifest of an installed runtime file, but not the file.
 
     Raises:
-        WeightsError: the weights are not installed, or have no manifest of this name and format.
+        WeightsError: the weights are not installed, or have no manifest of this name.
     """
     entry = installed_entry(name)
     path = _path(entry).with_suffix(".json")
@@ -191,14 +183,14 @@ def read_manifest(name: str) -> Manifest:
         source = f"{entry.file} from {entry.source} ({entry.license})"
         raise WeightsError(f"{name}: not installed in {path.parent}; get {source} and install it", entry)
     try:
-        manifest = Manifest(**json.loads(path.read_text(encoding="utf-8")))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        manifest = Manifest(**{each.name: values[each.name] for each in fields(Manifest) if each.name in values})
     except FileNotFoundError as error:
         raise WeightsError(f"{path}: there is no manifest, so the file was never finished; {_MEND}", entry) from error
     except (ValueError, TypeError) as error:
-        raise WeightsError(f"{path}: expected a manifest of format {FORMAT}; {_MEND}", entry) from error
-    if (manifest.format, manifest.name) != (FORMAT, name):
-        got = f"that of {manifest.name}, format {manifest.format}"
-        raise WeightsError(f"{path}: expected the manifest of {name}, format {FORMAT}, got {got}; {_MEND}", entry)
+        raise WeightsError(f"{path}: expected a manifest; {_MEND}", entry) from error
+    if manifest.name != name:
+        raise WeightsError(f"{path}: expected the manifest of {name}, got that of {manifest.name}; {_MEND}", entry)
     return manifest
 
 

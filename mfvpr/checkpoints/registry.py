@@ -51,9 +51,15 @@ _DINOV2 = "https://dl.fbaipublicfiles.com/dinov2"
 
 
 def _entry(
-    network: str, name: str, source: str, *, file: str = "", size: int | None = None, sha256: str | None = None,
+    network: str,
+    name: str,
+    source: str,
+    *,
+    file: str = "",
+    size: int | None = None,
+    sha256: str | None = None,
     license: str | None = None,
-) -> Entry:  # fmt: skip
+) -> Entry:
     """Entry with the network's licenses, or with `license` for both; the source ends with the file by default."""
     licenses = (license, license) if license else _LICENSES[network]
     return Entry(name, network, file or source.rpartition("/")[2], source, size, sha256, *licenses)

@@ -26,11 +26,9 @@ def _batch_norm(source: str, target: str) -> tuple[Rule, ...]:
     return *_norm(source, target), *rules
 
 
-# Positions of VGG16's convolutions in the public Sequential; pooling and ReLU lie between.
-_VGG = {
-    0: "conv1_1", 2: "conv1_2", 5: "conv2_1", 7: "conv2_2", 10: "conv3_1", 12: "conv3_2", 14: "conv3_3",
-    17: "conv4_1", 19: "conv4_2", 21: "conv4_3", 24: "conv5_1", 26: "conv5_2", 28: "conv5_3",
-}  # fmt: skip
+_VGG_POSITIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # in the public Sequential, with pooling and ReLU
+_VGG_NAMES = [f"conv{block}_{place + 1}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for place in range(count)]
+_VGG = dict(zip(_VGG_POSITIONS, _VGG_NAMES, strict=True))
 
 
 def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:

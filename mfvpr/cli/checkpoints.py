@@ -41,10 +41,9 @@ def add(file: Path, name: str | None, own: str | None) -> None:
         print(f"{file}: {megabytes:,} MiB to convert, some {max(1, megabytes // 50)} s", file=sys.stderr)
     path = install(file, entry.name, own=own)
     manifest = read_manifest(entry.name if own is None else f"own/{own}")
-    rounded = f", {manifest.rounded} of its tensors rounded from float64 to float32" if manifest.rounded else ""
     origin = "" if entry.sha256 else f", from a file of sha256 {manifest.source_sha256[:12]}..., which nobody published"
     origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={manifest.name}"
-    print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{rounded}{origin}")
+    print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{origin}")
 
 
 def verify(names: Iterable[str]) -> None:

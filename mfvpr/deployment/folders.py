@@ -1,12 +1,7 @@
 """Folders of exported programs: the program, arrays to check it with, and a description of both."""
 
-import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,18 +11,19 @@ import numpy as np
 
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array
-from mfvpr.deployment import onnx_models, stablehlo
+from mfvpr.deployment import onnx_models
 from mfvpr.deployment.check_arrays import check_inputs, largest_difference
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
+from mfvpr.deployment.stablehlo import PLATFORMS, deserialize, serialize, without_unused_inputs
 from mfvpr.evaluation.system import System
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file
+from mfvpr.utils.files import require_file, write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import as_array
 from mfvpr.utils.versions import versions
 
 FORMAT = "mfvpr exported program 1"
-DESCRIPTION, PROGRAM, MODEL = "export.json", "program.stablehlo", "program.onnx"
+DESCRIPTION, PROGRAM, MODEL, CHECK = "export.json", "program.stablehlo", "program.onnx", "check"
 
 
 @dataclass(frozen=True)
@@ -58,12 +54,12 @@ class ExportedProgram:
         """
         if arrays.keys() != (expected := {each.name: each for each in self.inputs}).keys():
             raise InputError(f"inputs: expected {', '.join(expected)}, got {', '.join(arrays) or 'none'}")
-        values = {name: as_array(array) for name, array in arrays.items()}
+        values = {name: np.asarray(as_array(array)) for name, array in arrays.items()}
         for name, each in expected.items():
-            got = str(getattr(values[name], "dtype", type(values[name]).__name__)), np.shape(values[name])
-            if got != (each.dtype, each.shape):
-                raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got[0]} {[*got[1]]}")
-        _require_sizes({name: np.asarray(array) for name, array in values.items()})
+            got = values[name]
+            if (str(got.dtype), got.shape) != (each.dtype, each.shape):
+                raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got.dtype} {[*got.shape]}")
+        _require_sizes(values)
         return self._outputs(values)
 
     def _outputs(self, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -73,7 +69,7 @@ class ExportedProgram:
     def check(self) -> float:
         """Largest difference from the outputs in the folder, relative where they are above 1."""
         inputs, outputs = (
-            {each.name: np.load(_array_path(self.folder, each.name), allow_pickle=False) for each in tensors}
+            {each.name: np.load(self.folder / CHECK / f"{each.name}.npy", allow_pickle=False) for each in tensors}
             for tensors in (self.inputs, self.outputs)
         )
         return largest_difference(self._outputs(inputs), outputs)
@@ -108,27 +104,40 @@ def export(
             model, or its outputs differ; or the folder has files.
     """
     folder = Path(folder)
-    is_other = folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))
-    if is_other or folder.is_symlink() or folder.resolve() == Path.cwd():
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
     with jax.enable_x64(False):
-        program = make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
-        program = stablehlo.without_unused_inputs(program)
-        content = stablehlo.serialize(program)
-        inputs = check_inputs(program)
-        run = jax.jit(stablehlo.deserialize(content, str(folder)).call)
-        outputs = dict(
-            zip((each.name for each in program.outputs), map(np.asarray, run(*inputs.values())), strict=True)
+        program = without_unused_inputs(
+            make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
         )
+        content = serialize(program)
+        inputs = check_inputs(program)
+        values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
+        outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = _model(program, inputs, outputs, required=onnx)
-    files = {PROGRAM: content} | ({} if model is None else {MODEL: model})
-    with _new_folder(folder) as temporary:
-        for name, file_content in files.items():
-            (temporary / name).write_bytes(file_content)
-        for name, array in (inputs | outputs).items():
-            np.save(_array_path(temporary, name), array, allow_pickle=False)
-        description = _description(program, onnx_note) | {"files": _digests(temporary)}
-        (temporary / DESCRIPTION).write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
+    description = {
+        "format": FORMAT,
+        "versions": versions(),
+        "platforms": PLATFORMS,
+        "inputs": [each._asdict() for each in program.inputs],
+        "outputs": [each._asdict() for each in program.outputs],
+        "axes": {"C": shapes.candidates, "K": shapes.keypoints, "D": program.shapes.dimension},
+        "image_size": program.shapes.image_size,
+        "parameters": {name: _recipe(part) for name, part in program.parameters.items()},
+        "left_out": program.left_out,
+        "onnx": onnx_note,
+    }
+    try:
+        (folder / CHECK).mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another path") from error
+    (folder / PROGRAM).write_bytes(content)
+    if model is not None:
+        (folder / MODEL).write_bytes(model)
+    for name, array in (inputs | outputs).items():
+        np.save(folder / CHECK / f"{name}.npy", array, allow_pickle=False)
+    # The description comes last: a folder without it is not loaded.
+    write_text(folder / DESCRIPTION, json.dumps(description, indent=2, allow_nan=False) + "\n")
     return load_exported(folder)
 
 
@@ -142,15 +151,19 @@ def load_exported(folder: Path | str) -> ExportedProgram:
         folder: of `export`, on this or on another computer.
 
     Raises:
-        InputError: a file is missing or has changed, or this version of JAX cannot read the program.
+        InputError: a file is missing, or this version of JAX cannot read the program.
     """
     folder = Path(folder)
-    description = _read_description(folder)
-    for name, digest in description["files"].items():
-        require_file(path := folder / name)
-        if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-            raise InputError(f"{path}: expected the file as it was exported, got a changed one; export it again")
-    exported = stablehlo.deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
+    require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
+    require_file(folder / PROGRAM)
+    try:
+        description = json.loads(path.read_text(encoding="utf-8"))
+        is_current = description["format"] == FORMAT
+    except (ValueError, LookupError, TypeError):
+        is_current = False
+    if not is_current:
+        raise InputError(f"{path}: expected the format {FORMAT!r}; export it again with this version")
+    exported = deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
     inputs, outputs = (
         tuple(Tensor(**entry | {"shape": tuple(entry["shape"])}) for entry in description[side])
         for side in ("inputs", "outputs")
@@ -177,41 +190,11 @@ def _model(
     return model, {"largest_difference": difference, "tolerance": onnx_models.TOLERANCE}
 
 
-def _description(program: Program, onnx_note: dict[str, Any]) -> dict[str, Any]:
-    """Content of `export.json` without the hashes of files."""
-    shapes = program.shapes
-    return {
-        "format": FORMAT,
-        "versions": versions(),
-        "platforms": stablehlo.PLATFORMS,
-        "inputs": [each._asdict() for each in program.inputs],
-        "outputs": [each._asdict() for each in program.outputs],
-        "axes": {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension},
-        "image_size": shapes.image_size,
-        "parameters": {name: _recipe(part) for name, part in program.parameters.items()},
-        "left_out": program.left_out,
-        "onnx": onnx_note,
-    }
-
-
 def _recipe(part: Any) -> Any:
     try:
         return recipe_of(part)
     except TypeError:  # a plain function
         return {"function": getattr(part, "__qualname__", type(part).__qualname__)}
-
-
-def _read_description(folder: Path) -> dict[str, Any]:
-    """Content of `export.json`."""
-    require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
-    try:
-        description = json.loads(path.read_text(encoding="utf-8"))
-        is_current = description["format"] == FORMAT
-    except (ValueError, LookupError, TypeError):
-        is_current = False
-    if not is_current:
-        raise InputError(f"{path}: expected the format {FORMAT!r}; export it again with this version")
-    return description
 
 
 def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
@@ -230,30 +213,3 @@ def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
             row = int(wrong.any(axis=1).argmax())
             got = f"{sizes[row].tolist()} with a point {points[row].tolist()}"
             raise InputError(f"{name}: expected (width, height) of images that contain all points, got {got}")
-
-
-def _array_path(folder: Path, name: str) -> Path:
-    return folder / "check" / f"{name}.npy"
-
-
-def _digests(folder: Path) -> dict[str, str]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
-
-
-@contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that takes the place of a new or empty `folder` when the block ends without an error."""
-    folder = folder.absolute()
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another path") from error
-    try:
-        (temporary / "check").mkdir()
-        temporary.chmod(0o755)
-        yield temporary
-        os.replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -2,8 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
@@ -37,8 +36,10 @@ def convert(program: Program) -> bytes:
         "output_names": [each.name for each in program.outputs],
     }
     try:
-        with _quiet():
+        with warnings.catch_warnings(action="ignore"):
             from jax2onnx import to_onnx
+
+            logging.getLogger("onnx_ir").setLevel(logging.ERROR)
 
             return to_onnx(function, structs, model_name="mfvpr", **names).SerializeToString()
     except Exception as error:  # of any kind: NotImplementedError, RuntimeError, AssertionError
@@ -59,17 +60,3 @@ def run(model: bytes, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]
         got = " ".join(str(error).split())[:200]
         raise InputError(f"onnx=True: expected a model that ONNX Runtime runs, got {got}; leave onnx out") from error
     return dict(zip((each.name for each in session.get_outputs()), outputs, strict=True))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the notes of jax2onnx and its libraries on their own workings."""
-    logger = logging.getLogger("onnx_ir")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)

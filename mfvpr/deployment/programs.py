@@ -1,7 +1,8 @@
 """Functions of arrays that are exported: scores of matches, or of the features of a query and its candidates."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -15,8 +16,8 @@ from mfvpr.core.scorer import Scorer, on_host, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
 from mfvpr.matchers.host_matcher import PairSource
-from mfvpr.matchers.matcher import Matcher
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import whole
 
 Form = Literal["vectorized", "loop"]
 
@@ -72,10 +73,13 @@ class ExportShapes:
     dimension: int | None = None
 
     def __post_init__(self) -> None:
-        names = ("candidates", "keypoints") if self.dimension is None else ("candidates", "keypoints", "dimension")
-        for name in names:
-            if not isinstance(number := getattr(self, name), int) or number < 1:
-                raise InputError(f"{name}={number!r}: expected a whole number from 1")
+        for name, number in (
+            ("candidates", self.candidates),
+            ("keypoints", self.keypoints),
+            ("dimension", self.dimension),
+        ):
+            if not (name == "dimension" and number is None):
+                whole(1, 10**9).check(name, number)
         size = np.asarray(self.image_size, np.float64)
         if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
             raise InputError(f"image_size={self.image_size!r}: expected (width, height) above 0, px")
@@ -115,101 +119,42 @@ class Program:
 def make_program(
     method: Scorer | System, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
 ) -> Program:
-    """The program of a scorer or of a system."""
+    """The program of a scorer or of a system, with the capacities that images of this size need.
+
+    A system returns the scores of all of its scorers, first those of the scorer that decides. An `InputError` says why
+    a method cannot be exported.
+    """
+    matcher: Any = None
+    left_out: tuple[str, ...] = ()
+    scorers: dict[str, Scorer]
     if isinstance(method, System):
         if with_confidence:
             raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
-        return _system_program(method, shapes, with_shift=with_shift)
-    return _scorer_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
-
-
-def _scorer_program(scorer: Scorer, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool) -> Program:
-    """Matches of C candidates -> their scores."""
-    scorers = _scorers({"scores": scorer}, shapes)
-
-    def function(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        of_query = {name: arrays[name] for name in ("image_size0", "count0")}
-        copies = {
-            name: jnp.broadcast_to(values, (shapes.candidates, *values.shape)) for name, values in of_query.items()
-        }
-        return _over(_score_pair(scorers, with_shift), Matches(**(arrays | copies)), form)
-
-    inputs = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
-    return Program(shapes, _tensors(inputs, shapes), _outputs(scorers, shapes, with_shift), function, scorers)
-
-
-def _system_program(system: System, shapes: ExportShapes, *, with_shift: bool) -> Program:
-    """Features of a query and C candidates -> scores of all scorers; the deciding score comes first."""
-    scales, main = system.pipeline.extractor.scales, system.headline
-    if len(scales) != 1:
-        name = type(system.pipeline.extractor).__name__
-        raise InputError(f"{name}: expected local features of one scale, got {len(scales)}; export a scorer alone")
-    if isinstance(system.pipeline.matcher, PairSource):
-        name = type(system.pipeline.matcher).__name__
-        raise InputError(f"{name}: expected a matcher that JAX compiles, not on the host; export a scorer alone")
-    if main not in system.scorers:
-        raise InputError(
-            f"final={main!r}: expected a scorer, got a ranking that needs the retrieval or further queries; choose "
-            "another by dataclasses.replace(system, final=...)"
-        )
-    names = [main, *(name for name in system.scorers if name != main)]
-    outputs = {"scores" if name == main else f"scores_{name}": system.scorers[name] for name in names}
-    scorers, matcher = _scorers(outputs, shapes), system.pipeline.matcher
-    shapes = _with_dimension(shapes, scales[0].dimension)
-
-    def function(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        query, candidates = (_features(arrays, side) for side in "01")
-        return _match_and_score(query, candidates, matcher, _score_pair(scorers, with_shift), form)
-
-    left_out = tuple(name for name in system.final_scores if name not in system.scorers)
-    tensors, parts = _tensors(FEATURES, shapes), {**scorers, "matcher": matcher}
-    return Program(shapes, tensors, _outputs(scorers, shapes, with_shift), function, parts, left_out)
-
-
-def _scorers(scorers: Mapping[str, Scorer], shapes: ExportShapes) -> dict[str, Scorer]:
-    """Scorers with the capacities that images need; an InputError for scorers that JAX cannot compile."""
-    for output, scorer in scorers.items():
+        table, matcher, main = FEATURES, method.pipeline.matcher, method.headline
+        shapes = replace(shapes, dimension=_dimension(method, shapes))
+        if main not in method.scorers:
+            got = "a ranking that needs the retrieval or further queries; choose another with dataclasses.replace"
+            raise InputError(f"final={main!r}: expected a scorer, got {got}")
+        scorers = {"scores": method.scorers[main]}
+        scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
+        left_out = tuple(name for name in method.final_scores if name not in method.scorers)
+    else:
+        scorers = {"scores": method}
+        table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
+    for name, scorer in scorers.items():
         if on_host(scorer):
-            name = type(scorer).__name__
+            kind = type(scorer).__name__
             raise InputError(
-                f"{name}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
+                f"{kind}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
             )
-        if not output.isidentifier():
-            name = output.removeprefix("scores_")
-            raise InputError(f"scorers: expected names of letters, digits and _, got {name!r}; rename the scorer")
-    size = np.asarray(shapes.image_size, np.float32)
-    return with_capacity(dict(scorers), size, size, multiple=BIN_STEP)
-
-
-def _with_dimension(shapes: ExportShapes, dimension: int) -> ExportShapes:
-    """Shapes with the length of the extractor's descriptors, 0 = not known."""
-    if shapes.dimension is None and not dimension:
-        raise InputError("dimension=None: expected the length of the descriptors, which this extractor does not say")
-    if shapes.dimension not in (None, dimension) and dimension:
-        raise InputError(
-            f"dimension={shapes.dimension}: expected {dimension}, the length of the extractor's descriptors"
-        )
-    return replace(shapes, dimension=shapes.dimension or dimension)
-
-
-def _tensors(table: Mapping[str, tuple[str, str, str]], shapes: ExportShapes) -> tuple[Tensor, ...]:
-    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
-    return tuple(
-        Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
-        for name, (axes, dtype, unit) in table.items()
-    )
-
-
-def _outputs(scorers: Mapping[str, Scorer], shapes: ExportShapes, with_shift: bool) -> tuple[Tensor, ...]:
+        if not name.isidentifier():
+            got = name.removeprefix("scores_")
+            raise InputError(f"scorers: expected names of letters, digits and _, got {got!r}; rename the scorer")
     if with_shift and not isinstance(scorers["scores"], HistogramOfShifts):
         got = type(scorers["scores"]).__name__
         raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got {got}; leave with_shift out")
-    table = {name: ("C", "float32", "") for name in scorers}
-    return _tensors(table | ({"shift": ("C2", "float32", "px")} if with_shift else {}), shapes)
-
-
-def _score_pair(scorers: Mapping[str, Scorer], with_shift: bool) -> Callable[[Matches], tuple[Array, ...]]:
-    """Function of one pair: its scores, and its dominant shift."""
+    size = np.asarray(shapes.image_size, np.float32)
+    scorers = with_capacity(scorers, size, size, multiple=BIN_STEP)
 
     def score(matches: Matches) -> tuple[Array, ...]:
         scores = [jnp.asarray(scorer(matches)) for scorer in scorers.values()]
@@ -219,23 +164,52 @@ def _score_pair(scorers: Mapping[str, Scorer], with_shift: bool) -> Callable[[Ma
         shift = [main.dominant_shift(matches, refine=True)] if with_shift else []
         return tuple(values.astype(jnp.float32) for values in (*scores, *shift))
 
-    return score
+    def score_matches(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
+        copies = {
+            name: jnp.broadcast_to(arrays[name], (shapes.candidates, *arrays[name].shape))
+            for name in ("image_size0", "count0")
+        }
+        return _over(score, Matches(**(arrays | copies)), form)
+
+    def score_features(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
+        query, candidates = (
+            Features(**{field.name: arrays[f"{field.name}{side}"] for field in fields(Features)}) for side in "01"
+        )
+        match: Callable[[Features], Matches] = partial(matcher, query)
+        if form == "loop":
+            return _over(lambda candidate: score(match(candidate)), candidates, form)
+        return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time
+
+    outputs = {name: ("C", "float32", "") for name in scorers}
+    outputs |= {"shift": ("C2", "float32", "px")} if with_shift else {}
+    parts = dict(scorers) if matcher is None else {**scorers, "matcher": matcher}
+    function = score_matches if matcher is None else score_features
+    return Program(shapes, _tensors(table, shapes), _tensors(outputs, shapes), function, parts, left_out)
 
 
-def _features(arrays: Mapping[str, Array], side: str) -> Features:
-    names = ("keypoints", "descriptors", "scores", "mask", "image_size")
-    return Features(**{name: arrays[f"{name}{side}"] for name in names})
+def _dimension(system: System, shapes: ExportShapes) -> int:
+    """Length of the descriptors; an InputError for features and matchers that a program cannot take."""
+    extractor, matcher = system.pipeline.extractor, system.pipeline.matcher
+    if len(extractor.scales) != 1:
+        got = f"{len(extractor.scales)}; export a scorer alone"
+        raise InputError(f"{type(extractor).__name__}: expected local features of one scale, got {got}")
+    if isinstance(matcher, PairSource):
+        name = type(matcher).__name__
+        raise InputError(f"{name}: expected a matcher that JAX compiles, not on the host; export a scorer alone")
+    known = extractor.scales[0].dimension  # 0 = not known
+    dimension = shapes.dimension or known
+    if not dimension or known not in (0, dimension):
+        expected = known or "the length of the descriptors, which this extractor does not say"
+        raise InputError(f"dimension={shapes.dimension}: expected {expected}")
+    return dimension
 
 
-def _match_and_score(
-    query: Features, candidates: Features, matcher: Matcher, score: Callable[[Matches], tuple[Array, ...]], form: Form
-) -> tuple[Array, ...]:
-    def match(candidate: Features) -> Matches:
-        return matcher(query, candidate)
-
-    if form == "loop":
-        return _over(lambda candidate: score(match(candidate)), candidates, form)
-    return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time, as in match_candidates
+def _tensors(table: Mapping[str, tuple[str, str, str]], shapes: ExportShapes) -> tuple[Tensor, ...]:
+    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
+    return tuple(
+        Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
+        for name, (axes, dtype, unit) in table.items()
+    )
 
 
 def _over(function: Callable[[Any], tuple[Array, ...]], pairs: Any, form: Form) -> tuple[Array, ...]:

@@ -1,7 +1,7 @@
 """Programs as StableHLO, by `jax.export`: for CPU and CUDA, without calls into Python or libraries."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
@@ -15,16 +15,12 @@ from mfvpr.deployment.programs import Program, Tensor
 from mfvpr.utils.errors import InputError
 
 PLATFORMS = ("cpu", "cuda")
-_CALLBACK = re.compile(r"\b(\w+_callback|debug_print)\[")
-_CUSTOM_CALL = re.compile(r"custom_call @([\w.]+)")
 
 
 def without_unused_inputs(program: Program) -> Program:
     """The program without inputs that have no effect on its outputs."""
-    exported = _export(program.call, program.inputs)
-    used = [program.inputs[index] for index in exported.module_kept_var_idx]
-    names = {each.name for each in used}
-    unused = {each.name: (each.shape, each.dtype) for each in program.inputs if each.name not in names}
+    used = [program.inputs[index] for index in export_program(program).module_kept_var_idx]
+    unused = {each.name: (each.shape, each.dtype) for each in program.inputs if each not in used}
 
     def function(arrays: dict[str, Array], form: Any) -> tuple[Array, ...]:
         return program.function(arrays | {name: jnp.zeros(*like) for name, like in unused.items()}, form)
@@ -32,50 +28,43 @@ def without_unused_inputs(program: Program) -> Program:
     return replace(program, inputs=tuple(used), function=function)
 
 
+def export_program(program: Program) -> jax_export.Exported:
+    """Export for all platforms; an InputError names operations that the program cannot have."""
+    function = jax.jit(lambda *arrays: program.call(*arrays))
+    try:
+        exported = jax_export.export(function, platforms=PLATFORMS)(*shape_structs(program.inputs))
+        calls = {*re.findall(r"custom_call @([\w.]+)", exported.mlir_module())}
+    except InputError:
+        raise
+    except (jax.errors.JAXTypeError, NotImplementedError, ValueError) as error:
+        expected = f"code that JAX compiles for {' and '.join(PLATFORMS)}, without calls into Python"
+        mend = "use jax.numpy instead of NumPy and Python"
+        raise InputError(f"scorer: expected {expected}, got {_first_line(error)}; {mend}") from error
+    if calls:
+        got = f"{', '.join(sorted(calls))}; leave the operation out"
+        raise InputError(f"scorer: expected a program without calls into libraries, got {got}")
+    return exported
+
+
 def serialize(program: Program) -> bytes:
     """The program as bytes that `deserialize` reads."""
     _require_flatbuffers()
-    return bytes(_export(program.call, program.inputs).serialize())
+    return bytes(export_program(program).serialize())
 
 
 def deserialize(content: bytes, where: str) -> jax_export.Exported:
     """The program of `serialize`; an InputError, which begins with `where`, if JAX cannot read it."""
     _require_flatbuffers()
     try:
-        exported = jax_export.deserialize(bytearray(content))
-        operations = _CUSTOM_CALL.findall(exported.mlir_module())
+        return jax_export.deserialize(bytearray(content))
     except Exception as error:  # of flatbuffers, of MLIR, or of JAX's own checks
         got = _first_line(error)
         raise InputError(f"{where}: expected a program that JAX {jax.__version__} reads, got {got}") from error
-    _require_none(operations, where)
-    return exported
 
 
-def shape_structs(tensors: tuple[Tensor, ...]) -> list[jax.ShapeDtypeStruct]:
+def shape_structs(tensors: Sequence[Tensor]) -> list[jax.ShapeDtypeStruct]:
+    """Shapes and types of arrays, for JAX."""
     return [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in tensors]
-
-
-def _export(function: Callable[..., Any], inputs: tuple[Tensor, ...]) -> jax_export.Exported:
-    """Export for all platforms; an InputError names operations that the program cannot have."""
-    structs, program = shape_structs(inputs), jax.jit(lambda *arrays: function(*arrays))
-    try:
-        traced = program.trace(*structs)
-        _require_none(_CALLBACK.findall(str(traced.jaxpr)), "scorer")
-        text = traced.lower(lowering_platforms=PLATFORMS).as_text()
-    except (jax.errors.JAXTypeError, NotImplementedError) as error:
-        expected = f"code that JAX compiles for {' and '.join(PLATFORMS)}"
-        mend = "use jax.numpy instead of NumPy and Python"
-        raise InputError(f"scorer: expected {expected}, got {_first_line(error)}; {mend}") from error
-    _require_none(_CUSTOM_CALL.findall(text), "scorer")
-    return jax_export.export(program, platforms=PLATFORMS)(*structs)
-
-
-def _require_none(operations: list[str], where: str) -> None:
-    if operations:
-        got = ", ".join(sorted({*operations}))
-        raise InputError(
-            f"{where}: expected a program without calls into Python or libraries, got {got}; leave the operation out"
-        )
 
 
 def _require_flatbuffers() -> None:

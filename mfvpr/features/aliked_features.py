@@ -16,7 +16,7 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches
 from mfvpr.networks.aliked import STRIDE, Aliked
 from mfvpr.networks.aliked_detection import Detections
-from mfvpr.utils.fields import NOT_NEGATIVE, SIZE, check_fields, setting, whole, word_of
+from mfvpr.utils.fields import NOT_NEGATIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most
 
@@ -39,11 +39,7 @@ class AlikedFeatures(NetworkExtractor):
     vector_size = 0  # no global descriptor
     side_multiple = STRIDE  # px: other images are padded, which costs recall
     model: Aliked = field(repr=False)
-    image_size: tuple[int, int] = setting(
-        (320, 320),
-        SIZE,
-        "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many",
-    )
+    image_size: tuple[int, int] = setting((320, 320), SIZE, SHAPED_SIZE)
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
     threshold: float = setting(0.1, NOT_NEGATIVE, "of the detection score: the paper's; its authors' default is 0.2")
     max_keypoints: int | None = setting(5000, whole(1, 20_000) | None, "the highest scores are kept; null = all")

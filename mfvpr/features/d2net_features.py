@@ -13,7 +13,7 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
 from mfvpr.networks.imagenet import Preprocessing
-from mfvpr.utils.fields import FLAG, SIZE, check_fields, setting, whole, word_of
+from mfvpr.utils.fields import FLAG, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth
 _SMALLEST_MAP = 2
@@ -36,11 +36,7 @@ class D2NetFeatures(NetworkExtractor):
 
     vector_size = 0  # no global descriptor
     model: D2Net = field(repr=False)
-    image_size: tuple[int, int] = setting(
-        (336, 336),
-        SIZE,
-        "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many",
-    )
+    image_size: tuple[int, int] = setting((336, 336), SIZE, SHAPED_SIZE)
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
     preprocessing: Preprocessing = setting("caffe", word_of(Preprocessing))
     multiscale: bool = setting(False, FLAG)

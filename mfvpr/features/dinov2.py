@@ -78,8 +78,11 @@ class Dinov2Features(NetworkExtractor):
 
     def compute(
         self, model: VisionTransformer, images: jax.Array
-    ) -> tuple[Float[jax.Array, "batch width"], Float[jax.Array, "batch rows columns width"],
-               Float[jax.Array, "batch rows columns"]]:  # fmt: skip
+    ) -> tuple[
+        Float[jax.Array, "batch width"],
+        Float[jax.Array, "batch rows columns width"],
+        Float[jax.Array, "batch rows columns"],
+    ]:
         """Global descriptors, local descriptors and scores."""
         tokens, output = model.with_block(model.preprocess(images), self.block)
         scores = output.attention / jnp.max(output.attention, axis=(1, 2), keepdims=True)

@@ -62,8 +62,8 @@ def _check_descriptions(descriptions: list[Description], extractor: Extractor, n
         raise InputError(f"{name}: expected a Description of each of {num_images} images, got {len(descriptions)}")
     for description in descriptions:
         if not isinstance(description, Description):
-            raise InputError(f"{name}: expected a Description, got {type(description).__name__}; return "
-                             "Description(vector, (features,))")  # fmt: skip
+            got = type(description).__name__
+            raise InputError(f"{name}: expected a Description, got {got}; return Description(vector, (features,))")
         vector, local = description
         for features in local:
             check_features(features, f"{name}: features", unit_length=False)

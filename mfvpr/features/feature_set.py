@@ -259,8 +259,8 @@ def check_features(image: Features, name: str, *, unit_length: bool) -> None:
     """Check Features of one image that come from user code; errors begin with `name`."""
     shapes = np.shape(image.mask), np.shape(image.image_size)
     if len(shapes[0]) != 1 or shapes[1] != (2,):
-        raise InputError(f"{name}: expected a mask [N] and an image_size [2] of one image, got shapes {shapes[0]} and "
-                         f"{shapes[1]}; see Features.of")  # fmt: skip
+        expected = "a mask [N] and an image_size [2] of one image"
+        raise InputError(f"{name}: expected {expected}, got shapes {shapes[0]} and {shapes[1]}; see Features.of")
     if not unit_length:
         return
     lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)

@@ -64,8 +64,8 @@ def compile_network(model: nnx.Module, function: Callable[..., Any]) -> Callable
 def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
     """Raise an InputError unless the model is a network of the expected class."""
     if not isinstance(model, expected):
-        raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; "
-                         "`mfvpr.checkpoints.files.load_model` gives a network by its name")  # fmt: skip
+        mend = "`mfvpr.checkpoints.load_model` gives a network by its name"
+        raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; {mend}")
 
 
 def require_at_least(name: str, size: tuple[int, int], smallest: int) -> None:

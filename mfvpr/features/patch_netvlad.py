@@ -55,13 +55,13 @@ class PatchNetVladFeatures(NetworkExtractor):
         require_network("Patch-NetVLAD", self.model, VggNetVlad)
         columns, rows = self._map_size
         if max(self.patch_sizes) > min(columns, rows):
-            raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected sizes from 1 to {min(columns, rows)}, as "
-                             f"a map of {columns} x {rows} positions has room for")  # fmt: skip
+            expected = f"sizes from 1 to {min(columns, rows)}, as a map of {columns} x {rows} positions has room for"
+            raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected {expected}")
         if len(set(self.patch_sizes)) < len(self.patch_sizes):
             raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected each size once")
         if self.scale_weights is not None and len(self.scale_weights) != len(self.patch_sizes):
-            raise InputError(f"scale_weights={list(self.scale_weights)}: expected one for each of "
-                             f"patch_sizes={list(self.patch_sizes)}, or None")  # fmt: skip
+            expected = f"one for each of patch_sizes={list(self.patch_sizes)}, or None"
+            raise InputError(f"scale_weights={list(self.scale_weights)}: expected {expected}")
 
     @property
     def scales(self) -> tuple[Scale, ...]:

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 from mfvpr.core.types import Features
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SIZE, check_fields, setting, whole, word_of
+from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,7 @@ class Sift:
     """
 
     vector_size = 0  # no global descriptor
-    image_size: tuple[int, int] = setting(
-        (336, 336),
-        SIZE,
-        "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many",
-    )
+    image_size: tuple[int, int] = setting((336, 336), SIZE, SHAPED_SIZE)
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
     max_keypoints: int | None = setting(800, whole(1, 20_000) | None, "the highest scores are kept; null = all")
     contrast_threshold: float = setting(0.01, POSITIVE, "low: the strongest max_keypoints are kept, in dark images too")

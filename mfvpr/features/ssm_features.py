@@ -21,6 +21,9 @@ from mfvpr.utils.whitening import Whitening
 CHANNELS = 512
 STAGE1_SIZE = (224, 224)
 STAGE1_FITTING, STAGE2_FITTING = WindowFitting(125), WindowFitting(100, dtype="float64")  # as published
+_PREPROCESSING: Any = setting(
+    "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
+)
 _STRIDES = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}
 _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its middle
 
@@ -38,9 +41,7 @@ class SsmMaps(NetworkExtractor):
     stage: Literal[1, 2]
     image_size: tuple[int, int]
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = setting(
-        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
-    )
+    preprocessing: Preprocessing = _PREPROCESSING
     batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     @property
@@ -100,9 +101,7 @@ class SsmWindows(_WhitenedWindows):
     image_size, stage = STAGE1_SIZE, 1
     model: SsmVgg = field(repr=False)
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = setting(
-        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
-    )
+    preprocessing: Preprocessing = _PREPROCESSING
     whitening: WindowFitting | Whitening = STAGE1_FITTING
     batch_size: int = setting(8, whole(1, 256), recipe=False)
 
@@ -139,9 +138,7 @@ class SsmCells(_WhitenedWindows):
         (336, 336), SIZE, "width, height: 40 x 40 cells; [224, 224]: 26 x 26, [448, 448]: 54 x 54"
     )
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = setting(
-        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
-    )
+    preprocessing: Preprocessing = _PREPROCESSING
     stride: int = setting(1, whole(1, 8), "positions of the map, 8 px each, from cell to cell")
     whitening: WindowFitting | Whitening = STAGE2_FITTING
     batch_size: int = setting(8, whole(1, 256), recipe=False)

@@ -47,8 +47,8 @@ class VladFitting:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.max_samples < self.num_words:
-            raise InputError(f"max_samples={self.max_samples}: expected at least one for each of "
-                             f"num_words={self.num_words} words")  # fmt: skip
+            expected = f"at least one for each of num_words={self.num_words} words"
+            raise InputError(f"max_samples={self.max_samples}: expected {expected}")
 
     def fit(self, database: FeatureSet) -> "Vlad":
         """Learn the vocabulary from random images of the database, or from all if they have few descriptors."""
@@ -84,8 +84,8 @@ class Vlad:
         per_image = [features.descriptors[features.mask] for features in images]
         descriptors = np.concatenate(per_image)
         if descriptors.shape[1] != self.centers.shape[1]:
-            raise InputError(f"VLAD: expected descriptors of {self.centers.shape[1]} dimensions, as those that it was "
-                             f"fitted on, got {descriptors.shape[1]}")  # fmt: skip
+            expected = f"{self.centers.shape[1]} dimensions, as those that it was fitted on"
+            raise InputError(f"VLAD: expected descriptors of {expected}, got {descriptors.shape[1]}")
         # No matrix product: its threads stay awake for a while and take the cores from the matching that comes next.
         products = np.vecdot(descriptors[:, None], self.centers)
         word = np.argmin((self.centers**2).sum(1) - 2 * products, axis=1)  # the first on a tie

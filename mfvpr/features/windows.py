@@ -33,8 +33,8 @@ class Windows:
 
     def __post_init__(self) -> None:
         if min(self.shape[:2]) < self.size:
-            raise InputError(f"windows of {self.size} x {self.size}: expected a map of as many positions, got "
-                             f"{self.shape[0]} x {self.shape[1]}; take larger images")  # fmt: skip
+            got = f"{self.shape[0]} x {self.shape[1]}; take larger images"
+            raise InputError(f"windows of {self.size} x {self.size}: expected a map of as many positions, got {got}")
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -151,11 +151,11 @@ def learned_whitening(extractor: WindowExtractor) -> Whitening:
     if not isinstance(whitening, Whitening):
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fit_to_database(...) of it")
     if len(whitening.mean) != expected:
-        raise InputError(f"{name}: expected a whitening of {expected} numbers, got one of {len(whitening.mean)}; learn "
-                         "it from windows of these maps")  # fmt: skip
+        got = f"{len(whitening.mean)}; learn it from windows of these maps"
+        raise InputError(f"{name}: expected a whitening of {expected} numbers, got one of {got}")
     if whitening.origin and whitening.origin != origin(extractor):
-        raise InputError(f"{name}: expected a whitening of its own network, images and windows, got one that was "
-                         "learned with others; replace it by a WindowFitting")  # fmt: skip
+        got = "one that was learned with others; replace it by a WindowFitting"
+        raise InputError(f"{name}: expected a whitening of its own network, images and windows, got {got}")
     return whitening
 
 
@@ -184,9 +184,13 @@ def whiten_windows(
 ) -> Float[Array, "images windows dimensions"]:
     """Descriptors of all windows of maps."""
     descriptors = jax.lax.conv_general_dilated(
-        maps, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        maps,
+        kernel,
+        window_strides=(stride, stride),
+        padding="VALID",
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
         precision=jax.lax.Precision.HIGHEST,
-    )  # fmt: skip
+    )
     return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 

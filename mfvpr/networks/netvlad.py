@@ -80,9 +80,14 @@ class VggNetVlad(nnx.Module):
     """
 
     def __init__(
-        self, clusters: int = 64, outputs: int | None = 4096, *, original: bool = False, precision: str = "highest",
+        self,
+        clusters: int = 64,
+        outputs: int | None = 4096,
+        *,
+        original: bool = False,
+        precision: str = "highest",
         rngs: nnx.Rngs,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.vgg = Vgg16(precision=precision, rngs=rngs)
         self.pool = NetVlad(clusters, "channels" if original else "clusters", precision=precision, rngs=rngs)
         self.dimension = outputs or clusters * CHANNELS

@@ -81,9 +81,15 @@ class SelaVpr(nnx.Module):
     """
 
     def __init__(
-        self, width: int = 1024, depth: int = 24, heads: int = 16, *, registers: int = 0, precision: str = "highest",
+        self,
+        width: int = 1024,
+        depth: int = 24,
+        heads: int = 16,
+        *,
+        registers: int = 0,
+        precision: str = "highest",
         rngs: nnx.Rngs,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.backbone = VisionTransformer(
             width, depth, heads, registers=registers, block=AdaptedBlock, precision=precision, rngs=rngs
         )

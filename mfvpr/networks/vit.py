@@ -116,9 +116,16 @@ class VisionTransformer(nnx.Module):
     """
 
     def __init__(
-        self, width: int, depth: int, heads: int, *, registers: int = 0, block: type[Block] = Block,
-        precision: str = "highest", rngs: nnx.Rngs,
-    ) -> None:  # fmt: skip
+        self,
+        width: int,
+        depth: int,
+        heads: int,
+        *,
+        registers: int = 0,
+        block: type[Block] = Block,
+        precision: str = "highest",
+        rngs: nnx.Rngs,
+    ) -> None:
         self.patches = Patches(width, precision=precision, rngs=rngs)
         self.first = nnx.Param(jnp.zeros(width, jnp.float32))  # the class token
         self.positions = nnx.Param(jnp.zeros((1 + _TRAINED**2, width), jnp.float32))

@@ -18,9 +18,8 @@ from typing import Any
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.report.tables import Table, format_values, read_csv
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import lock_folder, write_text
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.locks import lock_folder
 from mfvpr.utils.versions import versions
 
 _UNFINISHED = ".unfinished"

@@ -81,9 +81,7 @@ def _learn(extractor: WindowExtractor, fitting: WindowFitting, database: ImageFo
     def maps() -> Iterator[dict[int, np.ndarray]]:
         track = cache.runtime.progress(f"{type(extractor).__name__} whitening")
         for batch in describe_folder(database, extractor.maps, rows, bad, skip_bad=cache.skip_bad, track=track):
-            yield {
-                row: description.vector.reshape(extractor.windows.shape)
-                for row, description in batch.items() if description.vector is not None
-            }  # fmt: skip
+            vectors = {row: description.vector for row, description in batch.items()}
+            yield {row: each.reshape(extractor.windows.shape) for row, each in vectors.items() if each is not None}
 
     return replace(fitting.fit(maps(), extractor.windows, rows), origin=origin(extractor))

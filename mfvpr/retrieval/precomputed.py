@@ -180,8 +180,8 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     files = {Path(root): file for root, file in files.items()}
     if folder.root not in files:
         known = ", ".join(map(str, files)) or "none"
-        raise InputError(f"{folder.root}: expected a folder that a file was given of, one of: {known}; give one of "
-                         "this folder as well")  # fmt: skip
+        expected = f"a folder that a file was given of, one of: {known}"
+        raise InputError(f"{folder.root}: expected {expected}; give one of this folder as well")
     return files[folder.root]
 
 
@@ -193,8 +193,8 @@ def _require_own_folder(
     for name, entry in zip(folder.names, entries, strict=True):
         start = "/" + entry.name.removesuffix(name).lstrip("/") if entry is not None else "/"
         if start != "/" and other_parts.endswith(start) and not own_parts.endswith(start):
-            raise InputError(f"{path}: expected names of images in {folder.root}, got names in {other.root}; exchange "
-                             "dataset.database and dataset.queries, or the columns of the file")  # fmt: skip
+            got = f"names in {other.root}; exchange dataset.database and dataset.queries, or the columns of the file"
+            raise InputError(f"{path}: expected names of images in {folder.root}, got {got}")
 
 
 def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:

@@ -49,14 +49,14 @@ class ExactSearch:
     ) -> Shortlist:
         """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
         if queries.shape[1] != database.shape[1]:
-            raise InputError(f"global descriptors: expected as many numbers on both sides, got {queries.shape[1]} for "
-                             f"queries and {database.shape[1]} for the database")  # fmt: skip
+            got = f"{queries.shape[1]} for queries and {database.shape[1]} for the database"
+            raise InputError(f"global descriptors: expected as many numbers on both sides, got {got}")
         if not len(queries) or not len(database):
-            raise InputError(f"global descriptors: expected at least one on both sides, got {len(queries)} of queries "
-                             f"and {len(database)} of the database")  # fmt: skip
+            got = f"{len(queries)} of queries and {len(database)} of the database"
+            raise InputError(f"global descriptors: expected at least one on both sides, got {got}")
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
-            raise InputError(f"excluded: expected rows for {len(queries)} queries and {len(database)} database images, "
-                             f"got {len(excluded)} and {excluded.num_database}")  # fmt: skip
+            expected = f"rows for {len(queries)} queries and {len(database)} database images"
+            raise InputError(f"excluded: expected {expected}, got {len(excluded)} and {excluded.num_database}")
         num_rows = min(len(database), _rows_at_once(database.shape[1]))
         chunk_size = self._chunk_size(len(queries), num_rows)
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
@@ -206,8 +206,8 @@ def retrieve(
         raise InputError(f"mask: expected shape {shapes[0]} or {shapes[1]}, got {mask.shape}")
     queries, database = at_least_single(query_descriptors), at_least_single(database_descriptors)
     if queries.ndim != 2 or database.ndim != 2 or queries.shape[1] != database.shape[1]:
-        raise InputError(f"descriptors: expected [Q, D] and [M, D] of the database, got {queries.shape} and "
-                         f"{database.shape}")  # fmt: skip
+        got = f"{queries.shape} and {database.shape}"
+        raise InputError(f"descriptors: expected [Q, D] and [M, D] of the database, got {got}")
     similarity = jnp.matmul(_at_least_two(queries), _at_least_two(database).T, precision=jax.lax.Precision.HIGHEST)
     similarity = similarity[: len(queries), : len(database)]
     usable = jnp.isfinite(similarity) if mask is None else jnp.isfinite(similarity) & jnp.atleast_2d(mask.astype(bool))

@@ -24,8 +24,7 @@ from mfvpr.storage.cache_files import disk_errors_as_input_errors, full_disk_err
 from mfvpr.storage.packing import pack_features, unpack_features
 from mfvpr.utils.arrays import pack_arrays, unpack_arrays
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle
-from mfvpr.utils.locks import lock_folder
+from mfvpr.utils.files import clip_middle, lock_folder
 
 FILE = "map.sqlite"  # in the folder of the map
 _FORMAT = 3

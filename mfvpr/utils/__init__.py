@@ -1,7 +1,7 @@
 """Files, hashes, errors, progress and arithmetic that several packages need.
 
 Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), arrays (their
-files), progress, runtime, cluster, compiled_programs (on disk), threads, locks, ragged (padding), whitening, versions.
+files), progress, runtime, cluster, compiled_programs (on disk), threads, ragged (padding), whitening, versions.
 """
 
 import lazy_loader

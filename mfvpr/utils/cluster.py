@@ -21,11 +21,11 @@ from mfvpr.utils.versions import versions
 BLOCK = 32  # rows of a task at most, which a killed worker loses
 _BLOCKS = 16  # tasks at least, if there are so many rows
 _LOGGING = {"distributed": "warning", "distributed.client": "critical", "distributed.scheduler": "critical"}
-_SETTINGS = {"distributed": {  # defaults of Dask
+_SETTINGS = {  # defaults of Dask
     "scheduler": {"no-workers-timeout": "30 minutes"},  # then a call ends with an error
     "nanny": {"pre-spawn-environ": {"DASK_LOGGING__DISTRIBUTED": "critical"}},  # the client raises errors of blocks
     "admin": {"large-graph-warning-threshold": "8 GB"},  # extractors include the weights of their networks
-}}  # fmt: skip
+}
 
 Result = TypeVar("Result")
 
@@ -100,14 +100,17 @@ class Cluster:
         """Start Slurm jobs of one worker each until the block ends; `options` of `sbatch`, such as `--gpus=1`."""
         with cls.local(0, host="tls://") as cluster:
             cluster._dashboard = re.sub(r"//.*:", "//127.0.0.1:", cluster._dashboard)
-            worker = [sys.executable, "-m", "distributed.cli.dask_worker", cluster._client.scheduler.address,
-                      "--nthreads=1", "--memory-limit=0", "--no-dashboard", "--dashboard-address=127.0.0.1:0",
-                      "--death-timeout=60"]  # fmt: skip
+            worker = [sys.executable, "-m", "distributed.cli.dask_worker", cluster._client.scheduler.address]
+            worker += ["--nthreads=1", "--memory-limit=0", "--death-timeout=60"]
+            worker += ["--no-dashboard", "--dashboard-address=127.0.0.1:0"]
             script = f"export PJRT_NPROC=${{PJRT_NPROC:-${{SLURM_CPUS_PER_TASK:-1}}}}; exec {shlex.join(worker)}"
             array = ["--parsable", "--requeue", "--job-name=mfvpr", f"--array=1-{workers}"]
             security, name = cluster._client.security, "DASK_DISTRIBUTED__COMM__TLS__"
-            keys = {f"{name}CA_FILE": security.tls_ca_file, f"{name}WORKER__KEY": security.tls_worker_key,
-                    f"{name}WORKER__CERT": security.tls_worker_cert}  # fmt: skip
+            keys = {
+                f"{name}CA_FILE": security.tls_ca_file,
+                f"{name}WORKER__KEY": security.tls_worker_key,
+                f"{name}WORKER__CERT": security.tls_worker_cert,
+            }
             command = ["sbatch", *array, *shlex.split(options), f"--wrap={script}"]
             job = _run_slurm(*command, **keys).partition(";")[0].strip()
             try:
@@ -163,10 +166,9 @@ def _distributed() -> Any:
         import_module("cryptography")  # of temporary keys
         import distributed
     except ImportError:
-        raise InputError(
-            "cluster: Dask Distributed or cryptography is not installed; pip install 'mfvpr[cluster]'"
-        ) from None
-    config.update_defaults(_SETTINGS)
+        message = "cluster: Dask Distributed or cryptography is not installed; pip install 'mfvpr[cluster]'"
+        raise InputError(message) from None
+    config.update_defaults({"distributed": _SETTINGS})
     return distributed
 
 

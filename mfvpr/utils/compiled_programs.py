@@ -45,8 +45,9 @@ def keep_compiled_programs(warn: Callable[[str], object] = warnings.warn) -> Non
     except OSError:
         return
     if foreign:
-        warn(f"{foreign[0]}: expected a folder that is yours and that nobody else can write to, as it holds machine "
-             "code; compiled programs are not kept; run `chmod go-w` on it, or set MFVPR_CACHE")  # fmt: skip
+        expected = "a folder that is yours and that nobody else can write to, as it holds machine code"
+        mend = "compiled programs are not kept; run `chmod go-w` on it, or set MFVPR_CACHE"
+        warn(f"{foreign[0]}: expected {expected}; {mend}")
         os.environ[VARIABLE] = "false"  # also for later calls and child processes
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))

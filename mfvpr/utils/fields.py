@@ -47,8 +47,10 @@ class Rule:
 
 def one_of(*choices: Any) -> Rule:
     """Some words, numbers, flags or None."""
-    words = ("null" if choice is None else str(choice).lower() if isinstance(choice, bool) else str(choice)
-             for choice in choices)  # fmt: skip
+    words = (
+        "null" if choice is None else str(choice).lower() if isinstance(choice, bool) else str(choice)
+        for choice in choices
+    )
     return Rule(
         lambda value: any(type(value) is type(choice) and value == choice for choice in choices),
         "one of " + ", ".join(words),

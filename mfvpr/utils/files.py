@@ -1,7 +1,7 @@
-"""Atomic writes, and checks of paths and names of files."""
+"""Atomic writes, locks of folders, and checks of paths and names of files."""
 
+import fcntl
 import os
-import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,7 +10,6 @@ from pathlib import Path
 from mfvpr.utils.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
-_TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` makes
 
 
 @contextmanager
@@ -35,6 +34,23 @@ def replacing(path: Path, *, once: bool = False) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def lock_folder(folder: Path, error: Exception | None) -> Iterator[None]:
+    """Hold the lock of an existing folder; if it is held elsewhere, raise the error, or wait for it without one.
+
+    `flock` needs no file, ends with its process, and holds between threads as well.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX if error is None else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as held:
+            raise error or held from None
+        yield
+    finally:
+        os.close(handle)
+
+
 def require_file(path: Path, expected: str = "a file") -> None:
     """Raise `InputError` if a path is no regular file: a pipe would block its reader forever."""
     if not path.is_file():
@@ -50,13 +66,6 @@ def require_replaceable(path: Path, mark: bytes | None = None) -> None:
                 if mark in file.read(4096):
                     return
         raise InputError(f"{path}: expected a new file, got one that exists; remove it, or name another")
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed processes below a folder; no process may be writing there."""
-    for path in folder.rglob(".*"):
-        if _TEMPORARY.fullmatch(path.name) and path.is_file():
-            path.unlink()
 
 
 def used_bytes(folder: Path) -> int:
@@ -93,13 +102,9 @@ def canonical_name(path: Path | str) -> str:
 
 def path_inside(root: Path, name: str) -> Path:
     """The path of a name from elsewhere below a folder; an InputError if the name leads out, also by a link."""
-    try:
-        path = (root / name).resolve()
-        is_circle = path.is_symlink()  # Python 3.13 returns it, earlier versions raise
-        if ".." not in Path(name).parts and path.is_relative_to(root.resolve()) and not is_circle:
+    with suppress(OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
+        if (path := (root / name).resolve()).is_relative_to(root.resolve()):
             return path
-    except (OSError, RuntimeError, ValueError):  # links in a circle, a character that no name has
-        pass
     raise InputError(
         f"{clip_middle(name, 200)!r}: expected the name of a file below {root}, got one that leads elsewhere"
     )

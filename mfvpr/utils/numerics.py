@@ -56,8 +56,8 @@ def as_array(values: Any) -> Any:
     An `InputError` for a masked NumPy array, whose mask would be lost.
     """
     if np.ma.is_masked(values):
-        raise InputError("arrays: expected arrays without a mask of NumPy, got masked entries; leave them out, for "
-                         "instance by array.compressed()")  # fmt: skip
+        mend = "leave them out, for instance by array.compressed()"
+        raise InputError(f"arrays: expected arrays without a mask of NumPy, got masked entries; {mend}")
     if isinstance(values, list | tuple):
         return np.asarray(values)
     if not _is_foreign(values):

@@ -37,8 +37,8 @@ def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: in
     """
     count, size = sample.shape
     if not 1 <= dimension < count or dimension > size:
-        raise InputError(f"whitening: expected more than {dimension} descriptors of as many numbers, got {count} of "
-                         f"{size}; keep fewer components")  # fmt: skip
+        expected = f"more than {dimension} descriptors of as many numbers"
+        raise InputError(f"whitening: expected {expected}, got {count} of {size}; keep fewer components")
     mean = sample.mean(axis=0, dtype=np.float64)
     by_rows = size <= count
     products = np.zeros((min(count, size),) * 2)

@@ -28,23 +28,44 @@ TABLE = Table(
     ignored=(r".*\.num_batches_tracked",),
 )
 SOURCE_SHAPES = {
-    "net.conv.weight": (4, 3, 3, 3), "net.conv.bias": (4,),
-    "net.bn.weight": (4,), "net.bn.bias": (4,), "net.bn.running_mean": (4,), "net.bn.running_var": (4,),
+    "net.conv.weight": (4, 3, 3, 3),
+    "net.conv.bias": (4,),
+    "net.bn.weight": (4,),
+    "net.bn.bias": (4,),
+    "net.bn.running_mean": (4,),
+    "net.bn.running_var": (4,),
     "net.bn.num_batches_tracked": (),
-    "net.mix.0.weight": (5, 4), "net.mix.0.bias": (5,), "net.mix.1.weight": (2, 5), "net.mix.1.bias": (2,),
-}  # fmt: skip
+    "net.mix.0.weight": (5, 4),
+    "net.mix.0.bias": (5,),
+    "net.mix.1.weight": (2, 5),
+    "net.mix.1.bias": (2,),
+}
 SHAPES = {
-    "conv.kernel": (3, 3, 3, 4), "conv.bias": (4,), "bn.scale": (4,), "bn.bias": (4,), "bn.mean": (4,), "bn.var": (4,),
-    "mix.0.kernel": (4, 5), "mix.0.bias": (5,), "mix.1.kernel": (5, 2), "mix.1.bias": (2,),
-}  # fmt: skip
+    "conv.kernel": (3, 3, 3, 4),
+    "conv.bias": (4,),
+    "bn.scale": (4,),
+    "bn.bias": (4,),
+    "bn.mean": (4,),
+    "bn.var": (4,),
+    "mix.0.kernel": (4, 5),
+    "mix.0.bias": (5,),
+    "mix.1.kernel": (5, 2),
+    "mix.1.bias": (2,),
+}
 PARAMETERS = 157
 
 
 def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
     values = {
-        "name": name, "network": "tiny", "file": f"{name}.pth", "source": f"https://example.org/{name}.pth",
-        "size": None, "sha256": None, "code_license": "MIT", "weights_license": "none stated",
-    }  # fmt: skip
+        "name": name,
+        "network": "tiny",
+        "file": f"{name}.pth",
+        "source": f"https://example.org/{name}.pth",
+        "size": None,
+        "sha256": None,
+        "code_license": "MIT",
+        "weights_license": "none stated",
+    }
     return registry.Entry(**(values | changes))
 
 

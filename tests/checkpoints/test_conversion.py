@@ -19,11 +19,15 @@ pytestmark = pytest.mark.thorough
 
 PUBLIC = {
     "d2_tf": d2net_shapes(),
-    "mixvpr_4096": mixvpr_shapes(1024, 4), "mixvpr_512": mixvpr_shapes(256, 2), "mixvpr_128": mixvpr_shapes(64, 2),
+    "mixvpr_4096": mixvpr_shapes(1024, 4),
+    "mixvpr_512": mixvpr_shapes(256, 2),
+    "mixvpr_128": mixvpr_shapes(64, 2),
     "vgg16_places365": places365_shapes(),
     "aliked-t16": checkpoints.aliked_shapes(),
-    **{f"aliked-n{kind}": checkpoints.aliked_shapes((16, 32, 64, 128), 128, positions)
-       for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))},
+    **{
+        f"aliked-n{kind}": checkpoints.aliked_shapes((16, 32, 64, 128), 128, positions)
+        for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))
+    },
     "aliked_lightglue": checkpoints.lightglue_shapes(),
     **{f"patchnetvlad_mapillary_{outputs}": checkpoints.netvlad_shapes(16, outputs) for outputs in (4096, 512, 128)},
     **{f"patchnetvlad_pitts_{outputs}": checkpoints.netvlad_shapes(64, outputs) for outputs in (4096, 512, 128)},
@@ -32,11 +36,13 @@ PUBLIC = {
     **{f"netvlad_{training}": checkpoints.matlab_shapes() for training in ("pitts30k", "tokyotm")},
     "cosplace_vgg16_512": checkpoints.gem_shapes("vgg16", 512),
     **{f"cosplace_resnet50_{outputs}": checkpoints.gem_shapes("resnet50", outputs) for outputs in (512, 2048)},
-    **{f"dinov2_vit{size}14": checkpoints.dinov2_shapes(width, depth)
-       for size, width, depth in (("s", 384, 12), ("b", 768, 12), ("l", 1024, 24))},
+    **{
+        f"dinov2_vit{size}14": checkpoints.dinov2_shapes(width, depth)
+        for size, width, depth in (("s", 384, 12), ("b", 768, 12), ("l", 1024, 24))
+    },
     **{f"selavpr_{training}": checkpoints.selavpr_shapes() for training in ("pitts30k", "msls")},
     "selavpr_msls_registers": checkpoints.selavpr_shapes(registers=4),
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -149,8 +155,10 @@ def test_places365_in_files_of_torch(change, full):
 
 def test_biases_of_places365_may_have_more_axes():
     shapes = {key: (1, *shape, 1, 1) if "bias" in key else shape for key, shape in places365_shapes(full=False).items()}
-    source = {key: np.arange(np.prod(shape), dtype=np.float32).reshape(shape) if "bias" in key else value
-              for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)}  # fmt: skip
+    source = {
+        key: np.arange(np.prod(shape), dtype=np.float32).reshape(shape) if "bias" in key else value
+        for (key, value), shape in zip(vacant(shapes).items(), shapes.values(), strict=True)
+    }
     np.testing.assert_array_equal(places365(source)["vgg.conv1_1.bias"], np.arange(64))
     source["conv1_1.bias"] = np.zeros((8, 8))
     with pytest.raises(InputError, match=r"conv1_1.bias .*: expected \(64,\), got \(8, 8\)"):
@@ -162,15 +170,6 @@ def test_vgg16_of_other_classes_is_not_that_of_places365(change):
     source = change(vacant(places365_shapes("weight") | {"fc8a_1.weight": (1000, 4096), "fc8a_1.bias": (1000,)}))
     with pytest.raises(InputError, match=r"weight .*: expected \(365, 4096\), got \(1000, 4096\)"):
         places365(source)
-
-
-def test_unknown_layers_of_places365_are_refused():
-    source = vacant(places365_shapes() | {"conv6_1.weights": (2, 2), "conv1_1.scale": (64,)})
-    with pytest.raises(InputError, match=r"conv6_1.weights unknown"):
-        places365(source)
-    both = vacant(places365_shapes()) | vacant(places365_shapes("weight"))
-    with pytest.raises(InputError, match=r"in 12 places: conv1_1\.weight twice"):
-        places365(both)
 
 
 @needs(ALIKED, LIGHTGLUE)
@@ -195,11 +194,3 @@ def test_registry():
     assert all(len(digest) == 64 and int(digest, 16) for digest in hashes)
     with pytest.raises(InputError, match=r"aliked-n17: .*the nearest is aliked-n16"):
         entry_of("aliked-n17")
-
-
-@pytest.mark.parametrize("name", [name for name in REGISTRY if name.startswith("patchnetvlad") and REGISTRY[name].size])
-def test_patchnetvlad_sizes_agree_with_its_parameters(name):
-    """The projection is stored in float64, the rest in float32; a container adds a few kilobytes."""
-    entry = entry_of(name)
-    projection = (512 * (16 if "mapillary" in name else 64) + 1) * int(name.rpartition("_")[2])
-    assert 0 < entry.size - 4 * (blueprint(entry).parameters + projection) < 30_000

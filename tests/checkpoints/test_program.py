@@ -4,11 +4,7 @@ import gc
 import hashlib
 import json
 import os
-import signal
-import subprocess
-import sys
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -19,7 +15,7 @@ from mfvpr.cli.console import one_line
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
-from tests.programs import ROOT, typed
+from tests.programs import typed
 from tests.random_checkpoints import random_checkpoint, write_zip
 
 CONTENT = bytes(range(256)) * 4096
@@ -52,22 +48,6 @@ def refused(program):
 @pytest.fixture
 def tiny_checkpoint(tmp_path):
     return write_zip(tmp_path / "tiny.pth", {"model": random_checkpoint(SOURCE_SHAPES)})
-
-
-def test_help_and_wrong_usage_do_not_wait_for_jax():
-    code = """
-import sys
-from mfvpr.cli.programs import run
-try:
-    run("weights")
-except SystemExit:
-    print(sorted({"jax", "flax", "numpy", "torch", "hydra"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.stderr == ""
-    *text, loaded = done.stdout.splitlines()
-    assert loaded == "[]"
-    assert all(any(command in line for line in text) for command in ("list", "add", "verify", "download"))
 
 
 @pytest.mark.parametrize(
@@ -123,17 +103,19 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
         source = f"from tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
         assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
     tensors = random_checkpoint(SOURCE_SHAPES)
-    tensors["net.bn.bias"] = tensors["net.bn.bias"].astype(float)
     code, stdout, _ = program("add", write_zip(tiny_checkpoint, tensors))
     assert code == 0
-    assert f": tiny, {PARAMETERS} parameters, 1 of its tensors rounded from float64 to float32, from a file" in stdout
+    assert f": tiny, {PARAMETERS} parameters, from a file" in stdout
     monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(sha256=file_sha256(tiny_checkpoint)))
     assert program("verify") == (0, f"tiny: good, {PARAMETERS} parameters as converted\n", "")
 
 
 def test_missing_weights_are_answered_with_a_command(program, folder, capsys):
-    for name, command in (("aliked-n16", "download aliked-n16"), ("d2_tf", "add d2_tf.pth"),
-                          ("mixvpr_512", "add 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'")):  # fmt: skip
+    for name, command in (
+        ("aliked-n16", "download aliked-n16"),
+        ("d2_tf", "add d2_tf.pth"),
+        ("mixvpr_512", "add 'resnet50_MixVPR_512_channels(256)_rows(2).ckpt'"),
+    ):
         with pytest.raises(SystemExit) as caught, one_line():
             load_model(name)
         assert caught.value.code == 2
@@ -173,8 +155,12 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
         assert program("verify", *arguments)[1] == f"own/mine: good, {PARAMETERS} parameters as converted, {source}\n"
     published, listed = (line.split() for line in program("list")[1].splitlines()[-2:])
     assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (
-        "tiny", "no", "own/mine", ["yours,", "as", "tiny"], "yes"
-    )  # fmt: skip
+        "tiny",
+        "no",
+        "own/mine",
+        ["yours,", "as", "tiny"],
+        "yes",
+    )
     assert assembly._network("features", ("tiny",), "own/mine").conv is not None
     with pytest.raises(InputError, match=r"features.weights=tiny\b.*|tiny: not installed"):
         assembly._network("features", ("tiny",), "tiny")
@@ -300,26 +286,3 @@ def test_download_that_fails_leaves_nothing(program, folder, site, monkeypatch, 
     assert "Traceback" not in stderr
     assert list(folder.iterdir()) == []
     gc.collect()  # which warns of a connection that is still open
-
-
-def test_ctrl_c_while_downloading_leaves_nothing(folder, site):
-    code = f"""
-import dataclasses
-from mfvpr.cli.programs import run
-from mfvpr.checkpoints.registry import REGISTRY
-entry = REGISTRY["aliked-t16"]
-REGISTRY["aliked-t16"] = dataclasses.replace(entry, source={site("slow")!r}, size={len(CONTENT)})
-run("weights")
-"""
-    process = subprocess.Popen([sys.executable, "-c", code, "download", "aliked-t16"], cwd=ROOT, text=True,
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
-    deadline = time.monotonic() + 60
-    while not (folder.is_dir() and any(path.stat().st_size for path in folder.iterdir())):  # until it is amid the file
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=20)
-    assert process.returncode == 130, stderr
-    assert "interrupted" in stderr
-    assert list(folder.iterdir()) == []

@@ -52,8 +52,10 @@ def run_example(program, *arguments):
 
 def test_the_outputs_in_the_folder_are_those_of_this_library(exported, tmp_path):
     program = export_scorer(tmp_path / "exported", onnx=False)
-    inputs, outputs = ({each.name: np.load(exported / "check" / f"{each.name}.npy") for each in tensors}
-                       for tensors in (program.inputs, program.outputs))  # fmt: skip
+    inputs, outputs = (
+        {each.name: np.load(exported / "check" / f"{each.name}.npy") for each in tensors}
+        for tensors in (program.inputs, program.outputs)
+    )
     assert [*outputs] == ["scores", "shift"]
     assert (outputs["scores"][:2] > 0).all()
     values = program.run(*inputs.values())  # the call would refuse points outside of their image

@@ -1,22 +1,18 @@
-"""Folders of exported programs: another process gives the same bits, and damage is noticed."""
+"""Folders of exported programs: another process gives the same bits, and wrong inputs are refused."""
 
-import hashlib
 import json
 import shutil
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import export as jax_export
 
 import mfvpr
 from mfvpr import ExportShapes, InputError
 from mfvpr.deployment import folders
-from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.retrieval import Retrieval
+from tests.deployment.test_programs import make_system
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.thorough
@@ -64,9 +60,7 @@ def test_the_description_has_inputs_units_capacities_parameters_versions_and_pla
     assert description["parameters"]["scores"]["max_bins"] == 48  # 2 * 320 / 15, a multiple of 8
     assert description["image_size"] == [320, 240]
     assert {"mfvpr", "jax", "jaxlib"} <= description["versions"].keys()
-    files = {path.relative_to(written).as_posix() for path in written.rglob("*") if path.is_file()}
-    assert {*description["files"]} == files - {"export.json"}
-    assert len(files) == 1 + 1 + 7 + 2
+    assert len([path for path in written.rglob("*") if path.is_file()]) == 1 + 1 + 7 + 2
 
 
 def test_a_program_takes_arrays_of_jax_and_other_libraries(written):
@@ -78,12 +72,15 @@ def test_a_program_takes_arrays_of_jax_and_other_libraries(written):
         np.testing.assert_array_equal(values, expected[name])
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got .* \[3, 21, 2\]"),
-    ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
-    ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
-    ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got .* \[3, 21, 2\]"),
+        ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
+        ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
+        ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
+    ],
+)
 def test_wrong_inputs_are_refused(written, change, message):
     program = mfvpr.load_exported(written)
     with pytest.raises(InputError, match=message):
@@ -92,10 +89,16 @@ def test_wrong_inputs_are_refused(written, change, message):
         program()
 
 
-@pytest.mark.parametrize(("name", "size"), [
-    ("image_size0", [0, 0]), ("image_size0", [-320, 240]), ("image_size0", [np.nan, 240]), ("image_size0", [240, 320]),
-    ("image_size1", [[320, 240], [240, 320], [320, 240]]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("image_size0", [0, 0]),
+        ("image_size0", [-320, 240]),
+        ("image_size0", [np.nan, 240]),
+        ("image_size0", [240, 320]),
+        ("image_size1", [[320, 240], [240, 320], [320, 240]]),
+    ],
+)
 def test_image_sizes_that_cannot_be_right_are_refused(written, name, size):
     program = mfvpr.load_exported(written)
     with pytest.raises(InputError, match=rf"^{name}: expected \(width, height\)"):
@@ -111,38 +114,23 @@ def test_sizes_of_padding_may_be_anything(written):
 
 
 def test_a_system_checks_the_keypoints_of_both_images(tmp_path):
-    pipeline = mfvpr.Pipeline(Sift(), Retrieval(Aggregated(Sift(), VladFitting())))
-    system = mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts()})
-    program = mfvpr.export(tmp_path / "system", system, SHAPES, onnx=False)
+    program = mfvpr.export(tmp_path / "system", make_system({"count": mfvpr.HistogramOfShifts()}), SHAPES, onnx=False)
     inputs = inputs_of(program)
     for name in ("image_size0", "image_size1"):
         with pytest.raises(InputError, match=name):
             program(**inputs | {name: inputs[name][..., ::-1].copy()})
 
 
-def edit(folder, change):
-    path = folder / "export.json"
-    description = json.loads(path.read_text())
-    change(description)
-    path.write_text(json.dumps(description))
-
-
-def flip(path):
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
 DAMAGE = {
     "no folder": (shutil.rmtree, r"export\.json: expected a folder of mfvpr\.export with this file, got nothing"),
-    "no description": (lambda folder: (folder / "export.json").unlink(), "export.json: expected a folder of"),
     "no program": (lambda folder: (folder / "program.stablehlo").unlink(), "stablehlo: expected a file, got nothing"),
-    "a bit": (lambda folder: flip(folder / "program.stablehlo"), "expected the file as it was exported, got a changed"),
-    "a bit of an array": (lambda folder: flip(folder / "check" / "mask.npy"), "mask.npy: expected the file as it was"),
+    "another program": (
+        lambda folder: (folder / "program.stablehlo").write_bytes(b"no program"),
+        r"program\.stablehlo: expected a program that JAX .* reads, got",
+    ),
     "cut": (lambda folder: (folder / "export.json").write_text('{"format"'), "export.json: expected the format"),
-    "a list": (lambda folder: (folder / "export.json").write_text("[]"), "export.json: expected the format"),
     "another version": (
-        lambda folder: edit(folder, lambda d: d.update(format="mfvpr exported program 2")),
+        lambda folder: (folder / "export.json").write_text('{"format": "mfvpr exported program 2"}'),
         "expected the format 'mfvpr exported program 1'",
     ),
 }
@@ -157,40 +145,14 @@ def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
     assert "\n" not in str(error.value)
 
 
-def exchange_program(folder, content):
-    (folder / "program.stablehlo").write_bytes(content)
-    digest = hashlib.sha256(content).hexdigest()
-    edit(folder, lambda description: description["files"].update({"program.stablehlo": digest}))
-
-
-def test_a_program_that_calls_a_library_is_not_loaded(folder):
-    exported = jax_export.export(jax.jit(jnp.linalg.cholesky))(jax.ShapeDtypeStruct((3, 3), np.float32))
-    exchange_program(folder, bytes(exported.serialize()))
-    with pytest.raises(
-        InputError, match=r"program\.stablehlo: expected a program without calls .* got lapack_spotrf_ffi"
-    ):
-        mfvpr.load_exported(folder)
-
-
-def test_a_program_that_jax_cannot_read_is_refused(folder):
-    """With a hash that fits, as somebody else's program would have."""
-    for content in (b"", b"no program", (folder / "program.stablehlo").read_bytes()[:1000]):
-        exchange_program(folder, content)
-        with pytest.raises(InputError, match=r"program\.stablehlo: expected a program that JAX .* reads, got") as error:
-            mfvpr.load_exported(folder)
-        assert "\n" not in str(error.value)
-
-
-def test_a_folder_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_a_program_is_written_to_a_new_or_an_empty_folder(tmp_path):
     (tmp_path / "empty").mkdir()
     program = mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
     assert program(mask=np.ones((3, 20), bool))["scores"].tolist() == [20, 20, 20]
-    with pytest.raises(InputError, match=r"empty: expected a new or an empty folder, got another"):
-        mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
-    monkeypatch.setattr(np, "save", lambda *_, **__: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        mfvpr.export(tmp_path / "new", mfvpr.MatchCount(), SHAPES, onnx=False)
-    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+    (tmp_path / "file").touch()
+    for name in ("empty", "file", "file/below"):
+        with pytest.raises(InputError, match=name):
+            mfvpr.export(tmp_path / name, mfvpr.MatchCount(), SHAPES, onnx=False)
 
 
 def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, monkeypatch):
@@ -200,18 +162,6 @@ def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, 
     with pytest.raises(InputError, match=r"onnx=True: expected the package jax2onnx.*pip install 'mfvpr\[export\]'"):
         mfvpr.export(tmp_path / "model", mfvpr.MatchCount(), SHAPES, onnx=True)
     assert not (tmp_path / "model").exists()
-
-
-def test_paths_that_cannot_be_a_new_folder_are_one_line(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "folder")
-    (tmp_path / "dangling").symlink_to(tmp_path / "none")
-    monkeypatch.chdir(tmp_path / "folder")
-    for name in ("../file", "../file/below", "../link", "../dangling", "."):
-        with pytest.raises(InputError) as error:
-            mfvpr.export(name, mfvpr.MatchCount(), ExportShapes(2, 3, (64, 48)), onnx=False)
-        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("size", [np.array([64, 48]), [64, 48], (64.0, 48.0)])

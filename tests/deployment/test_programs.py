@@ -46,11 +46,17 @@ def candidate_matches(inputs):
 
 
 @pytest.mark.optimized
-@pytest.mark.parametrize("scorer", [
-    *(SCORERS[name]() for name in SCORERS if name not in ("homography", "homography_opencv", "grid")), HISTOGRAM, plain,
-    mfvpr.GridAnchors(side=7), mfvpr.HistogramOfShifts(temperature=0.5),
-    pytest.param(mfvpr.Homography(), marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "scorer",
+    [
+        *(SCORERS[name]() for name in SCORERS if name not in ("homography", "homography_opencv", "grid")),
+        HISTOGRAM,
+        plain,
+        mfvpr.GridAnchors(side=7),
+        mfvpr.HistogramOfShifts(temperature=0.5),
+        pytest.param(mfvpr.Homography(), marks=pytest.mark.slow),
+    ],
+)
 def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     inputs, outputs = outputs_of(scorer)
     expected = {"scores": np.asarray(mfvpr.score_candidates(scorer, candidate_matches(inputs)))}
@@ -86,8 +92,9 @@ def test_a_system_matches_and_scores_by_all_scorers_the_deciding_one_first():
     np.testing.assert_allclose(outputs["shift"][0], [16, 12], atol=3)  # 5 % of the image
 
 
-def test_padding_does_not_matter():
-    program = make_program(make_system({"histogram": HISTOGRAM}), SHAPES, with_shift=True)
+def test_padding_does_not_matter_and_a_loop_gives_the_same():
+    scorers = {"histogram": HISTOGRAM, "anchor": mfvpr.AnchorPoints()}
+    program = make_program(make_system(scorers), SHAPES, with_shift=True)
     inputs = check_inputs(program)
     for side in "01":
         for name in ("keypoints", "descriptors", "scores"):
@@ -95,6 +102,8 @@ def test_padding_does_not_matter():
     expected = program.call(*check_inputs(program).values())
     for values, each in zip(program.call(*inputs.values()), expected, strict=True):
         np.testing.assert_array_equal(values, each)
+    for values, each in zip(program.call(*inputs.values(), form="loop"), expected, strict=True):
+        np.testing.assert_allclose(values, each, rtol=1e-5, atol=1e-5)
 
 
 def test_images_above_the_capacity_score_nan_and_smaller_ones_a_number():
@@ -106,20 +115,14 @@ def test_images_above_the_capacity_score_nan_and_smaller_ones_a_number():
         assert np.isfinite(scores[0]) == is_number
 
 
-def test_a_loop_gives_the_same():
-    program = make_program(
-        make_system({"histogram": HISTOGRAM, "anchor": mfvpr.AnchorPoints()}), SHAPES, with_shift=True
-    )
-    inputs = [*check_inputs(program).values()]
-    for values, each in zip(program.call(*inputs, form="loop"), program.call(*inputs), strict=True):
-        np.testing.assert_allclose(values, each, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize(("scorer", "names"), [
-    (mfvpr.MatchCount(), ["mask"]),
-    (mfvpr.RapidSpatialScore(per_feature=True), ["points0", "points1", "mask", "image_size0", "count0"]),
-    (HISTOGRAM, ["points0", "points1", "mask", "image_size0", "image_size1", "ratio"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scorer", "names"),
+    [
+        (mfvpr.MatchCount(), ["mask"]),
+        (mfvpr.RapidSpatialScore(per_feature=True), ["points0", "points1", "mask", "image_size0", "count0"]),
+        (HISTOGRAM, ["points0", "points1", "mask", "image_size0", "image_size1", "ratio"]),
+    ],
+)
 def test_inputs_without_effect_are_left_out(scorer, names):
     program = stablehlo.without_unused_inputs(make_program(scorer, SHAPES, with_shift=False))
     assert [each.name for each in program.inputs] == names
@@ -129,11 +132,6 @@ def test_inputs_without_effect_are_left_out(scorer, names):
 def call_python(matches):
     shape = jax.ShapeDtypeStruct((), np.float32)
     return jax.pure_callback(lambda mask: np.float32(mask.sum()), shape, matches.mask, vmap_method="sequential")
-
-
-def print_number(matches):
-    jax.debug.print("{}", count := jnp.sum(matches.mask).astype(jnp.float32))
-    return count
 
 
 def call_lapack(matches):
@@ -148,15 +146,17 @@ def branch_in_python(matches):
     return 1.0 if matches.mask[0] else 0.0
 
 
-@pytest.mark.parametrize(("scorer", "message"), [
-    (call_python, "without calls into Python or libraries, got pure_callback"),
-    (print_number, "without calls into Python or libraries, got debug_"),
-    (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
-    (use_numpy, "code that JAX compiles for cpu and cuda, got TracerArrayConversionError.*use jax.numpy"),
-    (branch_in_python, "code that JAX compiles for cpu and cuda, got TracerBoolConversionError"),
-    (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
-    (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, .*score_pairs"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scorer", "message"),
+    [
+        (call_python, "without calls into Python, got .*callback"),
+        (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
+        (use_numpy, "code that JAX compiles for cpu and cuda, .* got TracerArrayConversionError.*use jax.numpy"),
+        (branch_in_python, "code that JAX compiles for cpu and cuda, .* got TracerBoolConversionError"),
+        (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
+        (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, .*score_pairs"),
+    ],
+)
 def test_scorers_that_cannot_be_exported_are_refused_by_the_operation(scorer, message):
     with pytest.raises(InputError, match=message) as error:
         stablehlo.serialize(make_program(scorer, SHAPES, with_shift=False))
@@ -171,25 +171,42 @@ class TwoScales:
 COUNT = {"count": mfvpr.MatchCount()}
 
 
-@pytest.mark.parametrize(("system", "options", "message"), [
-    (lambda: make_system({}), {}, "final='retrieval': expected a scorer"),
-    (lambda: make_system(COUNT, fused={"count": Fusion()}, final="count + retrieval"), {},
-     r"final='count \+ retrieval': expected a scorer, got a ranking that needs the retrieval"),
-    (lambda: make_system(COUNT | {"a/b": mfvpr.MatchCount()}), {}, "names of letters.*got 'a/b'"),
-    (lambda: make_system(COUNT | {"cv": mfvpr.OpenCvHomography()}), {}, "OpenCvHomography: expected a scorer"),
-    (lambda: make_system(COUNT, extractor=TwoScales()), {}, "TwoScales: expected local features of one scale, got 2"),
-    (lambda: make_system(COUNT), {"with_shift": True}, "with_shift=True: expected a HistogramOfShifts.*MatchCount"),
-    (lambda: make_system(COUNT), {"shapes": replace(SHAPES, dimension=64)}, "dimension=64: expected 128"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("system", "options", "message"),
+    [
+        (lambda: make_system({}), {}, "final='retrieval': expected a scorer"),
+        (
+            lambda: make_system(COUNT, fused={"count": Fusion()}, final="count + retrieval"),
+            {},
+            r"final='count \+ retrieval': expected a scorer, got a ranking that needs the retrieval",
+        ),
+        (lambda: make_system(COUNT | {"a/b": mfvpr.MatchCount()}), {}, "names of letters.*got 'a/b'"),
+        (lambda: make_system(COUNT | {"cv": mfvpr.OpenCvHomography()}), {}, "OpenCvHomography: expected a scorer"),
+        (
+            lambda: make_system(COUNT, extractor=TwoScales()),
+            {},
+            "TwoScales: expected local features of one scale, got 2",
+        ),
+        (lambda: make_system(COUNT), {"with_shift": True}, "with_shift=True: expected a HistogramOfShifts.*MatchCount"),
+        (lambda: make_system(COUNT), {"shapes": replace(SHAPES, dimension=64)}, "dimension=64: expected 128"),
+    ],
+)
 def test_systems_that_cannot_be_exported_are_refused(system, options, message):
     with pytest.raises(InputError, match=message) as error:
         make_program(system(), **{"shapes": SHAPES, "with_shift": False} | options)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("name", "number"), [
-    ("candidates", 0), ("keypoints", 2.5), ("dimension", -1), ("image_size", (320,)), ("image_size", (320, 0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("candidates", 0),
+        ("keypoints", 2.5),
+        ("dimension", -1),
+        ("image_size", (320,)),
+        ("image_size", (320, 0)),
+    ],
+)
 def test_shapes_out_of_bounds_are_refused(name, number):
     with pytest.raises(InputError, match=f"{name}=.*: expected"):
         replace(SHAPES, **{name: number})

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
-from mfvpr.features import FeatureSet, InMemory
+from mfvpr.features import FeatureSet
 from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
 from tests.builders import make_features
 
@@ -88,26 +88,21 @@ AXES = {"keypoints": (2, 5, 2), "descriptors": (2, 5, 16), "scores": (2, 5), "ma
 STACKED = {name: np.ones(shape, bool if name == "mask" else float) for name, shape in AXES.items()}
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ([], "at least one image, got none"),
-    ([{}, {"image_size": None}], r"image 1: .*image_size \[2\].* got shapes \(5,\) and \(\)"),
-    ([STACKED], r"mask \[N\]"),
-    ([{}, {"descriptors": np.full((5, 16), 2.0)}], "image 1: .*unit length, got 8;"),
-    ([{}, {"descriptors": np.ones((5, 8)) / np.sqrt(8)}], "image 1: .*16 .*, got 8;"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ([], "at least one image, got none"),
+        ([{}, {"image_size": None}], r"image 1: .*image_size \[2\].* got shapes \(5,\) and \(\)"),
+        ([STACKED], r"mask \[N\]"),
+        ([{}, {"descriptors": np.full((5, 16), 2.0)}], "image 1: .*unit length, got 8;"),
+        ([{}, {"descriptors": np.ones((5, 8)) / np.sqrt(8)}], "image 1: .*16 .*, got 8;"),
+    ],
+)
 def test_own_features_that_do_not_fit_are_refused(changes, message):
     [image] = images_of([5])
     with pytest.raises(InputError, match=message) as error:
         FeatureSet.of([replace(image, **change) for change in changes])
     assert "\n" not in str(error.value)
-
-
-def test_rows_that_are_not_there_have_no_keypoints():
-    [image] = images_of([5])
-    feature_set = FeatureSet(InMemory({2: image}, 4), {0: "cannot be read"})
-    assert feature_set.counts.tolist() == [0, 0, 5, 0]
-    assert [row for row, _ in feature_set.read(range(4))] == [2]
-    assert [row for row, _ in feature_set.source.read()] == [2]
 
 
 # Memory
@@ -146,11 +141,6 @@ def test_what_was_used_longest_ago_makes_room(requests):
         assert [places[row] for row in rows] == slots
         assert len(set(places.values())) == len(places)
         assert set(places.values()) <= set(range(4))
-
-
-def test_more_rows_than_slots_are_refused():
-    with pytest.raises(ValueError, match="at most 2 rows at the same time, got 3"):
-        Recent(2).take([4, 5, 6])
 
 
 COUNTS = [30, 25, 0, 200, 31, 1, 180, 29, 200, 32]

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.checkpoints.networks import plan_network
-from mfvpr.cli import inputs
 from mfvpr.evaluation import fuse_scales
 from mfvpr.features import PatchNetVladFeatures
-from mfvpr.networks import VggNetVlad
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
@@ -26,12 +23,6 @@ from tests.programs import results
 pytestmark = pytest.mark.thorough
 
 SIZE = (160, 128)
-
-
-def _vacant(outputs):
-    """A network that is never run."""
-    plan = plan_network(partial(VggNetVlad, 2, outputs))
-    return plan.build({path: np.zeros(shape, np.float32) for path, shape in plan.shapes.items()})
 
 
 SCORERS = {"count": mfvpr.MatchCount(), "histogram": mfvpr.HistogramOfShifts()}
@@ -55,23 +46,16 @@ def test_patches_are_where_the_public_code_has_them(model, position):
     assert scale == (16, len(expected), 1.0)
 
 
-@pytest.mark.slow
-def test_one_pass_gives_what_the_network_gives(model):
-    extractor = PatchNetVladFeatures(model, SIZE, patch_sizes=(1, 3))
-    [description] = extractor(image(SIZE))
-    vectors, patches = model.with_patches(model.preprocess(image(SIZE)), (1, 3))
-    np.testing.assert_allclose(description.vector, vectors[0], atol=1e-6)
-    for local, expected in zip(description.local, patches, strict=True):
-        np.testing.assert_allclose(local.descriptors, expected[0], atol=1e-6)
-        np.testing.assert_allclose(np.linalg.norm(local.descriptors, axis=1), 1, rtol=1e-5)
-
-
-@pytest.mark.parametrize(("options", "words"), [
-    ({"patch_sizes": ()}, r"patch_sizes=\(\): expected a list of one or more"),
-    ({"patch_sizes": (9,)}, "expected sizes from 1 to 8, .*10 x 8"), ({"patch_sizes": (0, 2)}, "from 1"),
-    ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
-    ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"patch_sizes": ()}, r"patch_sizes=\(\): expected a list of one or more"),
+        ({"patch_sizes": (9,)}, "expected sizes from 1 to 8, .*10 x 8"),
+        ({"patch_sizes": (0, 2)}, "from 1"),
+        ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
+        ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
+    ],
+)
 def test_what_cannot_be_is_refused(model, options, words):
     with pytest.raises(InputError, match=words):
         PatchNetVladFeatures(model, SIZE, **options)
@@ -116,24 +100,21 @@ def test_scales_are_standardized_weighted_and_summed(model, dataset, tmp_path):
         assert np.abs(changed.systems[scorer][0].scores - report.systems[scorer][0].scores).max() > 0.1
 
 
-@pytest.mark.parametrize(("images", "size", "patch_sizes", "outputs", "printed"), [
-    (220, (480, 480), (2, 5, 8), 4096, 7040), (1415, (640, 480), (2, 5, 8), 4096, 62520),
-    (220, (480, 480), (5,), 512, 292), (1415, (640, 480), (5,), 512, 2596),
-])  # fmt: skip
-def test_databases_are_of_the_published_size(images, size, patch_sizes, outputs, printed):
-    """In MiB, in float32."""
-    extractor = PatchNetVladFeatures(_vacant(outputs), size, patch_sizes=patch_sizes)
-    numbers = extractor.vector_size + sum(scale.dimension * scale.typical_count for scale in extractor.scales)
-    assert images * 4 * numbers / 2**20 == pytest.approx(printed, rel=0.01)
-
-
 @pytest.mark.optimized
 @pytest.mark.first_case
-@pytest.mark.parametrize(("matcher", "scorer", "unit"), [
-    ("spatialApproximator", lambda patch: mfvpr.RapidSpatialScore(
-        size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True), 256),
-    ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("matcher", "scorer", "unit"),
+    [
+        (
+            "spatialApproximator",
+            lambda patch: mfvpr.RapidSpatialScore(
+                size=tuple(16.0 * (side - patch) for side in reversed(patch_scores.MAP)), per_feature=True
+            ),
+            256,
+        ),
+        ("RANSAC", lambda patch: mfvpr.Homography(24.0, few="zero", per_feature=True), 1),
+    ],
+)
 def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
     """Every size, for pairs and over candidates; the public scores are the smaller, the better, and in patches.
 
@@ -144,8 +125,10 @@ def test_scores_and_rankings_are_the_public_codes(model, matcher, scorer, unit):
     for patch in patch_scores.PATCHES:
         [places] = PatchNetVladFeatures(model, (width, height), patch_sizes=(patch,))(image((width, height)))
         query, candidates = patch_scores.descriptors(patch)
-        everywhere = jax.tree.map(partial(np.repeat, repeats=len(candidates), axis=0),
-                                  jax.tree.map(lambda field: field[None], places.features))  # fmt: skip
+        everywhere = jax.tree.map(
+            partial(np.repeat, repeats=len(candidates), axis=0),
+            jax.tree.map(lambda field: field[None], places.features),
+        )
         matches = mfvpr.match_candidates(
             replace(places.features, descriptors=query), replace(everywhere, descriptors=candidates)
         )
@@ -174,9 +157,14 @@ def program(run_program, weights, street_settings, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "scorer"), [
-    ("patch_netvlad_performance", "homography"), ("patch_netvlad_speed", "rapid"), ("patch_netvlad_storage", "rapid"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("system", "scorer"),
+    [
+        ("patch_netvlad_performance", "homography"),
+        ("patch_netvlad_speed", "rapid"),
+        ("patch_netvlad_storage", "rapid"),
+    ],
+)
 def test_its_configurations_run_by_name(program, system, scorer):
     reach = () if scorer == "homography" else ("scorer.size=[80,48]",)
     if reach:  # at another size of images, that of the configuration is another score
@@ -199,27 +187,6 @@ def test_a_sweep_fuses_the_scales_as_an_evaluation_does(program):
         alone, _ = program("evaluate", *many, f"scorer.bin_size={bin_size}", "figures=0")
         expected = [row["recall_at"]["1"] for row in read_rows(alone) if row["system"] == "histogram"]
         assert [row["1"] for row in setting["recall_at"].values()] == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("options", "words"), [
-    (("scorer=all", "scorer.rapid.size=[560,400]"), "scorer.rapid.size=[560, 400]: expected [80, 48]"),
-    (("scorer=rapid", "scorer.size=[560,400]", "features.patch_sizes=[9]"), "[9]: expected sizes from 1 to 8"),
-    (("features.image_size=null",), "features.image_size=null: expected "),
-])  # fmt: skip
-def test_settings_of_other_sizes_are_refused(program, options, words):
-    _, stderr = program("evaluate", "features=patch_netvlad", "retrieval=same", *options, code=2)
-    assert words in stderr
-
-
-def test_what_it_cannot_be_used_for_is_one_line(program, monkeypatch):
-    scales = ("features=patch_netvlad", "features.patch_sizes=[2,4]")
-    options = "retrieval=same", "scorer=sum", "steps=1", "recall.tolerances=[0]"
-    _, stderr = program("learn", *scales, *options, code=2)
-    assert "features.patch_sizes=[2, 4]: expected one size" in stderr.splitlines()[-1]
-    monkeypatch.setattr(inputs, "dataset_of", None)  # told before
-    _, stderr = program("evaluate", *scales, "retrieval=same", "features.scale_weights=[1]", code=2)
-    assert "scale_weights=[1]: expected one for each of patch_sizes=[2, 4]" in stderr
 
 
 def test_other_features_have_no_global_descriptor(run_program, street_settings, tmp_path):

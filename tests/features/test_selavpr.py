@@ -17,8 +17,13 @@ def training(tensors):
     moments = [{"step": 7, "exp_avg": np.zeros(3, np.float32), "exp_avg_sq": np.ones(3, np.float32)}]
     groups = [{"lr": 1e-5, "betas": (0.9, 0.999), "weight_decay": 0, "amsgrad": False, "params": [0, 1]}]
     optimizer = {"state": dict(enumerate(moments)), "param_groups": groups}
-    return {"epoch_num": 3, "model_state_dict": tensors, "optimizer_state_dict": optimizer, "best_r5": 97.2,
-            "not_improved_num": 0}  # fmt: skip
+    return {
+        "epoch_num": 3,
+        "model_state_dict": tensors,
+        "optimizer_state_dict": optimizer,
+        "best_r5": 97.2,
+        "not_improved_num": 0,
+    }
 
 
 @pytest.fixture
@@ -45,9 +50,13 @@ def checkpoint(folder, name="SelaVPR_msls", registers=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "file"), [
-    ("selavpr_msls", "SelaVPR_msls"), ("selavpr_pitts", "SelaVPR_pitts30k"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("system", "file"),
+    [
+        ("selavpr_msls", "SelaVPR_msls"),
+        ("selavpr_pitts", "SelaVPR_pitts30k"),
+    ],
+)
 def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, system, file):
     stderr = program("evaluate", f"system={system}", code=2)
     assert f"not installed in {tmp_path}/weights; get {file}.pth from https://drive.google.com/" in stderr
@@ -101,25 +110,3 @@ def test_dinov2_gives_features_and_the_global_descriptor(dinov2, tmp_path, featu
     assert {row["features"]["facet"] for row in rows} == {facet}
     stores = {path.name.rpartition("-")[0] for path in (tmp_path / "cache" / "features").glob("*-*")}
     assert stores == {"Dinov2Features", "matches"}
-
-
-@pytest.mark.parametrize(("option", "words"), [
-    ("features.image_size=[56,40]", "image_size=[56, 40]: expected multiples of 14, the side of a patch in px"),
-    ("features.image_size=auto", "features.image_size=auto: expected a list of 2"),
-    ("features.block=-2", "block=-2: expected from -1 to 0, a block of this network"),
-    ("features.block=24", "features.block=24: expected a whole number from -24 to 23"),
-    ("features.facet=attention", "features.facet=attention: expected one of token, query, key, value"),
-    ("features.weights=d2_tf", "features.weights=d2_tf: expected weights of dinov2: one of dinov2_vits14"),
-])  # fmt: skip
-def test_wrong_settings_of_dinov2_are_one_line(dinov2, option, words):
-    small = "features.image_size=[28,28]" if "image_size" not in option else "features.block=-1"
-    stderr = dinov2("evaluate", "features=dinov2", "features.weights=dinov2_vits14", small, option, code=2)
-    assert words in stderr
-    assert stderr.count("\n") == 1
-
-
-def test_wrong_weights_are_told(program, tmp_path):
-    path = write_zip(tmp_path / "SelaVPR_msls.pth", random_checkpoint(dinov2_shapes(64, 1)))
-    assert "keys do not fit the network" in program("weights", "add", path, code=2)
-    stderr = program("evaluate", "system=selavpr_msls", "features.weights=d2_tf", code=2)
-    assert "features.weights=d2_tf: expected weights of selavpr: one of selavpr_pitts30k" in stderr

@@ -12,21 +12,19 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.baselines import GridAnchors
 from mfvpr.datasets import ImageFolder
-from mfvpr.evaluation import match_sequence, stages
+from mfvpr.evaluation import match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe
-from mfvpr.features import Aggregated, FeatureSet, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
-from mfvpr.features.extractor import local_features
+from mfvpr.features import Aggregated, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
 from mfvpr.features.ssm_features import SsmMaps
-from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
+from mfvpr.features.windows import Windows, kernels, whiten_windows
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.packing import pack_features
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import difference, fingerprint
 from mfvpr.utils.whitening import Whitening, fit_whitening
-from tests.builders import evaluate_parts, local, make_shortlist
+from tests.builders import evaluate_parts, local
 from tests.networks.test_ssm_maps import published
 
 pytestmark = pytest.mark.thorough
@@ -58,9 +56,11 @@ def learned(cells, dataset):
 @pytest.mark.parametrize(("shape", "size", "stride"), [((5, 7, 2), 3, 1), ((8, 5, 3), 3, 2), ((4, 4, 1), 4, 1)])
 def test_windows_are_those_of_the_loops(shape, size, stride):
     image_map, positions = np.random.default_rng(0).normal(size=shape), Windows(shape, size, stride)
-    expected = [image_map[row : row + size, column : column + size].reshape(-1)
-                for row in range(0, shape[0] - size + 1, stride)
-                for column in range(0, shape[1] - size + 1, stride)]  # fmt: skip
+    expected = [
+        image_map[row : row + size, column : column + size].reshape(-1)
+        for row in range(0, shape[0] - size + 1, stride)
+        for column in range(0, shape[1] - size + 1, stride)
+    ]
     assert positions.count == len(expected) == np.prod(positions.grid)
     np.testing.assert_array_equal(positions.take(image_map, np.arange(positions.count)), expected)
     places = np.array([1, 0]) % positions.count
@@ -75,13 +75,6 @@ def test_a_convolution_is_the_whitening_of_every_window():
     got = jax.jit(partial(whiten_windows, stride=2))(maps, *kernels(learned, positions))
     expected = (sample - learned.mean) @ learned.components.T
     np.testing.assert_allclose(np.reshape(got, (-1, 5)), expected, atol=1e-5)
-
-
-def test_maps_are_of_unit_length_where_there_is_something():
-    maps = np.random.default_rng(2).normal(size=(1, 3, 3, 8)).astype(np.float32)
-    maps[0, 1, 1] = 0
-    lengths = np.linalg.norm(np.asarray(normalize_maps(maps)), axis=-1)
-    np.testing.assert_allclose(lengths, np.where(np.arange(9).reshape(1, 3, 3) == 4, 0, 1), atol=1e-6)
 
 
 @pytest.mark.parametrize(("windows_at_most", "zero_row"), [(None, False), (None, True), (30, False), (30, True)])
@@ -158,16 +151,6 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
         replace(cells, whitening=Whitening(np.zeros(41472), np.zeros((3, 41472))))(np.zeros((1, 40, 48, 3), np.uint8))
 
 
-def test_stores_take_little_more_than_half_of_it(cells, dataset, tmp_path):
-    """Directions of cells in float16, beside their lengths, places and scores."""
-    cache, wide = FeatureCache(tmp_path), replace(cells, whitening=WindowFitting(100))
-    [store] = cache.local(dataset.database, fit_to_database(wide, dataset.database, cache))
-    [(_, features)] = store.read([0])
-    parts = pack_features(features)
-    assert features.descriptors.nbytes == 12 * 100 * 4
-    assert sum(part.nbytes for part in parts.values()) == 12 * (100 * 2 + 4 + 8 + 4) + 8
-
-
 # What is learned
 
 
@@ -202,13 +185,25 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
     recipes = [cache.recipes.of_folder(dataset.database, extractor) for extractor in extractors]
     assert "whitening" in difference(*recipes)
     variants = [
-        cells, replace(cells, model=other), replace(cells, preprocessing="caffe"), replace(cells, stride=2),
-        replace(cells, image_size=(40, 48)), replace(cells, interpolation="cv2_area"), SsmWindows(model),
-        *(replace(cells, whitening=replace(how, **change)) for change in (
-            {"dimension": 5}, {"seed": 2}, {"zero_row": True}, {"max_images": 9}, {"max_windows": 99},
-            {"dtype": "float64"},
-        )),
-    ]  # fmt: skip
+        cells,
+        replace(cells, model=other),
+        replace(cells, preprocessing="caffe"),
+        replace(cells, stride=2),
+        replace(cells, image_size=(40, 48)),
+        replace(cells, interpolation="cv2_area"),
+        SsmWindows(model),
+        *(
+            replace(cells, whitening=replace(how, **change))
+            for change in (
+                {"dimension": 5},
+                {"seed": 2},
+                {"zero_row": True},
+                {"max_images": 9},
+                {"max_windows": 99},
+                {"dtype": "float64"},
+            )
+        ),
+    ]
     recipes = [whitening_recipe(extractor, extractor.whitening, cache) for extractor in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
     assert whitening_recipe(replace(cells, batch_size=1), how, cache) == recipes[0]
@@ -218,8 +213,12 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, data
     image = np.zeros((1, 40, 48, 3), np.uint8)
     turned = {"image_size": (40, 48)}
     for change in (
-        {"model": published(1)}, {"preprocessing": "caffe"}, {"interpolation": "cv2_area"}, {"stride": 2}, turned,
-    ):  # fmt: skip
+        {"model": published(1)},
+        {"preprocessing": "caffe"},
+        {"interpolation": "cv2_area"},
+        {"stride": 2},
+        turned,
+    ):
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
             replace(learned, **change)(image.swapaxes(1, 2) if change is turned else image)
     with pytest.raises(InputError, match="SsmCells: expected images of 48 x 40 px, got 40 x 48"):
@@ -251,17 +250,6 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
     learned = fit_to_database(cells, folder, FeatureCache(tmp_path / "s", skip_bad=True))
     few = fit_to_database(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), FeatureCache())
     np.testing.assert_array_equal(learned.whitening.components, few.whitening.components)
-
-
-def test_candidates_without_cells_score_zero():
-    image, empty = (
-        local_features(np.zeros((count, 2)), np.eye(count, 16, dtype=np.float32), (48, 48)) for count in (16, 0)
-    )
-    queries, database = (FeatureSet.of(images, unit_length=False) for images in ([image, empty], [empty, image]))
-    candidates = make_shortlist([[0, 1]] * 2)
-    matches = stages.match(queries, database, candidates, CANDIDATE)
-    scores = stages.score({"grid": GridAnchors(4, 3)}, matches, candidates)["grid"]
-    np.testing.assert_array_equal(scores, [[0, 100], [0, 0]])
 
 
 def test_parts_of_retrievers_are_learned_as_well(cells, model, dataset):

@@ -17,9 +17,12 @@ from tests.random_checkpoints import dinov2_shapes, random_checkpoint
 WIDTH, HEADS = 64, 4
 # Blocks, registers, image size (width, height), index of the block, seed.
 CASES = (
-    (3, 0, (98, 56), -2, 0), (3, 0, (98, 56), -1, 0), (2, 4, (42, 70), 0, 1), (2, 0, (518, 518), -2, 2),
+    (3, 0, (98, 56), -2, 0),
+    (3, 0, (98, 56), -1, 0),
+    (2, 4, (42, 70), 0, 1),
+    (2, 0, (518, 518), -2, 2),
     (1, 0, (14, 14), -1, 3),
-)  # fmt: skip
+)
 
 
 def main(clone: str) -> dict[str, np.ndarray]:
@@ -62,6 +65,14 @@ def _transformer(depth: int, registers: int) -> Any:
     from dinov2.models.vision_transformer import DinoVisionTransformer  # pyright: ignore
 
     return DinoVisionTransformer(
-        img_size=518, patch_size=14, embed_dim=WIDTH, depth=depth, num_heads=HEADS, mlp_ratio=4, init_values=1,
-        block_chunks=0, num_register_tokens=registers, block_fn=partial(Block, attn_class=MemEffAttention),
-    )  # fmt: skip
+        img_size=518,
+        patch_size=14,
+        embed_dim=WIDTH,
+        depth=depth,
+        num_heads=HEADS,
+        mlp_ratio=4,
+        init_values=1,
+        block_chunks=0,
+        num_register_tokens=registers,
+        block_fn=partial(Block, attn_class=MemEffAttention),
+    )

@@ -56,10 +56,12 @@ def _scores() -> Iterator[tuple[str, np.ndarray]]:
     query = [torch.from_numpy(of_query) for of_query, _ in features]
     for name in MATCHERS:
         matcher = PatchMatcher(name, PATCHES, [1] * len(PATCHES), keypoints, indices)
-        scores = np.array([
-            matcher.match(query, [torch.from_numpy(of_candidates[candidate].T) for _, of_candidates in features])[0]
-            for candidate in range(len(CANDIDATES))
-        ])  # fmt: skip
+        scores = np.array(
+            [
+                matcher.match(query, [torch.from_numpy(of_candidates[candidate].T) for _, of_candidates in features])[0]
+                for candidate in range(len(CANDIDATES))
+            ]
+        )
         yield f"{name}/scales", scores
         yield f"{name}/pairs", np.array([apply_patch_weights(of_pair, len(PATCHES), WEIGHTS) for of_pair in scores])
         yield f"{name}/fused", normalise_func(scores, len(PATCHES), WEIGHTS)

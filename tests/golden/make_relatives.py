@@ -121,8 +121,15 @@ def _lost(clone: str) -> dict[str, np.ndarray]:
         for mirrored in (False, True):
             for form, files in (("weighted", paths), ("unweighted", {})):
                 matrix = match_lost_kc.getSpatialCheckMat(
-                    labels, labels, reference[None], query[None], 1, np.ones((1, 1)), flipFlag=mirrored,
-                    preLoadDenseDescRef=False, **files,
-                )  # fmt: skip
+                    labels,
+                    labels,
+                    reference[None],
+                    query[None],
+                    1,
+                    np.ones((1, 1)),
+                    flipFlag=mirrored,
+                    preLoadDenseDescRef=False,
+                    **files,
+                )
                 golden[f"lost/{form}/{mirrored}"] = matrix[0, 1]
     return golden

@@ -20,9 +20,12 @@ NETWORKS = ((2, 0, 0), (2, 0, 1), (1, 4, 2))
 WIDTH = 64
 # Narrow backbones: blocks, registers, whether adapted, image size (width, height), seed.
 BACKBONES = (
-    (3, 0, True, (224, 224), 3), (2, 4, True, (70, 42), 4), (2, 0, False, (42, 98), 5), (1, 0, False, (518, 518), 6),
+    (3, 0, True, (224, 224), 3),
+    (2, 4, True, (70, 42), 4),
+    (2, 0, False, (42, 98), 5),
+    (1, 0, False, (518, 518), 6),
     (2, 0, False, (28, 14), 7),
-)  # fmt: skip
+)
 # Maps that are matched: side, candidates, seed; one position has exactly one match.
 MATCHES = ((61, 4, 8), (9, 12, 9), (1, 2, 10))
 
@@ -55,9 +58,17 @@ def _transformer(width: int, depth: int, heads: int, registers: int) -> Any:
     from backbone.vision_transformer import DinoVisionTransformer  # pyright: ignore
 
     return DinoVisionTransformer(
-        img_size=518, patch_size=14, embed_dim=width, depth=depth, num_heads=heads, mlp_ratio=4, init_values=1,
-        block_chunks=0, num_register_tokens=registers, block_fn=partial(Block, attn_class=MemEffAttention),
-    )  # fmt: skip
+        img_size=518,
+        patch_size=14,
+        embed_dim=width,
+        depth=depth,
+        num_heads=heads,
+        mlp_ratio=4,
+        init_values=1,
+        block_chunks=0,
+        num_register_tokens=registers,
+        block_fn=partial(Block, attn_class=MemEffAttention),
+    )
 
 
 def _networks() -> Iterator[tuple[str, np.ndarray]]:

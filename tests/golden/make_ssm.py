@@ -83,11 +83,15 @@ def _run(program: type, seed: int, pixels: int | None, num_database: int, num_qu
     index = np.array(run.index)
     votes = np.array(run.votes)
     return {
-        "windows": stage1, "cells": stage2, "candidates": np.array(run.candidates).astype(np.int8),
-        "votes": votes.astype(np.int16), "index": index.astype(np.int16), "scores": np.array(run.scores),
+        "windows": stage1,
+        "cells": stage2,
+        "candidates": np.array(run.candidates).astype(np.int8),
+        "votes": votes.astype(np.int16),
+        "index": index.astype(np.int16),
+        "scores": np.array(run.scores),
         "zero_scores": np.array([[_padded_by_zeros(query_index) for query_index in of_query] for of_query in index]),
         "weights": np.array(run.weights),
-    }  # fmt: skip
+    }
 
 
 def _padded_by_zeros(index: np.ndarray) -> int:

@@ -14,7 +14,6 @@ from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
 from mfvpr.utils.runtime import Runtime
 from tests.io.checks import one_line_error
-from tests.needs import needs
 
 SIFT = Sift(image_size=(160, 120))
 SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
@@ -232,53 +231,6 @@ def test_where_a_matcher_must_be_compiled_it_is_refused(dataset, tmp_path):
         mfvpr.Map.create(tmp_path / "map", dataset.database.root, system)
     with one_line_error("HostMatcher", "features"):
         system.warm_up((64, 48))
-
-
-class VismatchStandIn:
-    """The interface of vismatch's matchers: (3, H, W) in [0, 1] -> a dictionary."""
-
-    def __call__(self, img0, img1):
-        assert img0.shape[0] == img1.shape[0] == 3
-        assert img0.dtype == np.float32
-        assert 0.5 < img0.max() <= 1
-        points = np.argwhere(img0[0] >= np.quantile(img0[0], 0.99))[:20, ::-1].astype(np.float32)
-        return {
-            "num_inliers": 0,
-            "H": None,
-            "all_kpts0": points,
-            "all_kpts1": points,
-            "all_desc0": np.empty((0, 2)),
-            "all_desc1": np.empty((0, 2)),
-            "matched_kpts0": points,
-            "matched_kpts1": points,
-            "inlier_kpts0": np.empty((0, 2)),
-            "inlier_kpts1": np.empty((0, 2)),
-            "matched_confidences": None,
-        }
-
-
-def vismatch_adapter(network):
-    """As documented in mfvpr/matchers/README.md."""
-
-    def match(first, second):
-        return network(*(image.transpose(2, 0, 1).astype(np.float32) / 255 for image in (first, second)))
-
-    return match
-
-
-def test_the_documented_adapter_of_vismatch(dataset):
-    matcher = mfvpr.HostMatcher(vismatch_adapter(VismatchStandIn()), "stand-in", image_size=(64, 48))
-    result = matched(few(dataset, 1), matcher)
-    assert (result.matches[0].counts > 0).all()
-    assert (result.matches[0].matches[0].confidence == 1).all()
-
-
-@needs("vismatch")
-def test_the_documented_adapter_with_vismatch_itself(dataset):
-    from vismatch import get_matcher  # pyright: ignore
-
-    matcher = mfvpr.HostMatcher(vismatch_adapter(get_matcher("sift-nn", device="cpu")), "vismatch sift-nn")
-    assert (matched(few(dataset, 1), matcher).matches[0].counts > 0).any()
 
 
 def write_hloc_matches(path, result, sequence, database, skip=()):

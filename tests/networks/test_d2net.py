@@ -124,7 +124,7 @@ def plain(model) -> D2NetFeatures:
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", PLAIN, ids=str)
 def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, golden, case):
-    """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
+    """Convolutions that round by position would make peaks of what is level, and lose those at its rim."""
     (features,) = local(plain(case.image[None]))
     assert_golden(features, golden, case, 1e-2, 1e-4)
     assert len(features.scores) > 10
@@ -132,20 +132,14 @@ def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, go
 
 @pytest.mark.optimized
 def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
-    """A position sees 92 x 92 px; elsewhere the fast convolutions are at work."""
-    image = texture(160, 128)
-    wide, tall = image.copy(), image.copy()
+    """A position sees 92 x 92 px."""
+    wide, tall = texture(160, 128), texture(160, 128)
     wide[2:94, 30:126] = 200
     tall[30:126, 2:94] = 200
-    maps = compile_network(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
-    (usual, wide, tall), (uniform, *_) = zip(
-        *(maps(preprocess(image[None], "caffe")) for image in (image, wide, tall)), strict=True
-    )
+    maps = compile_network(model, lambda model, images: model(images))
+    wide, tall = (maps(preprocess(image[None], "caffe")) for image in (wide, tall))
     np.testing.assert_array_equal(wide[0, 11, 18], wide[0, 11, 19])
     np.testing.assert_array_equal(tall[0, 18, 11], tall[0, 19, 11])
-    if jax.default_backend() == "cpu":
-        assert not np.array_equal(usual, uniform)
-    np.testing.assert_allclose(usual, uniform, atol=1e-5 * uniform.max())
 
 
 @pytest.mark.parametrize(("seed", "offset"), [*((seed, 0) for seed in range(6)), (0, -4)])
@@ -160,9 +154,14 @@ def test_detection_agrees_with_the_oracle(seed, offset):
 FLAT = np.ones((6, 5, 6), np.float32)
 
 
-@pytest.mark.parametrize(("maps", "num_empty"), [
-    ((smooth(0, 4, 7), smooth(1, 9, 15), smooth(2, 20, 31)), 0), ((FLAT, smooth(1)), 1),
-], ids=["textured", "flat"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("maps", "num_empty"),
+    [
+        ((smooth(0, 4, 7), smooth(1, 9, 15), smooth(2, 20, 31)), 0),
+        ((FLAT, smooth(1)), 1),
+    ],
+    ids=["textured", "flat"],
+)
 def test_scales_agree_with_the_oracle(maps, num_empty):
     """A scale without keypoints adds nothing to the next."""
     expected = oracle.pyramid([dense.astype(np.float64) for dense in maps])
@@ -267,14 +266,6 @@ def test_the_smallest_images_are_taken(model, size, multiscale, slots):
         jax.ShapeDtypeStruct((1, *size, 3), jnp.uint8),
     )
     assert levels[0].keypoints.shape == (1, slots, 2)
-
-
-def test_the_forecast_grows_with_the_map(model):
-    assert D2NetFeatures(model).scales[0].typical_count == 740
-    assert D2NetFeatures(model).scales[0].dimension == 512
-    assert D2NetFeatures(model, (320, 320)).scales[0].typical_count == pytest.approx(684, abs=20)
-    assert D2NetFeatures(model, multiscale=True).scales[0].typical_count > 740
-    assert D2NetFeatures(model, max_keypoints=100).scales[0].typical_count == 100
 
 
 def test_relu_is_an_option(model, images):

@@ -106,13 +106,16 @@ def test_other_settings_have_other_recipes():
     assert len({fingerprint(recipe_of(Dinov2Features(model, **each))) for each in settings}) == len(settings)
 
 
-@pytest.mark.parametrize(("settings", "words"), [
-    ({"image_size": (224, 225)}, r"image_size=\[224, 225\]: expected multiples of 14"),
-    ({"facet": "values"}, "facet=values: expected one of token, query, key, value"),
-    ({"block": 2}, "block=2: expected from -2 to 1, a block of this network"),
-    ({"block": -3}, "block=-3: expected from -2 to 1, a block of this network"),
-    ({"threshold": 1.5}, "threshold=1.5: expected a number from 0 to 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"image_size": (224, 225)}, r"image_size=\[224, 225\]: expected multiples of 14"),
+        ({"facet": "values"}, "facet=values: expected one of token, query, key, value"),
+        ({"block": 2}, "block=2: expected from -2 to 1, a block of this network"),
+        ({"block": -3}, "block=-3: expected from -2 to 1, a block of this network"),
+        ({"threshold": 1.5}, "threshold=1.5: expected a number from 0 to 1"),
+    ],
+)
 def test_wrong_settings_are_one_line(settings, words):
     with pytest.raises(InputError, match=f"^{words}[^\n]*$"):
         Dinov2Features(network(), **settings)

@@ -101,8 +101,14 @@ def test_layer_and_patches_are_those_of_loops(order):
     single = jax.numpy.asarray(maps, np.float32)
     np.testing.assert_allclose(layer(single), [pooled(parameter) for parameter in maps], atol=1e-6)
     for size in (1, 2, 4):
-        expected = [[pooled(parameter[row : row + size, column : column + size])
-                     for row in range(5 - size) for column in range(6 - size)] for parameter in maps]  # fmt: skip
+        expected = [
+            [
+                pooled(parameter[row : row + size, column : column + size])
+                for row in range(5 - size)
+                for column in range(6 - size)
+            ]
+            for parameter in maps
+        ]
         np.testing.assert_allclose(layer.patches(single, size), expected, atol=1e-6)
 
 
@@ -145,10 +151,13 @@ def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(sma
     assert_separate_images(GlobalDescriptor(small, (64, 48)), compilations)
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    ({"image_size": (15, 100)}, "image_size=.*from 16"),
-    ({"components": 9}, "components=9: expected from 1 to 8"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"image_size": (15, 100)}, "image_size=.*from 16"),
+        ({"components": 9}, "components=9: expected from 1 to 8"),
+    ],
+)
 def test_what_cannot_be_is_refused(small, options, words):
     with pytest.raises(InputError, match=words):
         GlobalDescriptor(small, **options)

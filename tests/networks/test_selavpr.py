@@ -78,9 +78,16 @@ def test_scores_are_the_public_codes(golden, case):
     assert (case[0] == 1) == (counted == 1).all()
 
 
-@pytest.mark.parametrize(("confidence", "published"), [
-    ([0.5, 0.0], 0.0), ([0.5, 0.25], 0.75), ([0.0, 0.0], 0.0), ([np.nan, 0.25], np.nan), ([np.nan, 0.0], np.nan),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("confidence", "published"),
+    [
+        ([0.5, 0.0], 0.0),
+        ([0.5, 0.25], 0.75),
+        ([0.0, 0.0], 0.0),
+        ([np.nan, 0.25], np.nan),
+        ([np.nan, 0.0], np.nan),
+    ],
+)
 def test_a_single_match_is_one_with_confidence(confidence, published):
     matches = make_matches(np.zeros((2, 2)), np.ones((2, 2)), capacity=4)
     matches = replace(matches, confidence=np.array([*confidence, np.nan, np.nan], np.float32))
@@ -91,10 +98,12 @@ def test_a_single_match_is_one_with_confidence(confidence, published):
 def as_features(values):
     rows = values.reshape(*values.shape[:-3], -1, values.shape[-1])
     return mfvpr.Features(
-        keypoints=np.zeros((*rows.shape[:-1], 2), np.float32), descriptors=rows,
-        scores=np.ones(rows.shape[:-1], np.float32), mask=np.ones(rows.shape[:-1], bool),
+        keypoints=np.zeros((*rows.shape[:-1], 2), np.float32),
+        descriptors=rows,
+        scores=np.ones(rows.shape[:-1], np.float32),
+        mask=np.ones(rows.shape[:-1], bool),
         image_size=np.full((*rows.shape[:-2], 2), 224, np.float32),
-    )  # fmt: skip
+    )
 
 
 def test_upsampling_is_the_sum_of_what_positions_add():

@@ -26,11 +26,14 @@ def list_candidates(source, queries, database):
     return retrieved.candidates.indices[0].tolist()
 
 
-@pytest.mark.parametrize("read", [
-    lambda files, other: FeatureFiles(files).open(other, partial=False),
-    lambda files, other: list_candidates(DescriptorFiles(files), other, other),
-    lambda files, other: list_candidates(ShortlistFiles(files), other, other),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda files, other: FeatureFiles(files).open(other, partial=False),
+        lambda files, other: list_candidates(DescriptorFiles(files), other, other),
+        lambda files, other: list_candidates(ShortlistFiles(files), other, other),
+    ],
+)
 def test_a_folder_without_a_file_is_refused_with_those_that_have_one(tmp_path, read):
     with pytest.raises(InputError, match=r"/other: .*one of: .*/known; "):
         read({tmp_path / "known": File(tmp_path / "a.npz")}, folder(tmp_path / "other"))
@@ -44,9 +47,10 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     same = folder(tmp_path)
     data = Dataset("same", same, (QuerySequence("same", same, None),))
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
-    for group, build_stage, defaults in (("features", assembly.extractor, {"image_size": None}),
-                             ("retrieval", lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data),
-                              {"whiten": None})):  # fmt: skip
+    for group, build_stage, defaults in (
+        ("features", assembly.extractor, {"image_size": None}),
+        ("retrieval", lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data), {"whiten": None}),
+    ):
         settings = {"name": "import"} | common | defaults | change
         if not refused:
             assert build_stage(settings, data).files == {tmp_path: File(expand_user("a.h5"))}
@@ -107,8 +111,10 @@ def test_a_file_of_a_folder_is_of_one_image(tmp_path):
     database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
     (tmp_path / "features" / "db").mkdir(parents=True)
     for row, name in enumerate(database.names):
-        parts = {part: np.asarray(getattr(feature(row, count=3), part))
-                 for part in ("keypoints", "descriptors", "scores", "image_size")}  # fmt: skip
+        parts = {
+            part: np.asarray(getattr(feature(row, count=3), part))
+            for part in ("keypoints", "descriptors", "scores", "image_size")
+        }
         np.savez(tmp_path / "features" / "db" / f"{name}.npz", **parts)
     files = {database.root: File(tmp_path / "features" / "db"), queries.root: File(tmp_path / "features")}
     with pytest.raises(InputError, match=r"0\.png\.npz for .*database/0\.png and for .*queries/0\.png; "):

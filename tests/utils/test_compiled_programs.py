@@ -8,7 +8,7 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from mfvpr.utils import InputError, compiled_programs, numerics
+from mfvpr.utils import compiled_programs, numerics
 from tests.programs import ROOT
 
 PROGRAM = """
@@ -27,9 +27,13 @@ def run(cache, **variables):
     """The printed result, whether programs were read, and JAX's folder, of a new process."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     done = subprocess.run(
-        [sys.executable, "-W", "ignore:Error", "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, check=True,
+        [sys.executable, "-W", "ignore:Error", "-c", PROGRAM],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
         env=environment | {"MFVPR_CACHE": str(cache), "JAX_PLATFORMS": "cpu"} | variables,
-    )  # fmt: skip
+    )
     return done.stdout.split()
 
 
@@ -123,9 +127,3 @@ def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path
     folders.append(compiled_programs._folder())
     assert folders[0] == folders[2]
     assert len({*folders}) == 4
-
-
-def test_a_wrong_word_is_an_error(monkeypatch):
-    monkeypatch.setenv("MFVPR_COMPILED", "no")
-    with pytest.raises(InputError, match=r"^MFVPR_COMPILED='no': expected one of true, false$"):
-        compiled_programs.keep_compiled_programs()

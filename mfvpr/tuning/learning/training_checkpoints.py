@@ -14,7 +14,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.locks import lock_folder
+from mfvpr.utils.files import lock_folder
 
 
 @contextmanager
