@@ -18,8 +18,8 @@ BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "search": "nearest global descriptors of 1, 20 and 100 queries among 10,000 and 100,000 (5 rounds; 6 GB)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
-    "networks": "D2-Net, MixVPR and ALIKED (5 rounds; a quarter of an hour)",
-    "accelerator": "correct and fast on a GPU? All steps beside torch there (30 rounds; 5 minutes)",
+    "networks": "D2-Net, MixVPR, ALIKED, NetVLAD, Patch-NetVLAD, a generalized mean, SelaVPR (5 rounds; half an hour)",
+    "accelerator": "correct and fast on a GPU? All steps beside torch there (30 rounds; 5 minutes, 1 with --quick)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
 }
 
@@ -37,19 +37,20 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("groups", nargs="*", help="accelerator: groups of steps, in this order (default: all)")
     parser.add_argument("--rounds", type=positive_int, help="timed calls of each implementation (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default: runs/benchmark_BENCHMARK.json)")
+    parser.add_argument("--quick", action="store_true", dest="is_quick", help="accelerator: fewer steps, in a minute")
     parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
-def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None) -> None:
+def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None, *, is_quick: bool) -> None:
     """Run a benchmark."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module = import_module(f"experiments.benchmark.{benchmark}")
     out = out or Path(f"runs/benchmark_{benchmark}.json")
     require_replaceable(out, b'{\n "machine": {')
     if benchmark == "accelerator":
-        module.run(rounds, out, groups)
-    elif groups:
-        raise InputError(f"{benchmark} has no groups, which belong to accelerator")
+        module.run(rounds, out, groups, is_quick=is_quick)
+    elif groups or is_quick:
+        raise InputError(f"{benchmark} has no groups and no --quick, which belong to accelerator")
     else:
         module.run(rounds, out)
 

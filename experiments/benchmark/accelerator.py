@@ -27,12 +27,8 @@ from mfvpr.utils.errors import InputError
 SIZE, BINS = 336, 45  # px; bins of the histogram per axis
 SLOTS, MATCHES, SHARE = 384, 300, 0.4  # of a pair; share of the keypoints that two views of a place have in common
 NEAREST = 50
-AXES = {
-    "sigma": np.linspace(8, 40, 25),
-    "bin_size": np.array([10.0, 15.0]),
-    "weight": ("fs", "unit"),
-    "max_distance": np.linspace(0.5, 1.4, 10),
-}
+AXES = {"sigma": np.linspace(8, 40, 25), "bin_size": np.array([10.0, 15.0]), "weight": ("fs", "unit"),
+        "max_distance": np.linspace(0.5, 1.4, 10)}  # fmt: skip
 GIGAFLOPS = {networks.D2NET: 120.0, networks.MIXVPR: 14.2, networks.ALIKED[0]: 2.1}  # of an image, by XLA
 ROUNDS, LEAST_ROUNDS, CASE_SECONDS = 30, 3, 1.0  # timed calls; a case has more than the least for about this time
 EXACT = jax.lax.Precision.HIGHEST
@@ -49,6 +45,7 @@ class Case(NamedTuple):
     make: Callable[..., Timed]
     sizes: tuple[Any, ...]
     small: tuple[Any, ...]
+    is_quick: bool = False
 
 
 def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
@@ -131,11 +128,8 @@ def product_rate(side: int) -> Timed:
     """Product of square matrices."""
     left = right = jax.random.normal(jax.random.key(3), (side, side))
     product, rounded = jax.jit(jnp.matmul, static_argnames="precision"), left.astype(jnp.bfloat16)
-    calls = {
-        "float32": ready(product, left, right, precision=EXACT),
-        "JAX's default": ready(product, left, right),
-        "bfloat16": ready(product, rounded, rounded),
-    }
+    calls = {"float32": ready(product, left, right, precision=EXACT), "JAX's default": ready(product, left, right),
+             "bfloat16": ready(product, rounded, rounded)}  # fmt: skip
     return calls | with_torch("product", left, right), 2 * side**3 / 1e12, "TFLOP"
 
 
@@ -160,8 +154,8 @@ def matching(candidates: int, keypoints: int, dimension: int, *, with_ratio: boo
 
 def scoring(pairs: int, *, name: str) -> Timed:
     """Scores of matches, which a device has to read once."""
-    histogram = mfvpr.HistogramOfShifts(max_bins=BINS)
-    scorer = {"histogram": histogram, "anchor": mfvpr.AnchorPoints(), "sum": mfvpr.AggregatedScore()}[name]
+    scorer = {"histogram": mfvpr.HistogramOfShifts(max_bins=BINS), "anchor": mfvpr.AnchorPoints(),
+              "sum": mfvpr.AggregatedScore()}[name]  # fmt: skip
     m, score = matches_of(pairs), partial(mfvpr.score_candidates, scorer)
     arrays = m.points0, m.points1, m.scores0, m.scores1, m.distance, m.mask
     read = jax.jit(lambda *arrays: [jnp.sum(array) for array in arrays])
@@ -184,8 +178,8 @@ def searching(queries: int, images: int, dimension: int) -> Timed:
     database = database_of(images, dimension)
     vectors = database[:queries] + 0.02 * jax.random.normal(jax.random.key(4), (queries, dimension))
     product = jax.jit(partial(jnp.einsum, "qd,nd->qn", precision=EXACT))
-    calls = {"mfvpr": ready(mfvpr.retrieve, vectors, database, num_candidates=NEAREST)}
-    calls |= {"bare product": ready(product, vectors, database)}
+    calls = {"mfvpr": ready(mfvpr.retrieve, vectors, database, num_candidates=NEAREST),
+             "bare product": ready(product, vectors, database)}  # fmt: skip
     calls |= with_torch("search", vectors, database, candidates=NEAREST)
     return calls, 2 * queries * images * dimension / 1e12, "TFLOP"
 
@@ -200,7 +194,7 @@ def network(batch: int, *, step: str) -> Timed:
     street = np.stack([networks.resize(image, contest.size) for image in _images(SIZE)])
     images = street[np.arange(batch) % len(street)]
     calls: Calls = {"mfvpr": partial(contest.extractor(model, batch_size=batch), images)}
-    if contest.peer and find_spec("torch"):
+    if find_spec("torch"):
         entries = networks.torch_entries(contest, arrays, images, (batch,))
         calls |= {name: call for _, name, call in entries if "channels last" not in name}
     return calls, batch * GIGAFLOPS[contest.checkpoint] / 1e3, "TFLOP"
@@ -227,52 +221,46 @@ def ranking(queries: int, candidates: int, keypoints: int, dimension: int) -> Ti
 
 
 CASES = [
-    Case("rates", "product {0} x {0}", product_rate, (8192,), (256,)),
+    Case("rates", "product {0} x {0}", product_rate, (8192,), (256,), True),
     Case("rates", "copy, {} GB", memory_rate, (4.0,), (0.01,)),
     Case("rates", "call without work", memory_rate, (1e-6,), (1e-6,)),
-    Case("matching", "{} x {} x {}", matching, (50, 700, 512), (3, 64, 32)),
+    Case("matching", "{} x {} x {}", matching, (50, 700, 512), (3, 64, 32), True),
     Case("matching", "{} x {} x {}", matching, (1000, 1000, 128), (8, 64, 16)),
     Case("matching", "{} x {} x {}, ratio", partial(matching, with_ratio=True), (50, 700, 512), (3, 64, 32)),
-]
-for pairs in (50, 1000, 10_000):
-    for name in ("histogram", "anchor", "sum"):
-        CASES.append(Case("scores", f"{name}, {{:,}} pairs", partial(scoring, name=name), (pairs,), (4,)))
-CASES.append(Case("grids", "1,000 settings, {} queries x {}", grid, (100, 50), (1, 2)))
-for queries in (1, 100, 1000):
-    CASES.append(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (3, 2000, 16)))
-for batch in (1, 8, 32):
-    for step in (networks.MAP, networks.FEATURES, f"{networks.ALIKED[0]} features", "MixVPR descriptor"):
-        if (step, batch) != (networks.FEATURES, 32):
-            CASES.append(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,)))
-CASES += [
-    Case("queries", "{} query x {} x {} x {}", ranking, (1, 50, 700, 512), (1, 3, 64, 32)),
+    *(Case("scores", f"{name}, {{:,}} pairs", partial(scoring, name=name), (pairs,), (4,), (name, pairs) == ("sum", 50))
+      for pairs in (50, 1000, 10_000) for name in ("histogram", "anchor", "sum")),
+    Case("grids", "1,000 settings, {} queries x {}", grid, (100, 50), (1, 2), True),
+    *(Case("search", "{} in {:,} x {}", searching, (queries, 1_000_000, 512), (3, 2000, 16), queries == 1)
+      for queries in (1, 100, 1000)),
+    *(Case("networks", f"{step}, batch {{}}", partial(network, step=step), (batch,), (1,), (step, batch) == (aliked, 8))
+      for batch in (1, 8, 32) for aliked in [f"{networks.ALIKED[0]} features"]
+      for step in (networks.MAP, networks.FEATURES, aliked, "MixVPR descriptor")
+      if (step, batch) != (networks.FEATURES, 32)),
+    Case("queries", "{} query x {} x {} x {}", ranking, (1, 50, 700, 512), (1, 3, 64, 32), True),
     Case("queries", "{} queries x {} x {} x {}", ranking, (1000, 50, 700, 512), (3, 3, 64, 32)),
-]
-GROUPS = ("rates", "correct", "matching", "scores", "grids", "search", "networks", "queries")
+]  # fmt: skip
+# Group -> seconds that it needs on an accelerator, mostly to compile; time that is left goes to the groups after it.
+SECONDS = {"rates": 20, "correct": 50, "matching": 45, "scores": 35, "grids": 35, "search": 25, "networks": 65,
+           "queries": 20}  # fmt: skip
+QUICK_SECONDS = 12
 TIMED = ("case", "who", "ms", "25 %", "75 %", "calls", "/ first", "rate", "per s", "first call, s", "note")
 CHECKED = ("what", "reference", "deviation", "allowed", "differ", "entries", "exact")
 
 
-def run(rounds: int | None, out: Path, groups: Sequence[str] = ()) -> dict[str, Any]:
+def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: bool = False) -> dict[str, Any]:
     """Run groups, by default all; print a table after each group, and write all tables so far as JSON to `out`."""
-    if unknown := {*groups} - {*GROUPS}:
-        raise InputError(f"groups: expected some of {', '.join(GROUPS)}, got {', '.join(sorted(unknown))}")
-    on_cpu, group_reports = jax.default_backend() == "cpu", {}
-    report = {
-        "torch": version("torch") if find_spec("torch") else None,
-        "matmul_precision": jax.config.values["jax_default_matmul_precision"],
-        "groups": group_reports,
-    }
-    for group in groups or GROUPS:
-        start = time.monotonic()
+    if unknown := {*groups} - {*SECONDS}:
+        raise InputError(f"groups: expected some of {', '.join(SECONDS)}, got {', '.join(sorted(unknown))}")
+    on_cpu, end, group_reports = jax.default_backend() == "cpu", time.monotonic(), {}
+    report = {"torch": version("torch") if find_spec("torch") else None, "is_quick": is_quick, "groups": group_reports,
+              "matmul_precision": jax.config.values["jax_default_matmul_precision"]}  # fmt: skip
+    for group in groups or SECONDS:
+        start, end = time.monotonic(), end + (QUICK_SECONDS if is_quick else SECONDS[group])
         if group == "correct":
-            rows, names = list(checks(is_small=on_cpu)), CHECKED
+            rows, names = list(checks(is_small=on_cpu or is_quick, end=end)), CHECKED
         else:
-            # A CPU has small sizes, which are the same for some cases.
-            sized = [(case, case.small if on_cpu else case.sizes) for case in CASES if case.group == group]
-            cases = {case.title.format(*sizes): (case.make, sizes) for case, sizes in sized}
-            timed = (time_calls(title, *make(*sizes), rounds or ROUNDS) for title, (make, sizes) in cases.items())
-            rows, names = [row for case_rows in timed for row in case_rows], TIMED
+            cases = [case for case in CASES if case.group == group and (case.is_quick or not is_quick)]
+            rows, names = list(time_cases(cases, rounds or ROUNDS, on_cpu=on_cpu, end=end)), TIMED
         seconds, first_calls = time.monotonic() - start, sum(row.get("first call, s", 0) for row in rows)
         peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
         group_reports[group] = {"seconds": seconds, "first_calls_s": first_calls, "peak_bytes": peak, "rows": rows}
@@ -281,6 +269,16 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = ()) -> dict[str, 
         title += "no GPU: sizes are tiny, and times mean nothing" if on_cpu else f"peak memory so far {peak} bytes"
         write_report(out, title, [table], report)
     return report
+
+
+def time_cases(cases: Sequence[Case], rounds: int, *, on_cpu: bool, end: float) -> Iterator[dict[str, Any]]:
+    """Rows of all calls of cases; a CPU has small sizes, which are the same for some cases."""
+    sized = [(case, case.small if on_cpu else case.sizes) for case in cases]
+    for title, (case, sizes) in {case.title.format(*sizes): (case, sizes) for case, sizes in sized}.items():
+        if time.monotonic() > end:
+            yield {"case": title, "note": "skipped: out of time"}
+        else:
+            yield from time_calls(title, *case.make(*sizes), rounds)
 
 
 def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int) -> Iterator[dict[str, Any]]:
@@ -301,9 +299,9 @@ def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int) ->
     medians = {name: float(np.median(seconds)) for name, seconds in times.items()}
     for name, seconds in times.items():
         low, high = (1e3 * float(np.quantile(seconds, share)) for share in (0.25, 0.75))
-        ratio = medians[name] / next(iter(medians.values()))
-        rows[name] |= {"ms": 1e3 * medians[name], "25 %": low, "75 %": high, "calls": len(seconds)}
-        rows[name] |= {"/ first": ratio, "rate": float(work / medians[name]), "per s": unit}
+        rows[name] |= {"ms": 1e3 * medians[name], "25 %": low, "75 %": high, "calls": len(seconds),
+                      "/ first": medians[name] / next(iter(medians.values())),
+                      "rate": float(work / medians[name]), "per s": unit}  # fmt: skip
     yield from rows.values()
 
 

@@ -1,5 +1,6 @@
 """Results of a device beside float64: loops of the paper's equations, NumPy, or the same code on the CPU."""
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -25,11 +26,9 @@ SIZE, CANDIDATES, DIMENSION = 336, 8, 128  # px
 SIDE = 12  # the keypoints of an image are SIDE^2, as cells of a grid
 TIE = 1e-6  # similarities that differ by less are equal in float32
 MATCHING: dict[str, dict[str, Any]] = {
-    "bfloat16": {"product": "bfloat16", "chunk_size": 1},
-    "float32": {"product": "float32"},
-    "one after the other": {"chunk_size": 1},
-    "without cross-check": {"cross_check": "none"},
-}
+    "bfloat16": {"product": "bfloat16", "chunk_size": 1}, "float32": {"product": "float32"},
+    "one after the other": {"chunk_size": 1}, "without cross-check": {"cross_check": "none"},
+}  # fmt: skip
 SCORES: dict[str, Callable[..., float]] = {  # of points0, points1, distances and summed scores of one pair
     "histogram": lambda p0, p1, _, s: oracles.histogram_of_shifts(p1 - p0, s, (SIZE, SIZE), (SIZE, SIZE))[0].max(),
     "anchor": lambda p0, p1, _, s: oracles.anchor_points(p0, p1, s, (SIZE, SIZE), (SIZE, SIZE)),
@@ -40,10 +39,9 @@ GRIDS = {
     mfvpr.AnchorPoints(): {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]},
 }
 SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
-    mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4,
-    mfvpr.AnchorPoints(temperature=0.1): 5e-3,
+    mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4, mfvpr.AnchorPoints(temperature=0.1): 5e-3,
     mfvpr.AggregatedScore(temperature=2.0): 1e-4,
-}
+}  # fmt: skip
 NETWORKS = {  # checkpoint -> side of the images in px, result; weights are random unless they are installed
     networks.ALIKED[0]: (320, lambda model, images: model.levels(images / 255)[1]),
     networks.D2NET: (336, lambda model, images: model(preprocess(images, "caffe"))),
@@ -63,23 +61,25 @@ class Task(NamedTuple):
     reference: str = "float64, CPU"
 
 
-def checks(*, is_small: bool) -> Iterator[dict[str, Any]]:
-    """Rows of all checks; several at the same time, since most of it is compiling."""
+def checks(*, is_small: bool, end: float) -> Iterator[dict[str, Any]]:
+    """Rows of all checks that begin before the time `end`; several at the same time, since most of it is compiling."""
     tasks = [task for part in PARTS for task in part(is_small)]
-    return ordered_map(check, tasks, workers=available_cpus())
+    return ordered_map(partial(check, end=end), tasks, workers=available_cpus())
 
 
-def check(task: Task) -> dict[str, Any]:
+def check(task: Task, end: float) -> dict[str, Any]:
     """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
     row: dict[str, Any] = {"what": task.what, "reference": task.reference}
+    if time.monotonic() > end:
+        return row | {"exact": "skipped: out of time"}
     try:
         got, expected, differ, entries = (*task.compute(), 0, 0)[:4]
     except Exception as error:  # the other checks go on
         return row | {"exact": f"failed: {error!r}"[:80]}
     got, expected = (np.asarray(values, np.float64) for values in (got, expected))
     deviation = float(np.max(np.abs(got - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
-    exact = "yes" if deviation <= task.allowed and not differ else "NO"
-    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries, "exact": exact}
+    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
+                  "exact": "yes" if deviation <= task.allowed and not differ else "NO"}  # fmt: skip
 
 
 def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:

@@ -24,14 +24,9 @@ QUICK = 0.05  # seconds
 
 
 def compete(
-    entries: list[Entry],
-    rounds: int,
-    out: Path,
-    *,
-    title: str,
-    setting: Mapping[str, Any],
-    remarks: Callable[[Seconds, Results], Iterable[str]],
-) -> Results:
+    entries: list[Entry], rounds: int, out: Path, *,
+    title: str, setting: Mapping[str, Any], remarks: Callable[[Seconds, Results], Iterable[str]],
+) -> Results:  # fmt: skip
     """Time entries in turns, print a table below the title, and write it with the setting as JSON to `out`.
 
     Each step has an implementation called "mfvpr"; the table shows how many times as long the others take.

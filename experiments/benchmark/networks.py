@@ -5,6 +5,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,15 @@ from mfvpr.checkpoints.files import load
 from mfvpr.checkpoints.networks import NETWORKS, blueprint
 from mfvpr.datasets import read_image, resize
 from mfvpr.datasets.streets import draw_streets
-from mfvpr.features import AlikedFeatures, D2NetFeatures, Description, MixVprDescriptor
+from mfvpr.features import (
+    AlikedFeatures,
+    D2NetFeatures,
+    Description,
+    GlobalDescriptor,
+    MixVprDescriptor,
+    PatchNetVladFeatures,
+    SelaVprFeatures,
+)
 from mfvpr.features.network import TOGETHER, compile_network
 from mfvpr.networks.d2net import extract
 from mfvpr.networks.imagenet import preprocess
@@ -27,6 +36,9 @@ BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
 D2NET, MIXVPR, ALIKED = "d2_tf", "mixvpr_4096", ("aliked-n16", "aliked-n32")
 MAP, ON_DEVICE, FEATURES = "D2-Net dense map", "D2-Net features, left on the device", "D2-Net features"
+PLACES_SIZE, SELAVPR_SIZE = (640, 480), (224, 224)  # px; NetVLAD and CosPlace take Patch-NetVLAD's size here
+PATCHES = {"patchnetvlad_mapillary_512": (5,), "patchnetvlad_mapillary_4096": (2, 5, 8)}  # speed, performance
+GEM, SELAVPR, BLOCKS = "cosplace_resnet50_2048", "selavpr_msls", 24
 THRESHOLD = 0.1  # of ALIKED's detection score, the paper's
 PAPER = "paper, RTX 2080 Ti: features 0.03 s (D2-Net at 320), matching and score of 50 candidates 0.07 s"
 
@@ -38,7 +50,9 @@ class Contest(NamedTuple):
     checkpoint: str
     size: tuple[int, int]  # (width, height) px
     extractor: Callable[..., Callable]  # takes the model and `batch_size`; the result takes a batch of images
-    peer: str | None  # torch's function in `torch_networks`
+    peer: str | None  # torch's function: module.function
+    options: dict[str, Any] | None = None  # keyword arguments of torch's function
+    note: str = ""
 
 
 def run(rounds: int | None, out: Path) -> Results:
@@ -53,8 +67,9 @@ def run(rounds: int | None, out: Path) -> Results:
             entries.append((f"{contest.step}, batch {count}", "mfvpr", partial(extractor, batch[:count])))
         if contest.peer and find_spec("torch"):
             entries += torch_entries(contest, arrays, batch, BATCHES)
-    sizes = f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px"
-    published = [name for name in (D2NET, MIXVPR, *ALIKED) if is_installed(entry_of(name))]
+    sizes = (f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px, SelaVPR at "
+             f"{SELAVPR_SIZE[0]} px, others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px")  # fmt: skip
+    published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
     weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
     title = f"images of the synthetic street, {sizes}, {weights}"
     setting = {"batches": BATCHES, "sizes": sizes, "weights": weights}
@@ -64,16 +79,26 @@ def run(rounds: int | None, out: Path) -> Results:
 def contests() -> Iterator[Contest]:
     """All steps; features and descriptors are timed from host to host."""
     size = (D2NET_SIZE, D2NET_SIZE)
-    dense_map = partial(_program, lambda model, batch: model(preprocess(batch, "caffe")))
-    yield Contest(MAP, D2NET, size, dense_map, "d2net_map")
+    yield Contest(MAP, D2NET, size, partial(_program, lambda model, batch: model(preprocess(batch, "caffe"))),
+                  "torch_networks.d2net_map")  # fmt: skip
     yield Contest(ON_DEVICE, D2NET, size, partial(_program, partial(extract, share=0.3)), None)
-    yield Contest(FEATURES, D2NET, size, partial(D2NetFeatures, image_size=size), "d2net")
+    yield Contest(FEATURES, D2NET, size, partial(D2NetFeatures, image_size=size), "torch_networks.d2net")
     size = (MIXVPR_SIZE, MIXVPR_SIZE)
-    yield Contest("MixVPR descriptor", MIXVPR, size, MixVprDescriptor, "mixvpr")
+    yield Contest("MixVPR descriptor", MIXVPR, size, MixVprDescriptor, "torch_networks.mixvpr")
     size = (ALIKED_SIZE, ALIKED_SIZE)
     for name in ALIKED:
         extractor = partial(AlikedFeatures, image_size=size, threshold=THRESHOLD)
-        yield Contest(f"{name} features", name, size, extractor, None)
+        yield Contest(f"{name} features", name, size, extractor, "torch_aliked.aliked", {"threshold": THRESHOLD},
+                      note=" (deformable convolution in Python)")  # fmt: skip
+    vector = partial(GlobalDescriptor, image_size=PLACES_SIZE)
+    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "torch_networks.netvlad")
+    for name, sizes in PATCHES.items():
+        step = f"Patch-NetVLAD features, sizes {', '.join(map(str, sizes))}, {name.rpartition('_')[2]} dimensions"
+        extractor = partial(PatchNetVladFeatures, patch_sizes=sizes, image_size=PLACES_SIZE)
+        yield Contest(step, name, PLACES_SIZE, extractor, "torch_networks.patch_netvlad", {"sizes": sizes})
+    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "torch_networks.gem")
+    extractor = partial(SelaVprFeatures, image_size=SELAVPR_SIZE)
+    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "torch_networks.selavpr", {"blocks": BLOCKS})
 
 
 def _program(function: Callable[[Any, Any], Any], model: Any, batch_size: int) -> Callable[[np.ndarray], Any]:
@@ -136,23 +161,25 @@ def torch_entries(
     """Torch in both memory layouts, in float32 on a GPU; on a CPU also one image after the other, as in mfvpr."""
     import torch
 
-    from experiments.benchmark import torch_networks
+    from experiments.benchmark.torch_networks import run_network, torch_weights
 
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
-    network = getattr(torch_networks, str(contest.peer))
+    module, _, function = str(contest.peer).partition(".")
+    network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
     device, table = "cuda" if torch.cuda.is_available() else "cpu", NETWORKS[contest.checkpoint].table
 
     def run_with(layout: torch.memory_format) -> Callable[[list[np.ndarray]], list[Any]]:
-        weights = torch_networks.torch_weights(arrays, table, device, layout)
-        return partial(torch_networks.run_network, network, weights=weights, device=device, layout=layout)
+        weights = torch_weights(arrays, table, device, layout)
+        return partial(run_network, network, weights=weights, device=device, layout=layout)
 
     default, channels_last = run_with(torch.contiguous_format), run_with(torch.channels_last)
     entries: list[Entry] = []
     for count in batches:
         batch, step = images[:count], f"{contest.step}, batch {count}"
-        entries.append((step, "torch", partial(default, [batch])))
-        entries.append((step, "torch, channels last", partial(channels_last, [batch])))
+        entries.append((step, f"torch{contest.note}", partial(default, [batch])))
+        entries.append((step, f"torch, channels last{contest.note}", partial(channels_last, [batch])))
         if count > 1 and device == "cpu":
-            entries.append((step, "torch, channels last, one by one", partial(channels_last, np.split(batch, count))))
+            split = partial(channels_last, np.split(batch, count))
+            entries.append((step, f"torch, channels last, one by one{contest.note}", split))
     return entries

@@ -3,7 +3,7 @@
 Each `*_entries` function returns the calls to time, none where its library is not installed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -44,7 +44,7 @@ def run(rounds: int | None, out: Path) -> None:
     data = make_data()
     matches = float(np.asarray(data.matches.mask).sum(1).mean())
     sizes = f"1 query x {CANDIDATES} candidates, {KEYPOINTS} features of {DIMENSION} dimensions"
-    libraries = (mfvpr_entries, opencv_entries, torch_entries, numpy_entries)
+    libraries = (mfvpr_entries, opencv_entries, faiss_entries, torch_entries, numpy_entries)
     entries = [entry for entries in libraries for entry in entries(data)]
     setting = {"candidates": CANDIDATES, "keypoints": KEYPOINTS, "dimension": DIMENSION, "matches_per_pair": matches}
     title = f"{sizes}, {matches:.0f} matches a pair"
@@ -97,8 +97,19 @@ def mfvpr_entries(data: Data) -> list[Entry]:
     def product(query: Features, candidates: Features) -> jax.Array:
         return jax.lax.map(lambda descriptors: query.descriptors @ descriptors.T, candidates.descriptors)
 
+    def sum_of_product(query: Features, candidates: Features) -> jax.Array:
+        return jax.lax.map(lambda descriptors: (query.descriptors @ descriptors.T).sum(0), candidates.descriptors)
+
     def both(query: Features, candidates: Features) -> jax.Array:
         return mfvpr.score_candidates(histogram, _match(query, candidates))
+
+    def rounded_product(query: Features, candidates: Features) -> jax.Array:
+        query_columns = query.descriptors.astype(jnp.bfloat16).T
+
+        def product(descriptors: jax.Array) -> jax.Array:
+            return jnp.matmul(descriptors.astype(jnp.bfloat16), query_columns, preferred_element_type=jnp.float32)
+
+        return jax.lax.map(product, candidates.descriptors)
 
     def wait(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
         return lambda: jax.block_until_ready(function(*inputs, **options))
@@ -106,10 +117,17 @@ def mfvpr_entries(data: Data) -> list[Entry]:
     score = mfvpr.score_candidates
     return [
         (MATCHING, "bare product (JAX)", wait(jax.jit(product), *images)),
+        (MATCHING, "bare product (JAX), not stored", wait(jax.jit(sum_of_product), *images)),
+        (MATCHING, "bare product (JAX), bfloat16", wait(jax.jit(rounded_product), *images)),
         (MATCHING, "mfvpr", wait(mfvpr.match_candidates, *images)),
         (MATCHING, "mfvpr, float32", wait(mfvpr.match_candidates, *images, product="float32")),
         (MATCHING, "mfvpr, under jit", wait(jax.jit(mfvpr.match_candidates), *images)),
         (MATCHING, "mfvpr, with ratio", wait(mfvpr.match_candidates, *images, with_ratio=True)),
+        (
+            MATCHING,
+            "mfvpr, with ratio, float32",
+            wait(mfvpr.match_candidates, *images, with_ratio=True, product="float32"),
+        ),
         (BOTH, "mfvpr", wait(jax.jit(both), *images)),
         (HISTOGRAM, "mfvpr", wait(score, mfvpr.HistogramOfShifts(), data.matches)),
         (ANCHOR, "mfvpr", wait(score, mfvpr.AnchorPoints(), data.matches)),
@@ -127,14 +145,40 @@ def opencv_entries(data: Data) -> list[Entry]:
         return [matcher.match(query.descriptors, descriptors) for descriptors in candidates.descriptors]
 
     def both() -> list[float]:
-        scores = []
-        for k, matches in enumerate(match()):
-            i, j = np.array([(match.queryIdx, match.trainIdx) for match in matches]).T
-            shifts = candidates.keypoints[k][j] - query.keypoints[i]
-            scores.append(_histogram_loop(shifts, query.scores[i] + candidates.scores[k][j]))
-        return scores
+        pairs = (np.array([(match.queryIdx, match.trainIdx) for match in matches]).T for matches in match())
+        return _scores(_histogram_loop, query, candidates, pairs)
 
     return [(MATCHING, "OpenCV BFMatcher(crossCheck)", match), (BOTH, "OpenCV + NumPy loop", both)]
+
+
+def faiss_entries(data: Data) -> list[Entry]:
+    """Exact search both ways, pair by pair; the score in NumPy, all bins and matches of a pair at once."""
+    if find_spec("faiss") is None:
+        return []
+    import faiss
+
+    query, candidates = jax.tree.map(np.asarray, (data.query, data.candidates))
+
+    def make_index(descriptors: np.ndarray) -> Any:
+        index = faiss.IndexFlatIP(DIMENSION)
+        index.add(descriptors)  # pyright: ignore[reportCallIssue]
+        return index
+
+    query_index = make_index(query.descriptors)
+
+    def match() -> list[tuple[np.ndarray, np.ndarray]]:
+        pairs = []
+        for descriptors in candidates.descriptors:
+            nearest1 = make_index(descriptors).search(query.descriptors, 1)[1][:, 0]
+            nearest0 = query_index.search(descriptors, 1)[1][:, 0]
+            i = np.flatnonzero(nearest0[nearest1] == np.arange(KEYPOINTS))
+            pairs.append((i, nearest1[i]))
+        return pairs
+
+    def both() -> list[float]:
+        return _scores(_histogram_broadcast, query, candidates, match())
+
+    return [(MATCHING, "FAISS both ways", match), (BOTH, "FAISS + NumPy", both)]
 
 
 def torch_entries(data: Data) -> list[Entry]:
@@ -193,6 +237,14 @@ def numpy_entries(data: Data) -> list[Entry]:
     return [
         (HISTOGRAM, "NumPy, loop over matches", lambda: [_histogram_loop(*pair) for pair in pairs]),
         (HISTOGRAM, "NumPy, broadcast", lambda: [_histogram_broadcast(*pair) for pair in pairs]),
+    ]
+
+
+def _scores(score: Callable, query: Features, candidates: Features, pairs: Iterable[Any]) -> list[float]:
+    """Score each candidate by its pairs of features (i of the query, j of the candidate)."""
+    return [
+        score(candidates.keypoints[k][j] - query.keypoints[i], query.scores[i] + candidates.scores[k][j])
+        for k, (i, j) in enumerate(pairs)
     ]
 
 

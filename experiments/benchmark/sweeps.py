@@ -41,8 +41,8 @@ def run(rounds: int | None, out: Path) -> None:
         *_histogram_entries("other place", _shuffle(same), teams),  # none agree
         *_anchor_entries(same),
     ]
-    setting = {"pairs": CANDIDATES, "matches_per_pair": SLOTS, "denormals": flushed}
-    setting |= {"sigma": SIGMAS, "bin_size": BIN_SIZES}
+    setting = {"pairs": CANDIDATES, "matches_per_pair": SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES,
+               "denormals": flushed}  # fmt: skip
     title = f"{CANDIDATES} pairs with {SLOTS} matches each; denormal floats {flushed}"
     compete(entries, rounds or 7, out, title=title, setting=setting, remarks=_remarks)
 

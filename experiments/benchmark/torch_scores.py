@@ -81,21 +81,16 @@ def score(
     weights = torch.where(mask, 2 - distance if scorer == "sum" else scores0 + scores1, 0.0)
     if scorer == "anchor":
         return anchor(points0, points1, weights)
-    if scorer == "sum":
-        return aggregate(points1 - points0, weights, mask)
-    return histogram(points1 - points0, weights, bin_centers(BIN, mask.device), SIGMA)
+    shifts = points1 - points0
+    return aggregate(shifts, weights, mask) if scorer == "sum" else histogram(
+        shifts, weights, bin_centers(BIN, mask.device), SIGMA
+    )  # fmt: skip
 
 
 def grid(
-    shifts: Tensor,
-    weights: Tensor,
-    distance: Tensor,
-    mask: Tensor,
-    *,
-    sigmas: Sequence[float],
-    bin_sizes: Sequence[float],
-    max_distances: Sequence[float],
-) -> Tensor:
+    shifts: Tensor, weights: Tensor, distance: Tensor, mask: Tensor, *, sigmas: Sequence[float],
+    bin_sizes: Sequence[float], max_distances: Sequence[float],
+) -> Tensor:  # fmt: skip
     """Scores of all settings, with weights and 1: `[bins * sigmas, C, 2 * distances]`."""
     centers, limits = [bin_centers(size, mask.device) for size in bin_sizes], distance.new_tensor(max_distances)
     near = ((distance[:, None] <= limits[:, None]) & mask[:, None]).float()

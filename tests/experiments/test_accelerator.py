@@ -20,6 +20,7 @@ from tests.needs import skip_without
     ],
 )
 def test_results_are_exact_and_times_are_reported(parts, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(accelerator, "SECONDS", dict.fromkeys(accelerator.SECONDS, 1000))
     monkeypatch.setattr(accelerator_checks, "PARTS", parts)
     report = accelerator.run(2, tmp_path / "report.json", ["correct", "rates"])
     assert json.loads((tmp_path / "report.json").read_text())["groups"] == report["groups"]
@@ -41,7 +42,10 @@ def test_matches_by_products_of_few_digits_differ():
     assert accelerator_checks.match(images, {}, rounded)[2] > 10
 
 
-def test_failing_calls_say_so():
+def test_late_and_failing_calls_say_so():
+    case = accelerator.Case("rates", "of {}", lambda _: pytest.fail("too late"), (1,), (2,))
+    late = list(accelerator.time_cases([case], 1, on_cpu=True, end=time.monotonic() - 1))
+    assert late == [{"case": "of 2", "note": "skipped: out of time"}]
     calls = {"fails": lambda: 1 / 0, "runs": lambda: time.sleep(1e-3)}
     fails, runs = accelerator.time_calls("both", calls, 1.0, "call", 3)
     assert "ZeroDivisionError" in fails["note"]
@@ -50,7 +54,7 @@ def test_failing_calls_say_so():
 
 
 def test_groups_are_named(tmp_path):
-    assert {case.group for case in accelerator.CASES} == {*accelerator.GROUPS} - {"correct"}
+    assert {case.group for case in accelerator.CASES} == accelerator.SECONDS.keys() - {"correct"}
     with pytest.raises(InputError, match="networks"):
         accelerator.run(1, tmp_path / "report.json", ["network"])
 

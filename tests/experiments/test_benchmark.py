@@ -1,6 +1,7 @@
 """The networks of the benchmark do the same on both sides, so that equals are compared."""
 
 import json
+from functools import partial
 from importlib import import_module
 
 import numpy as np
@@ -10,6 +11,9 @@ from experiments.benchmark import search
 from experiments.benchmark.__main__ import BENCHMARKS
 from experiments.benchmark.__main__ import run as run_benchmark
 from mfvpr import InputError
+from mfvpr.checkpoints.networks import NETWORKS, Network
+from mfvpr.checkpoints.tables import SELAVPR
+from mfvpr.networks import SelaVpr
 from tests.needs import skip_without
 
 pytestmark = pytest.mark.slow
@@ -27,7 +31,10 @@ def contest(tmp_path_factory):
     torch.set_num_threads(1)  # several wait for each other when other processes take their cores
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
-        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",)}
+        small = {"BATCHES": (2,), "D2NET_SIZE": 96, "ALIKED_SIZE": 96, "ALIKED": ("aliked-n16",), "BLOCKS": 2,
+                 "PLACES_SIZE": (160, 128), "SELAVPR_SIZE": (42, 28)}  # fmt: skip
+        narrow = Network(lambda: partial(SelaVpr, 128, 2, 2), SELAVPR)
+        patch.setitem(NETWORKS, networks.SELAVPR, narrow)
         for name, value in small.items():
             patch.setattr(networks, name, value)
         out = tmp_path_factory.mktemp("benchmark") / "networks.json"
@@ -44,8 +51,9 @@ def peers(contest, step):
     return ours, by_name.values()
 
 
-def test_keypoints_are_the_same(contest):
-    ours, all_theirs = peers(contest, "D2-Net features")
+@pytest.mark.parametrize("step", ["D2-Net", "aliked-n16"])
+def test_keypoints_are_the_same(contest, step):
+    ours, all_theirs = peers(contest, f"{step} features")
     assert len(ours) == 2
     for theirs in all_theirs:
         for features, expected in zip((image.features for image in ours), theirs, strict=True):
@@ -67,10 +75,24 @@ def test_dense_maps_are_the_same(contest):
         np.testing.assert_allclose(ours, np.stack([np.asarray(dense) for dense in theirs]), atol=1e-4 * ours.max())
 
 
-def test_global_descriptors_are_the_same(contest):
-    ours, all_theirs = peers(contest, "MixVPR descriptor")
+@pytest.mark.parametrize("step", ["MixVPR descriptor", "NetVLAD descriptor", "generalized mean of ResNet-50"])
+def test_global_descriptors_are_the_same(contest, step):
+    ours, all_theirs = peers(contest, step)
     for theirs in all_theirs:
         np.testing.assert_allclose([image.vector for image in ours], theirs, atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [
+    "Patch-NetVLAD features, sizes 5, 512 dimensions", "Patch-NetVLAD features, sizes 2, 5, 8, 4096 dimensions",
+    "SelaVPR features",
+])  # fmt: skip
+def test_local_descriptors_are_the_same(contest, step):
+    ours, all_theirs = peers(contest, step)
+    for theirs in all_theirs:
+        for description, (vector, *local) in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(description.vector, vector, atol=1e-5)
+            for features, expected in zip(description.local, local, strict=True):
+                np.testing.assert_allclose(features.descriptors.ravel(), expected.ravel(), atol=2e-5)
 
 
 def test_report_has_everyone(contest):
@@ -99,4 +121,4 @@ def test_the_file_of_others_stays(tmp_path):
     """It is refused before the work."""
     (tmp_path / "precious.json").write_text("{}")
     with pytest.raises(InputError, match="expected a new file"):
-        run_benchmark("scores", [], 1, tmp_path / "precious.json")
+        run_benchmark("scores", [], 1, tmp_path / "precious.json", is_quick=False)
