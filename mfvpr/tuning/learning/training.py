@@ -1,8 +1,8 @@
 """Gradient descent on a pytree of arrays, with validation, early stopping, and resuming to the bit."""
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +13,12 @@ import numpy as np
 import optax
 
 from mfvpr.core.types import Array
-from mfvpr.tuning.learning.training_checkpoints import lock_checkpoints, restore, save_checkpoint
+from mfvpr.storage.cache_files import disk_errors_as_input_errors
+from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.progress import Track, no_progress
+
+CHECKPOINT = "checkpoint.npz"  # in the folder of a training; each one replaces the one before
 
 
 class TrainingError(InputError):
@@ -84,8 +87,8 @@ def fit(
         track: progress over the steps.
 
     Raises:
-        InputError: the folder cannot be used, another process trains in it, or it has other files, or a checkpoint of
-            another training or of more steps.
+        InputError: the folder cannot be used, or has a checkpoint that is damaged, of another training, or of more
+            steps.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
     every, steps, patience = schedule.every, schedule.steps, schedule.patience
@@ -115,36 +118,62 @@ def fit(
 
     parameters = _strong(parameters)
     state = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
-    with lock_checkpoints(checkpoints.folder) if checkpoints else nullcontext():
-        stored = restore(*checkpoints, state) if checkpoints else None
-        if stored:
-            state, (rows, losses) = _strong(stored[0]), stored[1]
-            history = [Record(*row) for row in rows]
-        else:
-            history, losses = [Record(0, None, validation(parameters, 0))], []
-        done = history[-1].step + len(losses)
-        if checkpoints and done > steps:
-            raise InputError(
-                f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; ask for more "
-                "steps, or choose another folder"
-            )
-        remaining = 0 if _out_of_patience(history, patience) else steps - done
-        for step in track(range(done, done + remaining), remaining):
-            learned, memory, loss, is_finite = update(state.parameters, state.optimizer, batches(step))
-            if not is_finite:
-                raise _not_finite(f"the loss, a gradient or a parameter of batch {step}", step)
-            state, losses = _State(learned, state.best, memory), [*losses, float(loss)]
-            if is_due := (step + 1) % every == 0:
-                (state, history), losses = add_record(state, history, losses), []
-            if checkpoints and (is_due or step + 1 == steps):
-                save_checkpoint(checkpoints.folder, step + 1, checkpoints.recipe, state, (history, losses))
-            if _out_of_patience(history, patience):
-                break
-        if losses:  # after the checkpoint: a training of more steps would not validate here
-            state, history = add_record(state, history, losses)
+    stored = restore(*checkpoints, state) if checkpoints else None
+    if stored:
+        state, (rows, losses) = _strong(stored[0]), stored[1]
+        history = [Record(*row) for row in rows]
+    else:
+        history, losses = [Record(0, None, validation(parameters, 0))], []
+    done = history[-1].step + len(losses)
+    if checkpoints and done > steps:
+        raise InputError(
+            f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; ask for more "
+            "steps, or choose another folder"
+        )
+    remaining = 0 if _out_of_patience(history, patience) else steps - done
+    for step in track(range(done, done + remaining), remaining):
+        learned, memory, loss, is_finite = update(state.parameters, state.optimizer, batches(step))
+        if not is_finite:
+            raise _not_finite(f"the loss, a gradient or a parameter of batch {step}", step)
+        state, losses = _State(learned, state.best, memory), [*losses, float(loss)]
+        if is_due := (step + 1) % every == 0:
+            (state, history), losses = add_record(state, history, losses), []
+        if checkpoints and (is_due or step + 1 == steps):
+            save_checkpoint(*checkpoints, state, (history, losses))
+        if _out_of_patience(history, patience):
+            break
+    if losses:  # after the checkpoint: a training of more steps would not validate here
+        state, history = add_record(state, history, losses)
     is_early = _out_of_patience(history, patience)
     ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
     return Fit(state.best, _best(history).step, tuple(history), ended)
+
+
+def save_checkpoint(folder: Path, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
+    """Write the pytree `state`, with the recipe and the progress as JSON values."""
+    arrays = {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(state))}
+    with disk_errors_as_input_errors(folder):
+        write_arrays(folder / CHECKPOINT, arrays | {"record": np.array(json.dumps([recipe, progress]))})
+
+
+def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
+    """State and progress of the checkpoint in a folder, None without one; `state` has the same structure.
+
+    Raises:
+        InputError: another recipe, or a damaged file.
+    """
+    with disk_errors_as_input_errors(folder):
+        try:
+            arrays = read_arrays(folder / CHECKPOINT)
+        except FileNotFoundError:
+            return None
+    stored, progress = json.loads(str(arrays.pop("record")))
+    expected = json.loads(json.dumps(recipe))  # tuples become lists
+    if names := [name for name in {**expected, **stored} if expected.get(name) != stored.get(name)]:
+        got = f"expected the checkpoint of this training, got that of another {names[0]}"
+        raise InputError(f"{folder}: {got}; choose another folder, or delete this one")
+    leaves = [arrays[str(place)] for place in range(len(arrays))]
+    return jax.tree.unflatten(jax.tree.structure(state), leaves), progress
 
 
 def _not_finite(what: str, step: int) -> TrainingError:

@@ -1,5 +1,7 @@
 """Training: what it finds, when it ends, and that an interruption changes nothing."""
 
+import shutil
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,9 @@ import optax
 import pytest
 
 from mfvpr import InputError
-from mfvpr.tuning.learning.training import TrainingError
-from tests.tuning.learning.toys import START, batches, contents, objective, same, train, validate
+from mfvpr.tuning.learning.training import CHECKPOINT, TrainingError
+from tests.storage.synthetic_features import DAMAGE, digests
+from tests.tuning.learning.toys import RECIPE, START, batches, objective, same, train, validate
 
 pytestmark = pytest.mark.thorough
 
@@ -16,6 +19,13 @@ pytestmark = pytest.mark.thorough
 @pytest.fixture(scope="module")
 def uninterrupted():
     return train()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, uninterrupted):
+    folder = tmp_path_factory.mktemp("trained")
+    assert same(train(folder), uninterrupted)
+    return folder
 
 
 def test_finds_the_least_squares_line():
@@ -76,10 +86,10 @@ def test_goes_on_to_the_bit(tmp_path, uninterrupted):
     half = train(tmp_path, steps=10)
     assert half.history == uninterrupted.history[:3]
     assert same(train(tmp_path), uninterrupted)
-    assert sorted({path.name for path in tmp_path.iterdir()} - {".lock"}) == ["15", "20"]
-    before = contents(tmp_path)
+    before = digests(tmp_path)
+    assert list(before) == [CHECKPOINT]
     assert same(train(tmp_path, batches=None), uninterrupted)  # nothing is left to do
-    assert contents(tmp_path) == before
+    assert digests(tmp_path) == before
 
 
 @pytest.mark.parametrize("validated", [True, False])
@@ -88,9 +98,9 @@ def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated
     options = {} if validated else {"validate": None}
     short = train(tmp_path, steps=7, **options)
     assert [record.step for record in short.history] == [0, 5, 7]
-    before = contents(tmp_path)
+    before = digests(tmp_path)
     assert same(train(tmp_path, steps=7, batches=None, **options), short)
-    assert contents(tmp_path) == before
+    assert digests(tmp_path) == before
     assert same(short, train(steps=7, **options))
     assert same(train(tmp_path, steps=9, **options), train(steps=9, **options))
     assert same(train(tmp_path, **options), train(**options))
@@ -109,14 +119,31 @@ def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_p
     assert same(longer, train(validate=at_seven))
 
 
-def test_a_second_training_in_one_folder_is_refused(tmp_path):
-    def second(step):
-        if step == 8:
-            with pytest.raises(InputError, match="another process"):
-                train(tmp_path)
-        return batches(step)
+@pytest.mark.parametrize(("changes", "difference"), [
+    ({"recipe": {**RECIPE, "model": {"scorer": "curve"}}}, "that of another model"),
+    ({"recipe": {**RECIPE, "seed": 0}}, "that of another seed"),
+    ({"recipe": {**RECIPE, "rate": 0.1}}, "that of another rate"),
+    ({"recipe": {}}, "that of another model"),
+    ({"steps": 5}, "this checkpoint is of step 20, expected at most 5"),
+])  # fmt: skip
+def test_another_training_is_refused_and_nothing_changes(finished, changes, difference):
+    before = digests(finished)
+    with pytest.raises(InputError) as refusal:
+        train(finished, **changes)
+    assert str(refusal.value).startswith(f"{finished}: ")
+    assert f"{difference}; " in str(refusal.value)
+    assert digests(finished) == before
 
-    assert same(train(tmp_path, batches=second), train(tmp_path))
+
+@pytest.mark.parametrize("damage", ["flipped", "half"])
+def test_a_checkpoint_that_cannot_be_used_is_named(finished, tmp_path, damage):
+    shutil.copy(finished / CHECKPOINT, tmp_path)
+    DAMAGE[damage](tmp_path / CHECKPOINT)
+    with pytest.raises(InputError, match=rf"{CHECKPOINT}: .* damaged ones; delete it$"):
+        train(tmp_path)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match=r"file: cannot be used"):
+        train(tmp_path / "file")
 
 
 def test_an_ended_training_stays_ended(tmp_path):
@@ -137,7 +164,6 @@ def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, uninterr
 
     with pytest.raises(TrainingError, match=r"^step 13: .* of batch 13 is not finite; [^\n]*$"):
         train(tmp_path, batches=spiked, objective=broken)
-    assert {path.name for path in tmp_path.iterdir()} - {".lock"} == {"5", "10"}
     assert same(train(tmp_path), uninterrupted)
 
 
