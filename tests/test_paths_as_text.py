@@ -17,7 +17,7 @@ from mfvpr.datasets import image_reading as images
 from mfvpr.datasets.published import published_dataset
 from mfvpr.datasets.streets import draw_streets, streets_folder
 from mfvpr.evaluation import Confidence, read_confidences, write_confidences
-from mfvpr.evaluation import confidence_calibration as calibration
+from mfvpr.evaluation import confidence as calibration
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
 from tests.builders import fill, random_matches

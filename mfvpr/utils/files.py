@@ -3,6 +3,7 @@
 import os
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -52,11 +53,12 @@ def require_replaceable(path: Path, mark: bytes | None = None) -> None:
         raise InputError(f"{path}: expected a new file, got one that exists; remove it, or name another")
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of killed processes below a folder; no process may be writing there."""
+def remove_leftovers(folder: Path, *, seconds: float = 0) -> None:
+    """Remove temporary files of killed processes below a folder that are older than so many seconds."""
     for path in folder.rglob(".*"):
-        if _TEMPORARY.fullmatch(path.name) and path.is_file():
-            path.unlink()
+        with suppress(FileNotFoundError):  # of a process that ended meanwhile
+            if _TEMPORARY.fullmatch(path.name) and path.is_file() and path.stat().st_mtime <= time.time() - seconds:
+                path.unlink()
 
 
 def used_bytes(folder: Path) -> int:

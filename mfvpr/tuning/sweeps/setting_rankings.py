@@ -180,7 +180,7 @@ def rank_settings(
                 fused = np.repeat(fuse_all(match_set, scores, seen), repeats, axis=0)
                 rows[view, numbers, place] = _first_rows(fused, cs, part.candidates, seen, view, options)
             if files is not None:
-                files.update({part.keys[number]: rows[:, number, place] for number in numbers})
+                files.update({part.keys[int(number)]: rows[:, number, place] for number in numbers})
     next(ticks, None)  # ends the progress
     return rows
 
