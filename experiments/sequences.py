@@ -28,7 +28,7 @@ from mfvpr.cli.systems import load_system
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset
-from mfvpr.evaluation.confidence_calibration import CalibrationData, calibration_data
+from mfvpr.evaluation.confidence import CalibrationData, calibration_data
 from mfvpr.evaluation.drives import Drive
 from mfvpr.evaluation.fusion import FrameCorrelation
 from mfvpr.evaluation.rankings import Ranked

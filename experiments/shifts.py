@@ -23,8 +23,8 @@ from mfvpr.datasets.streets import TRUTH
 from mfvpr.datasets.streets.camera import LANE, SPACING, plan_drives
 from mfvpr.datasets.streets.drawing import Drive, draw_drives
 from mfvpr.evaluation import System
-from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.stages import dominant_shifts, match
+from mfvpr.evaluation.system import folders_of
 from mfvpr.report import Table
 from mfvpr.storage import FeatureCache
 

@@ -22,6 +22,7 @@ from mfvpr.features import Aggregated, AlikedFeatures, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.report import Table
 from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import Entry
 
 SIZES, CANDIDATES, ROUNDS = (1000, 10_000), 50, 3
@@ -61,7 +62,7 @@ def _fill(street_map: Map, images: ImageFolder, size: int) -> None:
     street_map.learn(images)
     describing, rng = street_map.describing, np.random.default_rng(0)
     describer: Any = describing.describer
-    described = [image for batch in describing.folder(images, range(len(images))) for image in batch.values()]
+    described = [image for batch in describing.folder(images, FeatureCache()) for image in batch.values()]
     for start in Progress(f"map of {size}", size // BATCH, range(0, size, BATCH)):
         features = [_with_noise(described[row % len(described)][0], rng) for row in range(start, start + BATCH)]
         entries = [Entry(str(start + row), start + row, vector) for row, vector in enumerate(describer(features))]

@@ -199,8 +199,8 @@ def search(descriptor: int) -> dict[int, float]:
     seconds, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
     for size in (size for size in _DATABASES if size * descriptor <= _MOST_BYTES):
         database = Vectors()
-        for row in range(size):
-            database.put(row, rng.standard_normal(length, np.float32))
+        for _ in range(size):
+            database.append(rng.standard_normal(length, np.float32))
         query, times = rng.standard_normal(length, np.float32), []
         for _ in range(_ROUNDS + 1):
             start = time.perf_counter()

@@ -7,10 +7,10 @@ from mfvpr.core.parameters import parameters_of
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import block_bytes, scales
 from mfvpr.systems import assembly
-from mfvpr.tuning.learning.models import can_learn
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.setting_rankings import SETTINGS_PER_BLOCK
 from mfvpr.tuning.sweeps.setting_search import require_optuna
+from mfvpr.tuning.sweeps.sweep_axes import can_learn
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import free_host_bytes
 

@@ -10,9 +10,9 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import Contents, own_rows
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
-from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe
+from mfvpr.evaluation.system import folders_of
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly

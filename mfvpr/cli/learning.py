@@ -18,7 +18,7 @@ from mfvpr.report.run_files import matched_content
 from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.losses import LOSSES
-from mfvpr.tuning.learning.teaching import Options
+from mfvpr.tuning.learning.models import Options
 from mfvpr.tuning.learning.training import Checkpoints
 from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError

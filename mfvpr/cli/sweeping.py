@@ -1,7 +1,5 @@
 """Sweep: matches -> scores of all settings -> the best setting, and its recall on other queries."""
 
-import shutil
-from pathlib import Path
 from typing import Any
 
 from mfvpr.cli import run_folder, truth
@@ -15,7 +13,6 @@ from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import DriveRanking, Outcome, SweepOptions
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.files import expand_user
-from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.versions import versions
 
 
@@ -27,11 +24,11 @@ def sweep(settings: dict[str, Any]) -> None:
         inputs = prepare(settings, watch)
         protocol = inputs.protocol(settings["split"])
         matches, candidates = inputs.match(watch)
-        blocks = _block_folder(settings, inputs)
+        folder_of_rows = settings["cache"] and expand_user(settings["cache"])
         options = SweepOptions(
             settings["recall"]["ks"], settings["ties"], settings["fusion"]["retrieval_score"],
             settings["sequence"] and DriveRanking.of(DriveFilter(settings["sequence"]), inputs.dataset, protocol),
-            settings["chunk"]["settings"], settings["chunk"]["queries"], blocks, inputs.cache.runtime,
+            settings["chunk"]["settings"], settings["chunk"]["queries"], folder_of_rows, inputs.cache.runtime,
         )  # fmt: skip
         with watch("sweep"):
             if settings["search"] == "grid":
@@ -47,19 +44,6 @@ def sweep(settings: dict[str, Any]) -> None:
             folder, settings, inputs.ground_truth, text=sweeps.sweep_summary(outcome, heading),
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results), figures=sweeps.sweep_figures(outcome),
         )  # fmt: skip
-    if blocks is not None:
-        shutil.rmtree(blocks, ignore_errors=True)
-
-
-def _block_folder(settings: dict[str, Any], inputs: Inputs) -> Path | None:
-    """The folder of finished blocks, from which an interrupted sweep goes on; None without a store."""
-    if settings["cache"] is None:
-        return None
-    names = ("scorer", "grid", "search", "trials", "seed", "split", "recall", "ties", "fusion", "sequence")
-    sweep_settings = {name: settings[name] for name in names}  # or another sweep would remove the blocks when it ends
-    software = {name: versions()[name] for name in ("mfvpr", "jax", "numpy")}
-    name = fingerprint({"matches": inputs.matches_recipe(), "sweep": sweep_settings, "versions": software})
-    return expand_user(settings["cache"]) / f"{settings['dataset']['name']}_sweep-{name}"
 
 
 def _heading(settings: dict[str, Any], inputs: Inputs, outcome: Outcome) -> str:

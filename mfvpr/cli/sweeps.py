@@ -40,7 +40,7 @@ def sweep(
             on the other half. None = choose and report on all queries.
         thresholds: largest distances of a correct prediction, in the unit of the ground truth. The middle one decides.
             None = 1, 2 and 5 frames, or 25 m.
-        out: folder of the result, also of finished blocks: the same call continues an interrupted sweep.
+        out: folder of the result, also of the rankings by finished settings: the same call continues a sweep.
         cache: where features and matches are kept; None = in memory.
         runtime: devices, memory, progress and messages; None = those of the cache.
         axes: lists of values by parameter: fields of the scorer (words stand for weights, `inner.sigma` is passed as

@@ -34,7 +34,7 @@ __all__ = [
     "write_confidences",
 ]
 
-from .confidence_calibration import (
+from .confidence import (
     Confidence,
     calibration_data,
     confidence_inputs,

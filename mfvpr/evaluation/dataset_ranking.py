@@ -22,10 +22,9 @@ from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import rank_by_scores
-from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.rankings import Matched, Ranked
 from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.evaluation.system import System
+from mfvpr.evaluation.system import System, folders_of
 from mfvpr.evaluation.validation import score_warnings
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
@@ -35,9 +34,15 @@ from mfvpr.utils.runtime import Runtime
 
 KS = (1, 5, 10)  # depths of recall, by default
 Reason = Literal[  # why there is no place
-    "no candidates", "overexposed", "blurred", "too few features", "too few matches", "no better than noise",
-    "low confidence", "off the map",
-]  # fmt: skip
+    "no candidates",
+    "overexposed",
+    "blurred",
+    "too few features",
+    "too few matches",
+    "no better than noise",
+    "low confidence",
+    "off the map",
+]
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,8 +101,8 @@ class RankedDataset:
         for sequence, truth in zip(self.dataset.sequences, positives, strict=True):
             expected, got = (len(sequence.images), len(self.dataset.database)), (len(truth), truth.num_database)
             if got != expected:
-                raise InputError(f"{sequence.name}: expected a ground truth of {expected[0]} queries and {expected[1]} "
-                                 f"database images, got one of {got[0]} and {got[1]}")  # fmt: skip
+                words = "{} queries and {} database images".format
+                raise InputError(f"{sequence.name}: expected a ground truth of {words(*expected)}, got {words(*got)}")
         return positives
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = KS) -> dict[str, Recall]:

@@ -76,11 +76,10 @@ class Drive:
         if wrong := [each for each in vars(self).values() if not isinstance(each, int | float | None)]:
             raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
         if not (abs(advance) <= _MOST_ROWS and 1 / _MOST_ROWS <= self.spread <= _MOST_SPREAD):
-            raise InputError(f"Drive(advance={self.advance}, spread={self.spread}): expected at most {_MOST_ROWS} "
-                             f"rows, and a spread from {1 / _MOST_ROWS:g} to {_MOST_SPREAD}")  # fmt: skip
+            expected = f"at most {_MOST_ROWS} rows, and a spread from {1 / _MOST_ROWS:g} to {_MOST_SPREAD}"
+            raise InputError(f"{self}: expected {expected}")
         if not all(0 <= p <= 1 for p in (self.kidnapped, self.leaves, self.correct)) or not 0 < self.returns <= 1:
-            raise InputError(f"Drive(kidnapped={self.kidnapped}, leaves={self.leaves}, returns={self.returns}, "
-                             f"correct={self.correct}): expected from 0 to 1, and returns above 0")  # fmt: skip
+            raise InputError(f"{self}: expected probabilities from 0 to 1, and returns above 0")
 
     @property
     def off(self) -> float:

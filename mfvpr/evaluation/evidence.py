@@ -28,8 +28,8 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.evaluation.system import Pipeline, noise_image
-from mfvpr.features.extractor import Extractor, Source
+from mfvpr.evaluation.system import Pipeline, noise_images
+from mfvpr.features.extractor import Source
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.storage.feature_cache import FeatureCache
 
@@ -60,12 +60,6 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     return "blurred" if (correlations > _MOST_CORRELATION).all() else None
 
 
-def _reason_against_query(images: ImageFolder, row: int, extractor: Extractor | Source) -> Reason | None:
-    if isinstance(extractor, Source):
-        return None
-    return reason_against_image(resize(images.read(row), extractor.image_size, extractor.interpolation))
-
-
 def _correlation(first: np.ndarray, second: np.ndarray) -> float:
     """Correlation of two images of one size; NaN if one of them is plain."""
     first, second = ((values - values.mean()).ravel() for values in (first, second))
@@ -81,11 +75,6 @@ def strength(features: Features) -> float:
 def evidence_scores(pairs: Matches) -> Float[np.ndarray, " pairs"]:
     """Scores of the matches `[P, K]` of pairs; NaN if they have no ratio."""
     return np.full(len(pairs.mask), np.nan) if pairs.ratio is None else np.asarray(score_candidates(_SCORER, pairs))
-
-
-def noise_images(size: tuple[int, int]) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Images of random pixels and of random squares of 2 px, (width, height) px."""
-    return [noise_image(size, seed=seed, grain=grain) for seed in (0, 1) for grain in (1, 2)]
 
 
 def reason_against(matches: float, score: float, noise: float) -> Reason | None:
@@ -122,8 +111,11 @@ def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Re
         counts = np.sum([match_set.counts[pairs] for match_set in matched.matches], axis=0)
         of_sequence: list[Reason | None] = []
         for row, (weak, count, score) in enumerate(zip(is_weak, counts, _scores(matched)[pairs], strict=True)):
-            of_image = None if row in matched.bad_queries else _reason_against_query(images, row, extractor)
-            of_sequence.append("too few features" if weak else of_image or reason_against(count, score, noise))
+            reason = reason_against(count, score, noise)
+            if row not in matched.bad_queries and not isinstance(extractor, Source):
+                image = resize(images.read(row), extractor.image_size, extractor.interpolation)
+                reason = reason_against_image(image) or reason
+            of_sequence.append("too few features" if weak else reason)
         reasons.append(of_sequence)
     return reasons
 

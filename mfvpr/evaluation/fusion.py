@@ -62,11 +62,10 @@ class Fusion:
             raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
         for name, weight in self.weights.items():
             if name not in {RETRIEVAL, *scorers}:
-                raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it "
-                                 "as well")  # fmt: skip
+                raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it as well")
             if not _between(weight, *POSITIVE):
-                raise InputError(f"weights: expected numbers from {POSITIVE[0]:g} to {POSITIVE[1]:g}, got {name}="
-                                 f"{weight!r}")  # fmt: skip
+                bounds = f"{POSITIVE[0]:g} to {POSITIVE[1]:g}"
+                raise InputError(f"weights: expected numbers from {bounds}, got {name}={weight!r}")
 
     def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
         """Combined scores, from scores by name of the scorer."""
@@ -102,8 +101,8 @@ class FrameCorrelation:
 
     def __post_init__(self) -> None:
         if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
-            raise InputError(f"FrameCorrelation(previous={self.previous}, reach={self.reach}, gain={self.gain}): "
-                             "expected at least one query, a finite reach above 0, a finite gain from 0")  # fmt: skip
+            expected = "at least one query, a finite reach above 0, a finite gain from 0"
+            raise InputError(f"{self}: expected {expected}")
 
     def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
         """Correlated scores of a sequence, float32.

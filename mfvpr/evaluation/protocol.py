@@ -136,6 +136,6 @@ def evaluation_protocol(truth: Truth, thresholds: Iterable[float], split: Split 
     chosen = [half for name, half in zip(_HALVES, halves(places), strict=True) if split in (name, "both")]
     for half in chosen:
         if not len(positives[-1].take(half.tune).rows):
-            raise InputError(f"split={split}: no query of one half has a place far enough from the other half; "
-                             "use more queries, or smaller tolerances or radius")  # fmt: skip
+            reason = "no query of one half has a place far enough from the other half"
+            raise InputError(f"split={split}: {reason}; use more queries, or smaller tolerances or radius")
     return EvaluationProtocol(thresholds, truth.unit, positives, places, chosen, split=split)

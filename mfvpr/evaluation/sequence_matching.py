@@ -9,9 +9,8 @@ import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.image_sizes import folders_of
 from mfvpr.evaluation.rankings import Matched
-from mfvpr.evaluation.system import Pipeline
+from mfvpr.evaluation.system import Pipeline, folders_of
 from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
 from mfvpr.matchers.host_matcher import Side
 from mfvpr.matchers.match_set import MatchSet
@@ -81,9 +80,8 @@ def match_sequence(
             cache.warn(line)
     missing = [row for row in np.flatnonzero(~matched.candidates.mask.any(axis=1)) if row not in matched.bad_queries]
     if missing:
-        images = sequence.images
-        cache.warn(f"{images.paths[missing[0]]}: no candidates ({len(missing)} such queries of {len(images)}), which "
-                     "counts as a failure")  # fmt: skip
+        number = f"{len(missing)} such queries of {len(sequence.images)}"
+        cache.warn(f"{sequence.images.paths[missing[0]]}: no candidates ({number}), which counts as a failure")
     return replace(matched, weights=tuple(scale.weight for scale in work.pipeline.scales))
 
 

@@ -74,9 +74,12 @@ class DriveFilter:
 
 
 def follow(
-    evidence: Evidence, drive: Drive, there: Bool[np.ndarray, " rows"], method: Method = "causal",
+    evidence: Evidence,
+    drive: Drive,
+    there: Bool[np.ndarray, " rows"],
+    method: Method = "causal",
     depth: int | None = None,
-) -> Followed:  # fmt: skip
+) -> Followed:
     """The first `depth` rows of each image of a drive, None = as many as candidates; see `DriveFilter`."""
     images, candidates = evidence.rows.shape
     depth = min(candidates if depth is None else depth, len(there))

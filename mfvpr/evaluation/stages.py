@@ -114,8 +114,8 @@ def _match_queries(
 
 def _require_same_dimensions(queries: FeatureSet, database: FeatureSet) -> None:
     if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
-        raise InputError(f"features: expected as many dimensions on both sides, got {queries.dimension} "
-                         f"and {database.dimension} (database); extract all images alike")  # fmt: skip
+        got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
+        raise InputError(f"features: expected as many dimensions on both sides, got {got}")
 
 
 def stored_matches(
@@ -166,9 +166,11 @@ def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
 
 
 def dominant_shifts(
-    scorer: HistogramOfShifts, match_set: MatchSet,
-    queries: Int[np.ndarray, " pairs"], places: Int[np.ndarray, " pairs"],
-) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, "pairs 2"]]:  # fmt: skip
+    scorer: HistogramOfShifts,
+    match_set: MatchSet,
+    queries: Int[np.ndarray, " pairs"],
+    places: Int[np.ndarray, " pairs"],
+) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"], Float[np.ndarray, "pairs 2"]]:
     """Shifts from the center of a query to the same point in a candidate, with their intervals; one program.
 
     Returns:
@@ -178,14 +180,13 @@ def dominant_shifts(
         refer.
     """
     fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
-    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))]
+    shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
-        part = slice(start, start + SHIFTS_AT_ONCE)
+        part = slice(start, min(start + SHIFTS_AT_ONCE, len(queries)))
         pairs = match_set.pairs(queries[part], places[part], match_set.capacity, total=SHIFTS_AT_ONCE)
-        values = (*pair_shifts(fitted, pairs), np.asarray(pairs.image_size0))
-        shifts, intervals, sizes = (each[: len(queries[part])] for each in values)
-        parts.append((shifts, intervals, sizes))
-    shifts, intervals, sizes = map(np.concatenate, zip(*parts, strict=True))
+        number = part.stop - start
+        shifts[part], intervals[part] = (values[:number] for values in pair_shifts(fitted, pairs))
+        sizes[part] = pairs.image_size0[:number]
     return shifts, intervals, sizes
 
 
@@ -210,14 +211,9 @@ def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Ar
         if scorer.direction == "query_minus_candidate":
             shifts = -shifts[jnp.array([0, 2, 1])]
         shifts = jnp.where(votes, shifts, 0.0)
-        interval = _widened(shifts[1:], SHIFT_FLOOR * at_least_single(pair.image_size0).max())
-        return votes, shifts[0], interval
+        shift, low, high = shifts
+        floor = SHIFT_FLOOR * at_least_single(pair.image_size0).max()
+        half = jnp.sqrt(((high - low) / 2) ** 2 + floor**2)
+        return votes, shift, (low + high)[None] / 2 + jnp.stack([-half, half])
 
     return jax.vmap(of_pair)(matches)
-
-
-def _widened(interval: Float[Array, "2 2"], floor: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """An interval (low, high) whose half widths, (x, y), are added to `floor` in quadrature."""
-    low, high = interval
-    half = jnp.sqrt(((high - low) / 2) ** 2 + floor**2)
-    return (low + high)[None] / 2 + jnp.stack([-half, half])

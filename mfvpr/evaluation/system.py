@@ -1,6 +1,8 @@
 """Values that say what is evaluated: a pipeline finds and matches candidates, a system scores and ranks them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -12,11 +14,10 @@ from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.parameters import check_bounds
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.image_reading import resize, shape_size
+from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.datasets.image_reading import read_size, resize, shape_size
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
-from mfvpr.evaluation.image_sizes import Note, size_for_images
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.shortlist_scores import Ties
@@ -32,7 +33,10 @@ from mfvpr.retrieval.retriever import Retriever
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 
-_TYPICAL_MATCHES = 1000  # assumed matches of a pair that no features limit, for forecasts of disk space
+_TYPICAL_MATCHES = 1000  # of a pair that no features limit
+_SAME_ASPECT = 0.02  # relative difference of two aspect ratios that count as the same
+
+Note = Callable[[str], object]
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,8 @@ class Pipeline:
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
         if isinstance(self.matcher, type) or not (callable(self.matcher) or isinstance(self.matcher, PairSource)):
             got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
-            raise InputError(f"matcher: expected a function of the features of two images that returns Matches, got "
-                             f"{got}; see mfvpr.Matcher")  # fmt: skip
+            expected = "a function of the features of two images that returns Matches"
+            raise InputError(f"matcher: expected {expected}, got {got}; see mfvpr.Matcher")
         if isinstance(self.matcher, LightGlueMatcher):
             _check_lightglue(self.matcher, self.extractor)
 
@@ -92,8 +96,24 @@ class Pipeline:
         return shape_size(shape, self.pixels, getattr(self.extractor, "side_multiple", 1))
 
     def size_for_images(self, folders: Iterable[ImageFolder], note: Note) -> tuple[int, int]:
-        """Size that `pixels` leaves to the images, see `mfvpr.evaluation.image_sizes`."""
-        return size_for_images(self.image_size_for, folders, note)
+        """The image size for the shape of the first image, by `image_size_for`.
+
+        `note` gets a line if images have another aspect ratio. Images that cannot be read do not count.
+        """
+        shapes = {}
+        for folder in folders:
+            for path in folder.paths:
+                with suppress(InputError):
+                    shapes[path] = read_size(path, orient=folder.orient)
+        if not shapes:
+            raise InputError("image_size: expected images to take the shape from, got none that can be read")
+        first = next(iter(shapes.values()))
+        size, aspect = self.image_size_for(first), first[0] / first[1]
+        other = [path for path, shape in shapes.items() if abs(shape[0] / shape[1] / aspect - 1) > _SAME_ASPECT]
+        if other:
+            got = f"{len(other)} of {len(shapes)} have another aspect ratio than the first, such as {other[0]}"
+            note(f"images are resized to {size[0]} x {size[1]} px, but {got}: they are squashed")
+        return size
 
     def with_image_size(self, size: tuple[int, int]) -> "Pipeline":
         """The pipeline with an extractor of another image size (width, height), px, in the retrieval as well."""
@@ -136,8 +156,8 @@ class System:
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
         if isinstance(self.final_scores[self.headline].step, DriveFilter):
-            raise InputError(f"final={self.final!r}: a sequence cannot decide, as its first row may be no candidate; "
-                             "it is ranked beside the score that decides")  # fmt: skip
+            reason = "as its first row may be no candidate; it is ranked beside the score that decides"
+            raise InputError(f"final={self.final!r}: a sequence cannot decide, {reason}")
         for name, scorer in self.scorers.items():
             is_class = isinstance(scorer, type)
             if is_class or not callable(scorer):
@@ -186,22 +206,35 @@ class System:
             raise InputError(f"{type(pipeline.matcher).__name__}: expected a matcher of features, got one of images")
         rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
         shortlist = Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)
-        image = resize(noise_image(image_size), extractor.image_size, extractor.interpolation)
+        image = resize(noise_images(image_size)[0], extractor.image_size, extractor.interpolation)
         [description] = extractor(image[None])
-        sets = [(FeatureSet.of([scale], unit_length=False), FeatureSet.of([scale] * rows.size, unit_length=False))
-                for scale in description.local]  # fmt: skip
-        matches = tuple(stages.match(*sides, shortlist, pipeline.matcher) for sides in sets)
+        matches = tuple(
+            stages.match(
+                FeatureSet.of([scale], unit_length=False),
+                FeatureSet.of([scale] * rows.size, unit_length=False),
+                shortlist,
+                pipeline.matcher,
+            )
+            for scale in description.local
+        )
         weights = tuple(scale.weight for scale in extractor.scales)
         stages.score(self.scorers, matches[0] if len(matches) == 1 else Scales(matches, weights), shortlist)
 
 
-def noise_image(
-    size: tuple[int, int] = (64, 48), *, seed: int = 0, grain: int = 1
-) -> UInt8[np.ndarray, "height width 3"]:
-    """An image of random squares of `grain` px, (width, height) px, in which every extractor finds features."""
-    width, height = size
-    squares = np.random.default_rng(seed).integers(0, 256, (-(-height // grain), -(-width // grain), 3), np.uint8)
-    return squares.repeat(grain, axis=0).repeat(grain, axis=1)[:height, :width]
+def folders_of(dataset: Dataset) -> list[ImageFolder]:
+    """The folders of a data set, the database first."""
+    return [dataset.database, *(sequence.images for sequence in dataset.sequences)]
+
+
+def noise_images(
+    size: tuple[int, int] = (64, 48), *, seeds: Sequence[int] = (0, 1), grains: Sequence[int] = (1, 2)
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Images of random squares of some px, (width, height) px, in which every extractor finds features."""
+    images, (width, height) = [], size
+    for seed, grain in itertools.product(seeds, grains):
+        squares = np.random.default_rng(seed).integers(0, 256, (-(-height // grain), -(-width // grain), 3), np.uint8)
+        images.append(squares.repeat(grain, axis=0).repeat(grain, axis=1)[:height, :width])
+    return images
 
 
 def _with_part(whole: Any, part: Any, new: Any) -> Any:
@@ -215,5 +248,5 @@ def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -
     dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
     if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
         got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
-        raise InputError(f"LightGlue: expected ALIKED's features, of {matcher.dimension} dimensions, got {got}; "
-                         "extract these, or match nearest neighbors")  # fmt: skip
+        expected = f"ALIKED's features, of {matcher.dimension} dimensions"
+        raise InputError(f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors")

@@ -18,27 +18,24 @@ def validate_candidates(
 ) -> RetrievalResult:
     """Check the candidates of the retrieval `name`, which may be user-defined; return them padded with -1 and 0."""
     if not isinstance(retrieved, RetrievalResult):
-        raise InputError(f"{name}: expected a RetrievalResult, got {type(retrieved).__name__}; return "
-                         "RetrievalResult(shortlist, {}, {})")  # fmt: skip
+        raise InputError(f"{name}: expected RetrievalResult(shortlist, {{}}, {{}}), got {type(retrieved).__name__}")
     shortlist = retrieved.candidates
     if not isinstance(shortlist, Shortlist):
-        raise InputError(
-            f"{name}: expected a Shortlist as the candidates of RetrievalResult, got {type(shortlist).__name__}"
-        )
+        raise InputError(f"{name}: expected a Shortlist in RetrievalResult, got {type(shortlist).__name__}")
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     expected = (num_queries, num_candidates)
     if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
         shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
-        raise InputError(f"{name}: expected indices (whole), scores and mask (bool) of {list(expected)} each, got "
-                         f"{shapes}; pad with -1")  # fmt: skip
+        parts = f"indices (whole), scores and mask (bool) of {list(expected)} each"
+        raise InputError(f"{name}: expected {parts}, got {shapes}; pad with -1")
     if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
-        raise InputError(f"{name}: expected rows of the database from 0 to {num_database - 1}, got "
-                         f"{indices[mask].min()} to {indices[mask].max()}")  # fmt: skip
+        got = f"{indices[mask].min()} to {indices[mask].max()}"
+        raise InputError(f"{name}: expected rows of the database from 0 to {num_database - 1}, got {got}")
     ordered = np.sort(np.where(mask, indices, -1), axis=1)
     if (is_repeated := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
         query, place = np.argwhere(is_repeated)[0]
-        raise InputError(f"{name}: expected every row of the database once, got {ordered[query, place]} twice for "
-                         f"query {query}")  # fmt: skip
+        got = f"{ordered[query, place]} twice for query {query}"
+        raise InputError(f"{name}: expected every row of the database once, got {got}")
     if not np.isfinite(scores[mask]).all():
         raise InputError(f"{name}: expected finite scores")
     indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
@@ -50,8 +47,8 @@ def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, 
     yield from bad.values()
     counts = np.asarray(features.source.counts)
     if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
-        yield (f"{folder.paths[empty[0]]}: no keypoints, so no matches ({len(empty)} such images of {len(folder)}); "
-               "scores are 0")  # fmt: skip
+        number = f"{len(empty)} such images of {len(folder)}"
+        yield f"{folder.paths[empty[0]]}: no keypoints, so no matches ({number}); scores are 0"
 
 
 def empty_pairs_warning(name: str, matched: Matched) -> Iterator[str]:
@@ -65,8 +62,8 @@ def empty_pairs_warning(name: str, matched: Matched) -> Iterator[str]:
 def require_finite(name: str, scores: np.ndarray) -> None:
     """Raise an InputError if every score of a scorer is NaN, infinite, or 0, the score of pairs without matches."""
     if not np.isfinite(scores).all() and not scores[np.isfinite(scores)].any():
-        raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; check what the scorer "
-                         "expects of features and sizes")  # fmt: skip
+        fix = "check what the scorer expects of features and sizes"
+        raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; {fix}")
 
 
 def score_warnings(

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.evaluation.image_sizes import Note
-from mfvpr.evaluation.system import System
+from mfvpr.evaluation.system import Note, System
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.systems.choices import check_system
@@ -26,20 +25,17 @@ def read_declaration(folder: Path) -> dict[str, Any]:
     """The settings of the map in a folder; an InputError without one, or for a system that no settings describe."""
     content = MapFile(Path(folder)).part("system")
     if content is None:
-        raise InputError(f"{folder}: expected a folder with a map, got none. Make one with `mfvpr map build` or "
-                         "`Map.create`, or open a map of a system of your own with `Map(folder, system)`.")  # fmt: skip
-    settings = json.loads(content)
-    try:
-        check_system(settings)
-    except InputError as error:
-        raise InputError(f"{folder}: {error}") from None
-    return settings
+        fix = "Make one with `mfvpr map build` or `Map.create`"
+        own = "open a map of a system of your own with `Map(folder, system)`"
+        raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {own}.")
+    return json.loads(content)
 
 
 def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
     settings = read_declaration(folder)
     try:
+        check_system(settings)
         return assembly.system(settings)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
@@ -50,9 +46,9 @@ def check_declaration(file: MapFile, system: System) -> None:
     content = None if system.settings is None else file.part("system")
     if system.settings is not None and content is not None:
         before, now = json.loads(content), declaration(system.settings)
-        if differing := [name for name in now if before.get(name) != now[name]]:
-            raise InputError(f"{file.folder}: this map was made with other {' and '.join(differing)}. Name another "
-                             "folder, or use what it was made with (`mfvpr map info`).")  # fmt: skip
+        if differing := " and ".join(name for name in now if before.get(name) != now[name]):
+            fix = "Name another folder, or use what it was made with (`mfvpr map info`)"
+            raise InputError(f"{file.folder}: this map was made with other {differing}. {fix}.")
 
 
 def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: Note) -> System:
@@ -65,10 +61,10 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
     if system.settings is not None and MapFile(Path(folder)).part("system") is not None:
         width, height = read_declaration(folder)["features"]["image_size"]
         if not 1 / _ABOUT < width * height / system.pipeline.pixels < _ABOUT:
-            got = f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}]."
-            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got {got}")
+            got = f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}]"
+            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got {got}.")
         return system.with_image_size((width, height))
     if images is None:
-        raise InputError("image_size: expected the images of a new map, whose shape decides, got none. Use "
-                         "`Map.create`, or a system with features.image_size=[WIDTH,HEIGHT].")  # fmt: skip
+        fix = "Use `Map.create`, or a system with features.image_size=[WIDTH,HEIGHT]"
+        raise InputError(f"image_size: expected the images of a new map, whose shape decides, got none. {fix}.")
     return system.fit_image_size([images], note)

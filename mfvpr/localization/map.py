@@ -19,14 +19,13 @@ from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
     evidence_scores,
-    noise_images,
     reason_against,
     reason_against_image,
     strength,
-)  # fmt: skip
+)
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
-from mfvpr.evaluation.system import System, noise_image
+from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.vlad import VladFitting
 from mfvpr.localization.declaration import fit_to_map, read_system
@@ -122,8 +121,8 @@ class Map(MapImages):
         warn = lambda line: runtime.log(f"warning: {line}")  # noqa: E731
         known = cls(folder, fit_to_map(Path(folder), system, images, warn), runtime=runtime)
         if same := len({*known.names} & {*images.names}):
-            runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; make "
-                        "another map if their content is new")  # fmt: skip
+            fix = "make another map if their content is new"
+            runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; {fix}")
         known.build(images, places, cache=cache, track=runtime.progress("images"))
         return known
 
@@ -180,11 +179,9 @@ class Map(MapImages):
         before = None if before is None else _whole_number("before", before)
         self._refresh_images()
         pixels, total = load(image), len(self)
-        resized = self.describing.resize(pixels)
-        description = self.describing.resized(resized, str(image) if is_file(image) else "image")
+        description, resized = self.describing.pixels(pixels, str(image) if is_file(image) else "image")
         end = max(0, (total if before is None else min(before, total)) - recent)
-        reason = reason_against_image(resized[0])
-        localized = self._localize(description, end, pixels.shape[1::-1], reason)
+        localized = self._localize(description, end, pixels.shape[1::-1], reason_against_image(resized))
         if route is None:
             return localized
         refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -201,7 +198,7 @@ class Map(MapImages):
         An empty map raises an `InputError`.
         """
         self._refresh_images()
-        self.describing.image(noise_image())
+        self.describing.image(noise_images()[0])
         matcher: Any = self.system.pipeline.matcher  # see `_extractor`
         counts = self._counts().tolist()
         rows = {padded_size(count, self._typical): row for row, count in enumerate(counts)}  # one of each size
@@ -296,16 +293,15 @@ def _extractor(system: System) -> Extractor:
     if isinstance(extractor, Source):
         name = type(extractor).__name__
         raise InputError(f"{name}: a map extracts features of images itself; expected an extractor")
-    if len(extractor.scales) != 1:
-        raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, "
-                         f"got {len(extractor.scales)}")  # fmt: skip
+    if (number := len(extractor.scales)) != 1:
+        raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, got {number}")
     if isinstance(matcher := system.pipeline.matcher, PairSource):
         raise InputError(f"{type(matcher).__name__}: a map compiles its matcher; expected one that JAX can compile")
     if candidates == "all":
         raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
     if system.correlated or system.sequences:
-        raise InputError("a map ranks single images: expected a system without frame correlation and "
-                         "sequences; mfvpr.Route follows a drive")  # fmt: skip
+        expected = "a system without frame correlation and sequences; mfvpr.Route follows a drive"
+        raise InputError(f"a map ranks single images: expected {expected}")
     return extractor
 
 
@@ -319,6 +315,6 @@ def _describer(system: System) -> Extractor | VladFitting:
         return describer
     is_same = recipe_of(describer.extractor) == recipe_of(system.pipeline.extractor)
     if not is_same or not isinstance(describer.fitting, VladFitting):
-        raise InputError("a map aggregates its local features: expected Aggregated(extractor, VladFitting(...)) of the "
-                         "same extractor")  # fmt: skip
+        expected = "Aggregated(extractor, VladFitting(...)) of the same extractor"
+        raise InputError(f"a map aggregates its local features: expected {expected}")
     return describer.fitting

@@ -10,9 +10,10 @@ from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.ground_truth import middle
-from mfvpr.evaluation.confidence import REFUSALS, Confidence
-from mfvpr.evaluation.confidence_calibration import (
+from mfvpr.evaluation.confidence import (
+    REFUSALS,
     CalibrationData,
+    Confidence,
     absent_rankings,
     calibration_data,
     confidence_from_json,
@@ -62,17 +63,17 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
 
     Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
     """
-    (data, refusals), queries = data_of_drive(dataset, system, cache), dataset.queries
+    data, refusals = data_of_drive(dataset, system, cache)
+    root, fix = dataset.queries.root, "calibrate on a longer drive"
     if not data.num_absent:
-        warnings.warn(f"{queries.root}: without the images of a query's place there are no candidates, so that "
-                      "places that the map does not show get too high a confidence; calibrate on a longer drive",
-                      stacklevel=3)  # fmt: skip
+        reason = "without the images of a query's place there are no candidates, so that places that the map does not"
+        warnings.warn(f"{root}: {reason} show get too high a confidence; {fix}", stacklevel=3)
     confidence = replace(data.fit(), refusals=refusals)
     probabilities = confidence.probability(data.present)
     if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
-        warnings.warn(f"{queries.root}: scores do not tell correct predictions ({data.correct.sum()} of "
-                      f"{len(queries)}) from incorrect ones, so that every image gets the same confidence; "
-                      "calibrate on a longer drive", stacklevel=3)  # fmt: skip
+        correct = f"correct predictions ({data.correct.sum()} of {len(data.correct)})"
+        reason = f"scores do not tell {correct} from incorrect ones, so that every image gets the same confidence"
+        warnings.warn(f"{root}: {reason}; {fix}", stacklevel=3)
     return confidence, data
 
 
@@ -80,10 +81,9 @@ def write_confidence(
     file: MapFile, parts: Mapping[str, bytes], system: System, confidence: Confidence, data: CalibrationData
 ) -> None:
     """Keep the confidence of the ranking that decides in a map, whose other `parts` are written first."""
-    try:
-        of_system = _fingerprint(system)
-    except TypeError as error:
-        warnings.warn(f"{error}: the confidence is not kept on disk", stacklevel=3)
+    of_system = _fingerprint(system)
+    if of_system is None:
+        warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=3)
         return
     content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
     content["confidence"] = vars(confidence)
@@ -95,18 +95,17 @@ def read_confidence(file: MapFile, system: System) -> Confidence | None:
     if (part := file.part("confidence")) is None:
         return None
     content = json.loads(part)
-    try:
-        of_system = _fingerprint(system)
-    except TypeError:
-        of_system = None
-    if content["system"] != of_system:
-        raise InputError(f"{file.folder}: expected the confidence of this map's system, got that of another system or "
-                         "version; calibrate again")  # fmt: skip
+    if content["system"] != _fingerprint(system):
+        got = "that of another system or version; calibrate again"
+        raise InputError(f"{file.folder}: expected the confidence of this map's system, got {got}")
     return confidence_from_json(content["confidence"])
 
 
-def _fingerprint(system: System) -> str:
-    """A hash of everything that scores depend on; a TypeError if a part has no recipe."""
+def _fingerprint(system: System) -> str | None:
+    """A hash of everything that scores depend on; None if a part has no recipe."""
     pipeline = system.pipeline
     parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
-    return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
+    try:
+        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
+    except TypeError:
+        return None

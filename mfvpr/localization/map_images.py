@@ -1,11 +1,13 @@
 """The images of a map: names, places and global descriptors in memory, features on demand; and how images are added."""
 
+import itertools
 import json
 import shutil
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +28,7 @@ from mfvpr.localization.describing import Describing, Image, is_file
 from mfvpr.localization.vectors import Vectors
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
-from mfvpr.utils.arrays import pack_arrays
+from mfvpr.utils.arrays import pack_arrays, unpack_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
 from mfvpr.utils.fingerprints import difference, recipe_of
@@ -35,6 +37,7 @@ from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.runtime import Runtime
 
 _LEARNING = ".learning"  # the folder of features that a vocabulary is being learned from
+_AT_ONCE = 64  # images that are described without a cache
 _SAMPLE = 32  # images whose strength is measured; a sample has up to twice as many
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -91,8 +94,7 @@ class MapImages:
     def describing(self) -> Describing:
         """The extractor and the describer of the images; raises `InputError` if the map has no vocabulary yet."""
         if self._describing is None:
-            raise InputError(f"{self.folder}: this map has no vocabulary yet; learn it from some images first "
-                             "(`learn`)")  # fmt: skip
+            raise InputError(f"{self.folder}: this map has no vocabulary yet; `learn` it from some images first")
         return self._describing
 
     @property
@@ -124,13 +126,14 @@ class MapImages:
         before = len(self)
         if not self._is_checked and (content := self._file.part("recipe")) is not None:
             if differs := difference(json.loads(content), json.loads(json.dumps(self._recipe)), "recipe"):
-                raise InputError(f"{self.folder}: this map was made with {differs}. Use the settings that it was made "
-                                 "with, or name another folder.")  # fmt: skip
+                fix = "Use the settings that it was made with, or name another folder"
+                raise InputError(f"{self.folder}: this map was made with {differs}. {fix}.")
             self._is_checked = True
-        if self._describing is None and (arrays := self._file.arrays("vocabulary")) is not None:
+        if self._describing is None and (content := self._file.part("vocabulary")) is not None:
+            arrays = unpack_arrays(content, "vocabulary")
             self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
         for row, entry in self._file.entries(before):
-            self._vectors.put(row, entry.vector)
+            self._vectors.append(entry.vector)
             self._names.append(entry.name)
             self._places.append(entry.place)
             self._row_of_name[entry.name] = row
@@ -173,15 +176,15 @@ class MapImages:
         if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
             return 0
         with self._file.lock(), self._learning(images, cache, track) as cache:
-            missing = [row for row, name in enumerate(images.names) if name not in self._row_of_name]
-            before = len(self)
-            if cache is None:
-                batches = self.describing.folder(images, missing, track)
-            else:
-                batches = self.describing.cached(images, missing, cache)
-            for batch in batches:
-                entries = [Entry(images.names[row], places[row], vector) for row, (_, vector) in batch.items()]
-                self._add(entries, [features for features, _ in batch.values()])
+            place_of, before = dict(zip(images.names, places, strict=True)), len(self)
+            missing = [name for name in images.names if name not in self._row_of_name]
+            names = iter(missing if cache is not None else track(missing, len(missing)))
+            while part := tuple(itertools.islice(names, _AT_ONCE if cache is None else len(missing))):
+                folder = replace(images, names=part)
+                for batch in self.describing.folder(folder, FeatureCache() if cache is None else cache):
+                    rows = ((part[row], vector) for row, (_, vector) in batch.items())
+                    entries = [Entry(name, place_of[name], vector) for name, vector in rows]
+                    self._add(entries, [features for features, _ in batch.values()])
             return len(self) - before
 
     @exclusive
@@ -222,9 +225,7 @@ class MapImages:
             values = np.asarray(vector)
             length = values.size if length is None else length
             if values.shape != (length,) or values.dtype.kind not in "fiu":
-                got = f"{list(values.shape)} {values.dtype}"
-                raise InputError(f"{name}: expected a descriptor [{length}], got {got}. Take it from `describing` of "
-                                 "this map.")  # fmt: skip
+                raise InputError(f"{name}: expected a descriptor [{length}], got {list(values.shape)} {values.dtype}")
             if not np.isfinite(values).all():
                 raise InputError(f"{name}: expected a descriptor of finite numbers, got NaN or infinity")
             check_features(local, f"{name}: features", unit_length=False)

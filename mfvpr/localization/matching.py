@@ -40,8 +40,11 @@ def match_and_score(
     by_size = defaultdict[int, list[int]](list)
     for place, candidate in enumerate(candidates):
         by_size[padded_size(len(candidate.mask), typical)].append(place)
-    parts = [(size, places[start : start + _AT_ONCE]) for size, places in sorted(by_size.items(), reverse=True)
-             for start in range(0, len(places), _AT_ONCE)]  # fmt: skip
+    parts = [
+        (size, places[start : start + _AT_ONCE])
+        for size, places in sorted(by_size.items(), reverse=True)
+        for start in range(0, len(places), _AT_ONCE)
+    ]
 
     def match_part(part: tuple[int, list[int]]) -> tuple[Matches, dict[str, np.ndarray]]:
         size, places = part

@@ -75,8 +75,7 @@ class Route:
             return None
         evidence = _evidence(prediction)
         if (last := evidence.rows.max(initial=-1)) >= len(there):
-            raise InputError(f"there: expected the rows of the map of the prediction, up to {last} at least, got "
-                             f"{len(there)}")  # fmt: skip
+            raise InputError(f"there: expected the rows of the prediction's map, {last + 1} at least, got {len(there)}")
         on = 1.0  # probability of what the image lacks on the map, relative to that off it
         if prediction is not None and not prediction.alternatives and prediction.reason != "no candidates":
             on = min(1.0, max(1 / _MOST_REFUSALS, refusals[0] / max(refusals[1], 1e-9)))  # never evidence of the map
@@ -85,8 +84,8 @@ class Route:
             odds = self._other.update(there, evidence) - chance
             self._lead = max(0.0, self._lead + min(odds, _ODDS_OF_ONE))
             if self._lead > _ODDS:
-                self._warn(f"the images fit {self._other.advance:.1f} rows from one to the next far better than "
-                           f"{self._drive.advance:g}; set that, or let it be learned")  # fmt: skip
+                better = f"fit {self._other.advance:.1f} rows from one to the next far better than"
+                self._warn(f"the images {better} {self._drive.advance:g}; set that, or let it be learned")
                 self._other = None
         by_row = np.where(there, self._filter.by_row[: len(there)], 0)
         row = int(np.argmax(by_row))

@@ -12,11 +12,11 @@ _FIRST = 1024  # rows; twice as many whenever they are full
 
 
 class Vectors:
-    """Global descriptors by row. Rows may be added in any order, and some may be missing."""
+    """Global descriptors by row."""
 
     def __init__(self) -> None:
         self._values, self._is_candidate = np.zeros((0, 0), np.float32), np.zeros(0, bool)
-        self.total = 0  # one more than the largest row
+        self._total = 0  # rows that are used
 
     @property
     def length(self) -> int | None:
@@ -27,23 +27,22 @@ class Vectors:
         """The descriptor of a row."""
         return self._values[row]
 
-    def put(self, row: int, vector: Float[np.ndarray, " dimensions"]) -> None:
-        """Store the descriptor of a row."""
-        while row >= len(self._values):
-            more = max(_FIRST, len(self._values))
-            values = self._values.reshape(-1, len(vector))
-            self._values = np.concatenate([values, np.zeros((more, len(vector)), np.float32)])
-            self._is_candidate = np.concatenate([self._is_candidate, np.zeros(more, bool)])
-        self._values[row] = vector
+    def append(self, vector: Float[np.ndarray, " dimensions"]) -> None:
+        """Store the descriptor of the next row."""
+        if self._total == len(self._values):
+            more = np.zeros((max(_FIRST, self._total), len(vector)), np.float32)
+            self._values = np.concatenate([self._values.reshape(-1, len(vector)), more])
+            self._is_candidate = np.concatenate([self._is_candidate, np.zeros(len(more), bool)])
+        self._values[self._total] = vector
         # An image without features has a zero descriptor and is never a candidate, as in `mfvpr.retrieval.Retrieval`.
-        self._is_candidate[row] = bool(np.isfinite(vector).all() and vector.any())
-        self.total = max(self.total, row + 1)
+        self._is_candidate[self._total] = bool(np.isfinite(vector).all() and vector.any())
+        self._total += 1
 
     def nearest(
         self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
     ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
         """At most `number` rows `before` a row, and their products with the query, most similar first, then by row."""
-        total = self.total if before is None else max(0, min(self.total, before))
+        total = self._total if before is None else max(0, min(self._total, before))
         rows = np.flatnonzero(self._is_candidate[:total])
         if not len(rows) or not query.any():
             return rows[:0], np.zeros(0, np.float32)

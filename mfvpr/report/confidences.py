@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.evaluation.confidence_calibration import write_confidences
+from mfvpr.evaluation.confidence import write_confidences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.reliability import chance_calibration_error, reliability
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport

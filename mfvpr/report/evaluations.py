@@ -14,8 +14,7 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, middle, threshold_words
 from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.confidence import Confidence
-from mfvpr.evaluation.confidence_calibration import CalibrationData, absent_rankings, calibration_data
+from mfvpr.evaluation.confidence import CalibrationData, Confidence, absent_rankings, calibration_data
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason, Recall
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.reliability import PrecisionRecall, precision_recall

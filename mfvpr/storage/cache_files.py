@@ -17,12 +17,13 @@ import numpy as np
 
 from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import write_text
+from mfvpr.utils.files import remove_leftovers, write_text
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.threads import ordered_map
 
 FORMAT = "mfvpr cache 1"  # of the files and folders
 THREADS = 4  # that write
+_LEFTOVER = 24 * 3600  # seconds: temporary files that are older were left by killed processes
 
 Item = TypeVar("Item")
 Arrays = Mapping[str, np.ndarray]
@@ -50,6 +51,7 @@ class CacheFiles(Generic[Item]):
         self._fingerprint = fingerprint(self._recipe)
         self.folder = root.absolute() / f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:100]}-{self._fingerprint}"
         self._pack, self._unpack, self._compress = pack, unpack, compress
+        self._is_open = False  # whether something was written
 
     def path(self, key: str) -> Path:
         """The file of a key."""
@@ -78,8 +80,11 @@ class CacheFiles(Generic[Item]):
             write_arrays(self.path(key), packed[key], self._about(key), **options)
 
         with disk_errors_as_input_errors(self.folder):
-            if packed and not (self.folder / "recipe.json").exists():
-                write_text(self.folder / "recipe.json", json.dumps(self._recipe, indent=1, sort_keys=True) + "\n")
+            if packed and not self._is_open:
+                if not (self.folder / "recipe.json").exists():
+                    write_text(self.folder / "recipe.json", json.dumps(self._recipe, indent=1, sort_keys=True) + "\n")
+                remove_leftovers(self.folder, seconds=_LEFTOVER)
+                self._is_open = True
             for _ in ordered_map(write, packed, workers=THREADS):
                 pass
 
@@ -102,8 +107,3 @@ def disk_errors_as_input_errors(folder: Path) -> Iterator[None]:
 def full_disk_error(folder: Path) -> InputError:
     """The error of a full disk, on which everything that was written before stays."""
     return InputError(f"{folder}: the disk is full; free some space and run again, which goes on from here")
-
-
-def has_earlier_files(root: Path) -> bool:
-    """Whether a folder has a cache of version 0.2 or earlier, which is not read."""
-    return any(root.glob("*/manifest.json"))

@@ -25,7 +25,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source
 from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
-from mfvpr.storage.cache_files import CacheFiles, has_earlier_files
+from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.packing import pack_features, unpack_features
 from mfvpr.storage.recipes import Memo, Recipes, Value, states
 from mfvpr.utils.errors import InputError
@@ -170,9 +170,6 @@ class FeatureCache:
         self.root = None if self.root is None else Path(self.root)
         if self.root is None and self.runtime.cluster is not None:
             raise InputError("cluster: expected a cache with a root, a folder that all workers share")
-        if self.root is not None and has_earlier_files(self.root):
-            self.warn(f"{self.root}: has files of an earlier version, which are not used; you may delete its folders "
-                      "with a manifest.json")  # fmt: skip
 
     @property
     def recipes(self) -> Recipes:
@@ -251,8 +248,8 @@ class FeatureCache:
         elif describer.vector_size:
             compute = partial(self._vectors, folder, describer, rows, label)
         else:
-            raise InputError(f"{type(describer).__name__}: gives no global descriptor; expected one that does, or "
-                             "Aggregated(extractor, VladFitting())")  # fmt: skip
+            expected = "expected one that does, or Aggregated(extractor, VladFitting())"
+            raise InputError(f"{type(describer).__name__}: gives no global descriptor; {expected}")
         is_kept = folder == database and rows is None
         return self.once("vectors", compute, folder, describer) if is_kept else compute()
 

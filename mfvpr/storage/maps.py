@@ -8,7 +8,6 @@ import json
 import os
 import sqlite3
 import time
-import uuid
 import weakref
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +28,6 @@ from mfvpr.utils.files import clip_middle, lock_folder
 FILE = "map.sqlite"  # in the folder of the map
 _FORMAT = 3
 _WAIT = 60  # seconds for another process that writes
-_AT_ONCE = 500  # rows of a query, whose number of parameters is limited
 _SCHEMA = """
 CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL);
 CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,
@@ -53,64 +51,54 @@ class MapFile:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open nothing yet; an InputError for a map of an earlier version, or a folder of something else."""
+        """Open nothing yet; an InputError for a folder of something else."""
         self.folder, self._path = folder.absolute(), folder.absolute() / FILE
         self._database: sqlite3.Connection | None = None
         self._stamp: tuple[int, int] | None = None  # of the file that is open
-        self._id: bytes | None = None  # of the map that is open: every map has another one
         with disk_errors_as_input_errors(self.folder):
             names = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.exists() else set()
-        if FILE not in names and names & {"0000", "settings.json", "vocabulary.npz"}:
-            raise InputError(f"{folder}: expected a map of this version, got one of an earlier version. Build it again "
-                             "in another folder.")  # fmt: skip
         if names and FILE not in names:
             raise InputError(f"{folder}: expected a new or empty folder, or a map; name another")
 
     def part(self, name: str) -> bytes | None:
         """A part that was written: settings, vocabulary or confidence; None if it was not. InputError if damaged."""
         query = "SELECT value, checksum FROM parts WHERE name = ?"
-        with self._reading() as database:
+        with self._open() as database:
             row: tuple[bytes, int] | None = database and database.execute(query, [name]).fetchone()
         if row is None:
             return None
         content, checksum = row
         if zlib.crc32(content) != checksum:
-            raise InputError(f"{self._path}: the {name} is damaged. Put back a copy, or build the map again.")
+            raise self._damage(f"the {name}")
         return content
-
-    def arrays(self, name: str) -> dict[str, np.ndarray] | None:
-        """Arrays that were written as a part."""
-        content = self.part(name)
-        return None if content is None else unpack_arrays(content, name)
 
     def entries(self, start: int) -> Iterator[tuple[int, Entry]]:
         """(row, entry) of all rows from `start` on, in their order; an InputError if one is damaged or missing."""
         query = "SELECT row, name, place, vector, checksum FROM entries WHERE row >= ? ORDER BY row"
-        with self._reading() as database:
+        with self._open() as database:
             for row, name, place, vector, checksum in database.execute(query, [start]) if database else ():
                 if row != start or _checksum(name, place, vector) != checksum:
-                    raise self._damage(start)
+                    raise self._damage(f"row {start}")
                 start += 1
                 yield row, Entry(json.loads(name), json.loads(place), np.frombuffer(vector, np.float32))
 
     def counts(self) -> np.ndarray:
         """`[M]` numbers of keypoints of all rows."""
-        with self._reading() as database:
+        with self._open() as database:
             rows = database.execute("SELECT count FROM features ORDER BY row").fetchall() if database else []
         return np.array(rows, int).reshape(-1)
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
-        """(row, features) of existing rows, in no order; an InputError if one is damaged."""
-        for start in range(0, len(rows), _AT_ONCE):
-            part = rows[start : start + _AT_ONCE]
-            query = f"SELECT row, content FROM features WHERE row IN ({','.join('?' * len(part))})"
-            with self._reading() as database:
-                found: dict[int, bytes] = dict(database.execute(query, part)) if database else {}
-            for row in part:
+        """(row, features) of existing rows, in their order; an InputError if one is damaged."""
+        query = "SELECT content FROM features WHERE row = ?"
+        with self._open() as database:
+            for row in rows:
+                content: tuple[bytes] | None = database and database.execute(query, [row]).fetchone()
                 try:
-                    yield row, unpack_features(unpack_arrays(found.get(row, b""), str(row)))
+                    features = unpack_features(unpack_arrays(content[0] if content else b"", str(row)))
                 except InputError:
-                    raise self._damage(row) from None
+                    raise self._damage(f"row {row}") from None
+                yield row, features
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -132,104 +120,75 @@ class MapFile:
                 packed.append((pack_features(features), entry))
             except ValueError as error:
                 raise InputError(f"{entry.name}: {error}") from None
-        with self._errors():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            database = self._connect(create=True)
+        with self._open(create=True) as database:
+            assert database is not None
             database.execute("BEGIN IMMEDIATE")
             try:
-                self._write(database, parts, packed)
+                if database.execute("PRAGMA user_version").fetchone()[0] == 0:
+                    for statement in filter(str.strip, _SCHEMA.split(";")):
+                        database.execute(statement)
+                    database.execute(f"PRAGMA user_version = {_FORMAT}")
+                of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
+                database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?, ?)", of_parts)
+                [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
+                for row, (arrays, entry) in enumerate(packed, first):
+                    name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # names may be no UTF-8
+                    vector = np.asarray(entry.vector, np.float32).tobytes()
+                    values = row, name, place, time.time(), vector, _checksum(name, place, vector)
+                    database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
+                    values = row, len(arrays["scores"]), pack_arrays(arrays, str(row))
+                    database.execute("INSERT INTO features VALUES (?, ?, ?)", values)
                 database.execute("COMMIT")
             except BaseException:
                 if database.in_transaction:  # SQLite may have ended it
                     database.execute("ROLLBACK")
                 raise
 
-    def _write(
-        self,
-        database: sqlite3.Connection,
-        parts: Mapping[str, bytes],
-        images: Sequence[tuple[Mapping[str, np.ndarray], Entry]],
-    ) -> None:
-        if database.execute("PRAGMA user_version").fetchone()[0] == 0:
-            for statement in filter(str.strip, _SCHEMA.split(";")):
-                database.execute(statement)
-            database.execute(f"PRAGMA user_version = {_FORMAT}")
-            parts = {"id": uuid.uuid4().bytes, **parts}
-        self._check_id(database)
-        of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
-        database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?, ?)", of_parts)
-        [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
-        for row, (arrays, entry) in enumerate(images, first):
-            name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # ASCII: names may be no UTF-8
-            vector = np.asarray(entry.vector, np.float32).tobytes()
-            values = row, name, place, time.time(), vector, _checksum(name, place, vector)
-            database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
-            content = pack_arrays(arrays, str(row))
-            database.execute("INSERT INTO features VALUES (?, ?, ?)", (row, len(arrays["scores"]), content))
-
     @contextmanager
-    def _reading(self) -> Iterator[sqlite3.Connection | None]:
-        """The database, None if there is no map yet."""
-        with self._errors():
-            if not self._path.exists():
-                if self._id is not None:
-                    raise self._replaced()
-                yield None
-                return
-            database = self._connect(create=False)
-            version = database.execute("PRAGMA user_version").fetchone()[0]
-            if version not in (0, _FORMAT):
-                raise InputError(f"{self._path}: expected a map of format {_FORMAT}, got {version}. Build it again.")
-            if version:
-                self._check_id(database)
-            yield database if version else None
-
-    def _check_id(self, database: sqlite3.Connection) -> None:
-        found = database.execute("SELECT value FROM parts WHERE name = 'id'").fetchone()
-        if self._id is not None and found != (self._id,):
-            raise self._replaced()
-        self._id = found and found[0]
-
-    def _connect(self, *, create: bool) -> sqlite3.Connection:
-        """The connection, a new one if the file was replaced."""
-        status = self._path.stat() if self._path.exists() else None
-        is_readonly = not create and not os.access(self.folder, os.W_OK)
-        if is_readonly or self._database is None or status is None or (status.st_dev, status.st_ino) != self._stamp:
-            how = "?mode=rwc" if create else "?mode=rw"
-            if is_readonly:  # `immutable` needs no files of a log beside it, but would not see the rows in one
-                how = "?mode=ro" if self._path.with_name(f"{FILE}-wal").exists() else "?mode=ro&immutable=1"
-            self._database = sqlite3.connect(
-                self._path.as_uri() + how, uri=True, timeout=_WAIT, isolation_level=None, check_same_thread=False
-            )
-            weakref.finalize(self, self._database.close)
-            if create:
-                self._database.execute("PRAGMA journal_mode = WAL")
-            status = self._path.stat()
-            self._stamp = status.st_dev, status.st_ino
-        return self._database
-
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        """Raise errors of SQLite and of the file system as an InputError of one line."""
+    def _open(self, *, create: bool = False) -> Iterator[sqlite3.Connection | None]:
+        """The database, which stays open; None if there is no map yet. Errors are an InputError of one line."""
         try:
             with disk_errors_as_input_errors(self.folder):
-                yield
+                status = self._path.stat() if self._path.exists() else None
+                if self._stamp is not None and (status is None or self._stamp != (status.st_dev, status.st_ino)):
+                    got = "another one that replaced it, or none. Open the map again"
+                    raise InputError(f"{self.folder}: expected the map that was opened, got {got}.")
+                if status is None and not create:
+                    yield None
+                    return
+                database = self._connect(create)
+                version = database.execute("PRAGMA user_version").fetchone()[0]
+                if version not in (0, _FORMAT):
+                    raise InputError(f"{self._path}: expected format {_FORMAT}, got {version}. Build the map again.")
+                yield database if version or create else None
         except sqlite3.Error as error:
             code = getattr(error, "sqlite_errorcode", 0)
             if code & 0xFF == sqlite3.SQLITE_FULL or code == sqlite3.SQLITE_IOERR_SHMSIZE:
                 raise full_disk_error(self.folder) from None
             if code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-                reason = f"is damaged ({error}). Put back a copy, or build the map again"
-            else:
-                reason = f"cannot be used ({error}). Check the path, its permissions and its disk"
+                raise self._damage(f"the file ({error})") from None
+            reason = f"cannot be used ({error}). Check the path, its permissions and its disk"
             raise InputError(f"{self._path}: {reason}.") from None
 
-    def _damage(self, row: int) -> InputError:
-        return InputError(f"{self._path}: row {row} is damaged. Put back a copy, or build the map again.")
+    def _connect(self, create: bool) -> sqlite3.Connection:
+        """The connection; without write access a new one, which sees what was added since."""
+        is_readonly = not create and not os.access(self.folder, os.W_OK)
+        if self._database is None or is_readonly:
+            how = "rwc" if create else "rw"
+            if is_readonly:  # `immutable` needs no files of a log beside it, but would not see the rows in one
+                how = "ro" if self._path.with_name(f"{FILE}-wal").exists() else "ro&immutable=1"
+            self.folder.mkdir(parents=True, exist_ok=True)
+            url, options = f"{self._path.as_uri()}?mode={how}", {"isolation_level": None, "check_same_thread": False}
+            self._database = sqlite3.connect(url, uri=True, timeout=_WAIT, **options)
+            weakref.finalize(self, self._database.close)
+            status = self._path.stat()
+            self._stamp = status.st_dev, status.st_ino
+        if create:
+            self._database.execute("PRAGMA journal_mode = WAL")
+        return self._database
 
-    def _replaced(self) -> InputError:
-        return InputError(f"{self.folder}: expected the map that was opened, got another one that replaced it, or "
-                          "none. Open the map again.")  # fmt: skip
+    def _damage(self, what: str) -> InputError:
+        return InputError(f"{self._path}: {what} is damaged. Put back a copy, or build the map again.")
 
 
 def _checksum(name: str, place: str, vector: bytes) -> int:
@@ -245,5 +204,5 @@ def check_entry(name: Any, place: Any) -> None:
         if place is None or json.loads(text) != place:
             raise ValueError(f"{clip_middle(repr(place), 80)}, which JSON gives back as {clip_middle(text, 80)}")
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; use text, numbers, "
-                         "lists, and dictionaries by text") from None  # fmt: skip
+        fix = "use text, numbers, lists, and dictionaries by text"
+        raise InputError(f"{name}: expected a place that JSON can say, and not null, got {error}; {fix}") from None

@@ -12,27 +12,26 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.threads import ordered_map
 
 
-class MatchStore:
-    """Matches by query, of a recipe that determines database, queries, shortlist and matcher."""
+class MatchStore(CacheFiles[QueryMatches]):
+    """Matches of `num_queries` queries by row, of a recipe that determines database, queries, shortlist and matcher."""
 
     def __init__(self, root: Path, recipe: Mapping[str, Any], num_queries: int) -> None:
-        """Matches of Q = `num_queries` queries in a folder below `root`."""
         # Compressed, since every candidate repeats points of the query: a match takes about 23 bytes instead of 32.
-        self._files = CacheFiles(root, "matches", recipe, pack_matches, unpack_matches, compress=True)
-        self.folder, self.num_queries = self._files.folder, num_queries
+        super().__init__(root, "matches", recipe, pack_matches, unpack_matches, compress=True)
+        self.num_queries = num_queries
 
     def has_all(self, rows: Iterable[int]) -> bool:
         """Whether there are files of all rows."""
-        return all(_key(row) in self._files for row in rows)
+        return all(_key(row) in self for row in rows)
 
     def read(self, rows: Iterable[int]) -> Iterator[tuple[int, QueryMatches | None]]:
         """(row, matches) in the order of rows; None if there is no file, or a damaged one."""
         rows = list(rows)
-        yield from zip(rows, ordered_map(lambda row: self._files.get(_key(row)), rows, workers=THREADS), strict=True)
+        yield from zip(rows, ordered_map(lambda row: self.get(_key(row)), rows, workers=THREADS), strict=True)
 
     def write(self, queries: Mapping[int, QueryMatches]) -> None:
         """Write matches by row; see `CacheFiles.update`."""
-        self._files.update({_key(row): query for row, query in queries.items()})
+        self.update({_key(row): query for row, query in queries.items()})
 
 
 class StoredMatches(Sequence[Matches]):
@@ -46,16 +45,16 @@ class StoredMatches(Sequence[Matches]):
 
     def __getitem__(self, query: Any) -> Matches:
         """Matches of one query; slices are not supported."""
-        return self._matches(*next(self._store.read([self._rows[query]])))
+        return next(self._read([self._rows[query]]))
 
     def __iter__(self) -> Iterator[Matches]:
-        return (self._matches(*query) for query in self._store.read(self._rows))
+        return self._read(self._rows)
 
-    def _matches(self, row: int, query: QueryMatches | None) -> Matches:
-        if query is None:
-            raise InputError(f"{self._store.folder}: the matches of row {row} were removed or damaged meanwhile; run "
-                             "again")  # fmt: skip
-        return query.matches
+    def _read(self, rows: Sequence[int]) -> Iterator[Matches]:
+        for row, query in self._store.read(rows):
+            if query is None:
+                raise InputError(f"{self._store.folder}: matches of row {row} were removed or damaged; run again")
+            yield query.matches
 
 
 def _key(row: int) -> str:

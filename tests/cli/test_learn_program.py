@@ -10,7 +10,7 @@ from PIL import Image
 
 from mfvpr.baselines.weight_registry import read_weight
 from mfvpr.cli import evaluation, learning, sweeping
-from mfvpr.tuning.learning import teaching, training
+from mfvpr.tuning.learning import models, training
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record
 from tests.programs import QUERIES, composed, job_of, results, small, snapshot
@@ -47,7 +47,7 @@ def untrained(monkeypatch):
             batches(step)
         return Fit(parameters, 0, (Record(0, None, 1.0),), "nothing was learned")
 
-    monkeypatch.setattr(teaching, "fit", start)
+    monkeypatch.setattr(models, "fit", start)
     return calls
 
 
@@ -164,11 +164,11 @@ def test_an_axis_that_is_not_searched_has_the_scorers_own_value(learn, untrained
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
     saved, save = [], training.save_checkpoint
 
-    def interrupted(folder, step, *rest):
-        saved.append((folder.name, step))
+    def interrupted(folder, recipe, state, progress):
+        saved.append((folder.name, progress[0][-1].step))
         if len(saved) == 4:
             raise KeyboardInterrupt
-        save(folder, step, *rest)
+        save(folder, recipe, state, progress)
 
     monkeypatch.setattr(training, "save_checkpoint", interrupted)
     again = (*SHORT, f"checkpoints={tmp_path}/kept")
@@ -181,12 +181,12 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
 
 
 def test_a_checkpoint_of_another_model_is_refused(root, learned, tmp_path, refuse):
-    [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/4")]
+    [folder] = [path.parent for path in root.glob("store/folder_learning-*/first_half-gradient/checkpoint.npz")]
     before = snapshot(root)
     for change, words in (
-        ("learning_rate=0.5", "those of another learning_rate"),
-        ("recall.tolerances=[1]", "those of another tolerances"),
-        ("loss=recall", "those of another loss"),
+        ("learning_rate=0.5", "that of another learning_rate"),
+        ("recall.tolerances=[1]", "that of another tolerances"),
+        ("loss=recall", "that of another loss"),
     ):
         arguments = (*small(root), *SHORT, change, f"checkpoints={folder.parent}", f"out={tmp_path}/out")
         error = refuse("learn", *arguments)
@@ -224,7 +224,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     assert " is not finite; " in error
     assert "learning rate" in error
     assert not (tmp_path / "out").exists()
-    assert sorted(path.name for path in place.glob("*/[0-9]*")) == (["3", "4"] if step == 4 else [])
+    assert any(place.rglob("checkpoint.npz")) == (step == 4)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -219,22 +219,22 @@ def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_p
 def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
     root, sweep, swept, tmp_path, monkeypatch, interrupt
 ):
-    """Finished blocks are store, and go when the whole sweep is done."""
+    """The rows of finished settings are stored, by query here."""
     grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
     arguments = [*small(root), *grid, f"out={tmp_path}/out"]
     command = [sys.executable, "-m", "experiments.sweep", *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     store = root / "store"
-    while len(done := list(store.glob("folder_sweep-*/[!.]*.npz"))) < 5:
+    before = len(list(store.glob("sweep-*/*/[!.]*.npz")))
+    while len(done := list(store.glob("sweep-*/*/[!.]*.npz"))) - before < 5:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.01)
     interrupt(process)
-    done, computed = list(store.glob("folder_sweep-*/[!.]*.npz")), []
-    assert 5 <= len(done) < 6 * QUERIES
-    sweep(tmp_path / "other", SIGMA)  # takes nothing of another sweep away
+    done, computed = list(store.glob("sweep-*/*/[!.]*.npz")), []
+    assert 5 <= (finished := len(done) - before) < 6 * QUERIES
     scores = SWEEP.block_scores
     monkeypatch.setattr(SWEEP, "block_scores", lambda *block: computed.append(1) or scores(*block))
     resumed = sweep(tmp_path / "out", *grid)
-    assert len(computed) == 6 * QUERIES - len(done)
-    assert not list(store.glob("folder_sweep-*"))
+    assert len(computed) == 6 * QUERIES - finished
+    assert len(list(store.glob("sweep-*/*/[!.]*.npz"))) - before == 6 * QUERIES
     assert resumed == sweep(tmp_path / "again", *grid[:1])

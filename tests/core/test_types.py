@@ -93,7 +93,7 @@ def test_nor_with_other_hashes():
 PROGRAMS_OF_THEIR_OWN = {
     "features/network.py",  # of a new function, which has one model
     "baselines/learned_weight.py",  # of matches alone
-    "tuning/learning/teaching.py",  # of a new function, which has one model
+    "tuning/learning/models.py",  # of a new function, which has one model
     "tuning/learning/training.py",  # of a new function, which has one kind of parameters
     "deployment/folders.py",  # of programs that were read from files
     "deployment/stablehlo.py",  # of a new function, which has one scorer

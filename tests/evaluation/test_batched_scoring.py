@@ -136,7 +136,7 @@ def test_blocks_of_other_weights_or_scales_are_not_read(two_scales, tmp_path):
         expected = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates)
         stored = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
         np.testing.assert_array_equal(stored, expected)
-        assert len(list(tmp_path.iterdir())) == number
+        assert len(list(tmp_path.rglob("*.npz"))) == number
 
 
 def test_scales_of_other_queries_or_weights_raise(data):

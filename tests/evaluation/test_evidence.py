@@ -10,7 +10,7 @@ from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.evidence import evidence_against, reason_against_image, strength
 from mfvpr.evaluation.rankings import Ranked
-from mfvpr.evaluation.system import noise_image
+from mfvpr.evaluation.system import noise_images
 from mfvpr.retrieval import FeatureFiles
 from tests.builders import make_matches, match_set_of
 
@@ -32,7 +32,7 @@ def test_photographs_of_a_street_are_neither_noise_nor_overexposed(small_street,
 def test_noise_of_any_strength_is_noise(size, deviation):
     rng = np.random.default_rng(0)
     for grain in (1, 2):
-        image = noise_image(size, seed=3, grain=grain).astype(float)
+        image = noise_images(size, seeds=(3,), grains=(grain,))[0].astype(float)
         image = 128 + deviation * (image - 128) / 128
         assert reason_against_image(np.clip(image, 0, 255).astype(np.uint8)) == "no better than noise"
     gray = np.clip(128 + deviation * rng.normal(size=(*size[::-1], 1)), 0, 255).astype(np.uint8)

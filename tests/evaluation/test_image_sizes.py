@@ -11,7 +11,7 @@ import mfvpr
 from mfvpr import InputError
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import match_sequence
-from mfvpr.evaluation.image_sizes import folders_of
+from mfvpr.evaluation.system import folders_of
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils.fingerprints import recipe_of

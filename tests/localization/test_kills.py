@@ -124,7 +124,7 @@ def test_flipped_bytes_are_named(tmp_path, part):
 
 def test_a_file_of_something_else_is_one_line(tmp_path):
     (tmp_path / FILE).write_bytes(b"no database " * 1000)
-    with pytest.raises(InputError, match=r"map\.sqlite: is damaged \(file is not a database\)"):
+    with pytest.raises(InputError, match=r"map\.sqlite: the file \(file is not a database\) is damaged"):
         MapFile(tmp_path).counts()
 
 

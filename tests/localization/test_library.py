@@ -12,7 +12,7 @@ from mfvpr import InputError, Map, Route
 from mfvpr.datasets import read_image
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation.drives import STREETS
-from mfvpr.evaluation.system import noise_image
+from mfvpr.evaluation.system import noise_images
 from mfvpr.features import VladFitting
 from mfvpr.localization.declaration import read_declaration
 from mfvpr.storage import FeatureCache
@@ -80,7 +80,7 @@ def test_a_robot_off_the_map_has_no_place(street, small_street):
     on_map = [known.localize(image, route=drive_route) for image in frames[:4]]
     assert [prediction.located.row for prediction in on_map] == [*range(4)]
     for seed in range(10):
-        prediction = known.localize(noise_image((160, 120), seed=seed), route=drive_route)
+        prediction = known.localize(noise_images((160, 120), seeds=(seed,))[0], route=drive_route)
     assert (prediction.place, prediction.shift, prediction.reason) == (None, None, "off the map")
     assert (prediction.located.row, prediction.located.off > 0.9, prediction.located.p < 0.1) == (None, True, True)
     back = [known.localize(image, route=drive_route) for image in frames[4:9]]
@@ -135,15 +135,6 @@ def test_a_system_of_ones_own_opens_its_map(small_street, tmp_path):
     with pytest.raises(InputError, match="of a system of your own with `Map"):
         Map.open(tmp_path)
     assert len(Map(tmp_path, system)) == 10
-
-
-@pytest.mark.parametrize("name", ["0000", "settings.json", "vocabulary.npz"])
-def test_a_map_of_an_earlier_version_is_to_be_built_again(tmp_path, small_street, name):
-    (tmp_path / name).mkdir()
-    for use in (lambda: Map.open(tmp_path), lambda: Map.create(tmp_path, small_street / "database", small("steering"))):
-        with pytest.raises(InputError, match="got one of an earlier version"):
-            use()
-    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_folder_of_something_else_is_refused(small_street):

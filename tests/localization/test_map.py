@@ -193,7 +193,7 @@ def test_images_come_one_by_one_and_others_see_them(dataset, tmp_path):
     for known in (adding, other):
         with pytest.raises(InputError, match="expected a map with images, got an empty one"):
             known.localize(dataset.queries.paths[0])
-    with pytest.raises(InputError, match="no vocabulary yet"):
+    with pytest.raises(InputError, match="no vocabulary yet; `learn`"):
         adding.add(dataset.database.paths[0], 0)
     adding.learn(dataset.database)
     for row, path in enumerate(dataset.database.paths):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.evaluation.evidence import LEAST_MATCHES
-from mfvpr.evaluation.system import noise_image
+from mfvpr.evaluation.system import noise_images
 from mfvpr.features import Description
 from mfvpr.localization import Map, Prediction, map_images
 from mfvpr.storage.maps import MapFile
@@ -43,7 +43,7 @@ def test_strong_features_with_few_matches_have_no_place(folder):
 
 @pytest.mark.parametrize("grain", [1, 3])
 def test_noise_has_no_place_whatever_the_confidence(folder, grain):
-    image = noise_image((160, 120), seed=7, grain=grain)
+    image = noise_images((160, 120), seeds=(7,), grains=(grain,))[0]
     prediction = opened(folder, confidence=replace(SURE, bias=100.0)).localize(image)
     assert prediction == without_place("no better than noise", image)
 

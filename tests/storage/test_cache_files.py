@@ -136,6 +136,17 @@ def test_files_that_were_exchanged_are_noticed(tmp_path):
     assert files.get(KEYS[1]) is None
 
 
+def test_old_files_of_killed_processes_are_removed(tmp_path):
+    files = opened(tmp_path)
+    files.update({KEYS[0]: features_of(0)})
+    old, new = (files.path(KEYS[0]).with_name(f".abc-{end}.npz") for end in ("12345678", "abcdefgh"))
+    for path in (old, new):
+        path.write_bytes(b"")
+    os.utime(old, (0, 0))
+    opened(tmp_path).update({KEYS[1]: features_of(1)})
+    assert [path.exists() for path in (old, new)] == [False, True]
+
+
 def make(root):
     """A process that makes the files that are not there, in batches."""
     files = opened(root)

@@ -283,15 +283,6 @@ def test_what_has_no_recipe_is_kept_in_memory_alone_which_is_said_once(folder, t
     assert_same(features[0], FeatureCache().local(folder, SIFT)[0][0])
 
 
-def test_files_of_earlier_versions_are_left_alone(folder, tmp_path):
-    (tmp_path / "Sift-0").mkdir()
-    (tmp_path / "Sift-0/manifest.json").write_text("{}")
-    lines = []
-    FeatureCache(tmp_path, runtime=Runtime(log=lines.append)).local(folder, SIFT)
-    assert lines[0].startswith(f"warning: {tmp_path}: has files of an earlier version, which are not used")
-    assert [path.name for path in (tmp_path / "Sift-0").iterdir()] == ["manifest.json"]
-
-
 def test_an_image_that_changes_while_it_is_described_is_refused(folder, tmp_path, monkeypatch):
     """Otherwise its features would be those of the content that it had before."""
     root = tmp_path / "images"

@@ -14,13 +14,12 @@ from mfvpr.core.weights import DescriptorDistanceWeight, FeatureScoreWeight, Rat
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import best_setting
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.tuning.learning.models import Model, can_learn
+from mfvpr.tuning.learning.models import Model, Options, of_matches, start, train
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
-from mfvpr.tuning.learning.teaching import Options, of_matches, start, train
 from mfvpr.tuning.learning.training import Checkpoints, Fit
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting
 from mfvpr.tuning.sweeps.setting_rankings import SweepOptions, rank_settings
-from mfvpr.tuning.sweeps.sweep_axes import Axes
+from mfvpr.tuning.sweeps.sweep_axes import Axes, can_learn
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 

@@ -1,4 +1,4 @@
-"""Models of learning: parameters to start from, and a differentiable score of the candidates of a query."""
+"""Models of learning: what they start from, a differentiable score of the candidates of a query, and their training."""
 
 import math
 from collections.abc import Callable
@@ -8,22 +8,31 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optax
 
-from mfvpr.baselines.learned_weight import LearnedWeight
+from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import SCORE, parameters_of
+from mfvpr.core.parameters import SCORE, parameters_of, with_capacity
 from mfvpr.core.ranking import combine
 from mfvpr.core.types import Array, Matches
-from mfvpr.tuning.learning import losses
-from mfvpr.tuning.learning.losses import Loss
-from mfvpr.tuning.learning.splits import Batch
+from mfvpr.core.weights import RatioWeight, UnitWeight
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
+from mfvpr.tuning.learning.losses import Loss, cross_entropy, mean_loss
+from mfvpr.tuning.learning.splits import Batch, TrainingSplit
+from mfvpr.tuning.learning.training import Fit, Schedule, fit
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float, masked_mean
 
+TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image
+FIRST_SHARE = 0.3  # the retrieval's weight at the start, in units of the balanced weight
+LEAST_C = 1e-3  # the same, at least, in units of the scores
+SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
+
 # `numbers` by name, `c` and `sharpness` as logarithms, which keeps them above 0, and `weight`
 Parameters = dict[str, Any]
-Objective = Callable[["Parameters", Batch], Array]
+Objective = Callable[[Parameters, Batch], Array]
 
 
 @dataclass(frozen=True)
@@ -60,12 +69,7 @@ class Model:
         scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
         scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
         logits = scores / self.unit * jnp.exp(parameters["sharpness"])
-        return losses.mean_loss(loss, logits, batch.positives, batch.mask)
-
-
-def can_learn(scorer: Any) -> bool:
-    """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
-    return any(parameter.learned for parameter in parameters_of(scorer).values())
+        return mean_loss(loss, logits, batch.positives, batch.mask)
 
 
 def first_numbers(scorer: Any, spread: float) -> dict[str, Array]:
@@ -97,3 +101,79 @@ def _match_loss(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch
     logits, correct = (values.reshape(-1) for values in of_pairs)
     incorrect = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~correct
     return (masked_mean(jax.nn.softplus(-logits), correct) + masked_mean(jax.nn.softplus(logits), incorrect)) / 2
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of learning and comparing scores."""
+
+    c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
+    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.evaluation.shortlist_scores.retrieval_scores`
+    ties: Ties = "retrieval"  # as in `mfvpr.evaluation.shortlist_scores.rank_shortlist`
+    loss: Loss = cross_entropy  # of one query
+    steps: int = 200  # updates of a training, at most
+    every: int = 5  # steps from one validation to the next
+    patience: int = 10  # validations without a gain after which to stop
+    batch: int = 8  # queries of a step
+    learning_rate: float = 0.01  # of Adam
+    hidden: int = 16  # width of the network of match weights
+    inputs: tuple[str, ...] = RELATIVE  # properties of a match that the network sees, see `LearnedWeight`
+    seed: int = 0  # of the network, and of the order of the queries
+
+
+def start(
+    split: TrainingSplit, scorer: Any, options: Options, *, fused: bool = False, learned_weight: bool = False
+) -> Model:
+    """The model that learns from rankings, starting from a hard scorer.
+
+    It learns the retrieval's weight as well (`fused`), and the match weight, starting from 1 (`learned_weight`).
+    """
+    scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
+    deviation = split.score_deviation(scorer)
+    scorer = with_capacity(scorer, *split.match_set.image_sizes)
+    first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
+    if fused:
+        c = FIRST_SHARE * split.balance(deviation)
+        first["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * deviation) / deviation))
+    if learned_weight:
+        first["weight"] = _first_weight(split, options)
+    return Model(scorer, first, deviation)
+
+
+def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
+    """The model that learns a match weight from labels of single matches."""
+    sizes = split.match_set.image_sizes
+    seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
+    sigma = TEACHER_SIGMA * float(np.max(seen))
+    teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
+    scorer = with_capacity(scorer, *sizes)
+    first = {"numbers": {}, "weight": _first_weight(split, options)}
+    return Model(scorer, first, 1.0, with_capacity(teacher, *sizes))
+
+
+def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
+    """A match weight of 1, with statistics of the matches of a few queries that are spread along the path."""
+    queries = split.train[np.linspace(0, len(split.train) - 1, min(options.batch, len(split.train))).astype(int)]
+    matches = split.batch(queries, options.batch).matches
+    return LearnedWeight.create(jax.random.key(options.seed), matches, options.hidden, names=options.inputs)
+
+
+def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) -> Fit:
+    """Learn a model's parameters; `keeping` are `checkpoints` and `track` of `training.fit`."""
+    size = options.batch
+    objective = model.objective(options.loss)
+    loss = jax.jit(objective)
+    parts = [split.validation[place : place + size] for place in range(0, len(split.validation), size)]
+    validation = [(split.batch(part, size), len(part)) for part in parts]
+
+    def batches(step: int) -> Batch:
+        """The batch of a step: every query once per epoch, in an order that depends on the step alone."""
+        epoch, place = divmod(step, -(-len(split.train) // size))
+        order = np.random.default_rng([options.seed, epoch]).permutation(split.train)
+        return split.batch(order[place * size : (place + 1) * size], size)
+
+    def validate(learned: Parameters) -> float:
+        return sum(float(loss(learned, batch)) * count for batch, count in validation) / len(split.validation)
+
+    schedule = Schedule(optax.adam(options.learning_rate), options.steps, options.every, options.patience)
+    return fit(model.start, objective, batches, schedule, validate=validate, **keeping)

@@ -1,18 +1,18 @@
 """The first rows of the rankings of every query by every setting of a sweep.
 
 Settings are batch axes of one compiled call. Matches are scored pair by pair, whatever query they belong to. Work goes
-block by block (some settings, some queries): this bounds the memory, and an interrupted sweep goes on with the blocks
-that are missing.
+block by block (some settings, some queries): this bounds the memory. With a folder, the rows of each setting are kept
+in a file, and only settings that are missing are ranked.
 """
 
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -32,8 +32,8 @@ from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties, breaks_ties_by_row, fuse, retrieval_scores
 from mfvpr.evaluation.validation import require_finite
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
+from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Group, Setting, distinct, group_by_program
-from mfvpr.utils.arrays import read_arrays, write_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of
 from mfvpr.utils.numerics import Device, compiled
@@ -41,7 +41,7 @@ from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 from mfvpr.utils.versions import versions
 
 SETTINGS_PER_BLOCK = 64
-_ALONE = "alone"  # the c of a score that is not fused
+ALONE = "alone"  # the c of a score that is not fused
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class SweepOptions:
             None = each query alone.
         settings_per_block: None = 64.
         queries_per_block: None = as many as fit into 256 MB.
-        folder: where finished blocks are stored, and read instead of being computed again; None = nowhere. It may hold
-            blocks of other sweeps. Blocks of a scorer without a recipe (`mfvpr.utils.recipe_of`) are not stored.
+        folder: where the rows of each setting are kept, and read by later sweeps; None = nowhere. It may hold those of
+            other data and scorers. Rows of a scorer without a recipe (`mfvpr.utils.recipe_of`) are not kept.
         runtime: devices that share the batches of pairs, progress and messages.
         label: of the progress.
     """
@@ -129,107 +129,120 @@ def rank_settings(
         candidates: their shortlist.
         views: candidates that are ranked; by default one view, all of the shortlist.
         options: depth and ties of the rankings, sizes of blocks and their folder, and the runtime.
+
+    Raises:
+        InputError: a setting that cannot be scored, or the folder cannot be used.
     """
     check_host(scorer)
     refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*WEIGHTINGS, FUSION))
     views = [candidates.mask] if views is None else views
-    num_queries = len(candidates.mask)
-    unique, places = distinct(settings)
-    per_block = min(options.settings_per_block or SETTINGS_PER_BLOCK, len(unique))
-    groups = list(group_by_program(scorer, unique, match_set.image_sizes))
-    blocks = [block for group in groups for block in group.blocks(per_block)]
-    size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, per_block)
-    recipe = _recipe(scorer, settings, options) if options.folder else None
-    parts = []
+    num_queries, at_once = len(candidates.mask), min(options.settings_per_block or SETTINGS_PER_BLOCK, len(settings))
+    size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)
+    rows = np.full((len(views), len(settings), num_queries, max(options.ks)), -1, np.int32)
+    files, recipes = _files(scorer, settings, options)
+    parts, total = list[_Part](), 0  # total: batches of pairs for all blocks
     for start in range(0, num_queries, max(1, size)):
-        part = slice(start, start + size)
+        queries = range(num_queries)[start : start + size]
+        part = slice(queries.start, queries.stop)
         shortlist = jax.tree.map(lambda values: values[part], candidates)  # noqa: B023
         seen = [view[part] & shortlist.mask for view in views]
-        queries = range(num_queries)[part]
-        parts.append(_Part(match_set, queries, shortlist, seen, len(unique) / len(groups), options))
+        keys, missing = list[str](), range(len(settings))
+        if files is not None:
+            digest = _digest(match_set, queries, shortlist, seen)
+            keys, missing = [fingerprint([recipe, digest]) for recipe in recipes], list[int]()
+            for number, key in enumerate(keys):
+                if (found := files.get(key)) is None:
+                    missing.append(number)
+                else:
+                    rows[:, number, part] = found
+        if not missing:
+            continue
+        unique, places = distinct([settings[number] for number in missing])
+        groups = list(group_by_program(scorer, unique, match_set.image_sizes))
+        blocks = [block for group in groups for block in group.blocks(at_once)]
+        share = len(unique) / len(groups)
+        total += len(blocks) * sum(len(partition(each, queries, settings=share)) for each in scales(match_set))
+        numbers = [[missing[place] for place in each] for each in places]
+        parts.append(_Part(queries, shortlist, seen, keys, numbers, blocks, share))
 
-    rows = np.full((len(views), len(settings), num_queries, max(options.ks)), -1, np.int32)
-    total = len(blocks) * sum(part.num_batches for part in parts)
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
     for part in parts:
-        for number, block in enumerate(blocks):
-            of_block = np.unique(block.rows)  # the last block of a program repeats settings
-            members = [member for row in of_block for member in places[row]]
-            path = options.folder / f"{recipe}-{part.digest}-{number}.npz" if options.folder and recipe else None
-            found = _read_rows(path) if path else None
-            if found is None:
-                cs = [[settings[member].get(FUSION, _ALONE) for member in places[row]] for row in of_block]
-                found = part.rank(block, cs, ticks)
-                if path:
-                    with suppress(FileNotFoundError):  # another process that ends the same sweep removes the folder
-                        write_arrays(path, {"rows": found}, path.stem)
-            else:
-                next(itertools.islice(ticks, part.num_batches, part.num_batches), None)
-            rows[:, members, part.queries.start : part.queries.stop] = found
+        batches = list(all_batches(match_set, part.queries, settings=part.share))
+        shape = len(scales(match_set)), *part.candidates.mask.shape
+        place = slice(part.queries.start, part.queries.stop)
+        for block in part.blocks:
+            of_block, firsts = np.unique(block.rows, return_index=True)  # the last block of a program repeats settings
+            scores = block_scores(block, batches, shape, options.runtime.devices, ticks)[:, firsts]
+            numbers = [number for row in of_block for number in part.numbers[row]]
+            repeats = [len(part.numbers[row]) for row in of_block]
+            cs = [settings[number].get(FUSION, ALONE) for number in numbers]
+            for view, seen in enumerate(part.views):
+                fused = np.repeat(fuse_all(match_set, scores, seen), repeats, axis=0)
+                rows[view, numbers, place] = _first_rows(fused, cs, part.candidates, seen, view, options)
+            if files is not None:
+                files.update({part.keys[int(number)]: rows[:, number, place] for number in numbers})
     next(ticks, None)  # ends the progress
     return rows
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Some of the queries of `rank_settings`, with their candidates and views."""
+class _Part(NamedTuple):
+    """Some queries of a sweep, and the settings by which they are not ranked yet."""
 
-    match_set: MatchSet | Scales  # of all queries
     queries: range
     candidates: Shortlist
     views: Sequence[np.ndarray]
-    settings: float  # that a program scores, on average: batches are smaller with more
-    options: SweepOptions
+    keys: Sequence[str]  # of the files of all settings
+    numbers: Sequence[Sequence[int]]  # of the settings of each score, which differ in c
+    blocks: Sequence[Group]  # of the scores
+    share: float  # scores of a program, on average: with more, batches are smaller
 
-    @cached_property
-    def num_batches(self) -> int:
-        """Number of batches of pairs."""
-        sets = scales(self.match_set)
-        return sum(len(partition(scale, self.queries, settings=self.settings)) for scale in sets)
 
-    @cached_property
-    def batches(self) -> list[PaddedBatch]:
-        """All pairs with matches."""
-        return list(all_batches(self.match_set, self.queries, settings=self.settings))
+def _files(
+    scorer: Any, settings: Sequence[Setting], options: SweepOptions
+) -> tuple[CacheFiles[np.ndarray] | None, list[Any]]:
+    """Files of rows, by what determines them but for setting and data, and recipes of the settings; None without."""
+    if options.folder is None:
+        return None, []
+    try:
+        of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
+        recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
+        recipes = [recipe_of(setting) for setting in settings]
+    except (TypeError, InputError) as error:
+        options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
+        return None, []
+    pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), recipes
 
-    @cached_property
-    def digest(self) -> str:
-        """Hash of the matches, the fusion of scales, the shortlist and the views."""
-        parts = [scale.take(self.queries) for scale in scales(self.match_set)]
-        fusion = (self.match_set.weights, self.match_set.normalize) if isinstance(self.match_set, Scales) else ()
-        matches = [(scale.counts, scale.matches) for scale in parts]
-        return content_hash(fusion, matches, self.candidates, self.views)
 
-    def rank(self, block: Group, cs: Sequence[Sequence[Any]], ticks: Iterator[Any]) -> np.ndarray:
-        """Database rows `[V, W, q, depth]` by the W settings of a block: each of its scores with several c."""
-        shape = len(scales(self.match_set)), *self.candidates.mask.shape
-        scores = block_scores(block, self.batches, shape, self.options.runtime.devices, ticks)
-        scores = scores[:, np.unique(block.rows, return_index=True)[1]]
-        fused = (fuse_all(self.match_set, scores, view) for view in self.views)
-        repeated = (np.repeat(each, list(map(len, cs)), axis=0) for each in fused)
-        flat = list(itertools.chain.from_iterable(cs))
-        return np.stack([self._first_rows(each, flat, number) for number, each in enumerate(repeated)])
+def _digest(match_set: MatchSet | Scales, queries: range, candidates: Shortlist, views: Sequence[np.ndarray]) -> str:
+    """Hash of the matches of queries, the fusion of their scales, their shortlist and views."""
+    fusion = (match_set.weights, match_set.normalize) if isinstance(match_set, Scales) else ()
+    parts = [scale.take(queries) for scale in scales(match_set)]
+    return content_hash(fusion, [(part.counts, part.matches) for part in parts], candidates, views)
 
-    def _first_rows(self, scores: np.ndarray, cs: Sequence[Any], number: int) -> np.ndarray:
-        """Database rows `[W, q, depth]` by scores `[W, q, C]` of a view, each fused with its own c."""
-        view, indices, options = self.views[number], self.candidates.indices, self.options
-        by_retrieval = retrieval_scores(self.candidates, options.retrieval_score)
-        tie_break = indices if breaks_ties_by_row(options.ties) else None
-        rows = np.full((*scores.shape[:2], max(options.ks)), -1, np.int32)
-        kinds = np.array(["alone" if c == _ALONE else "balanced" if c is None else "given" for c in cs])
-        for kind in np.unique(kinds):
-            members = np.flatnonzero(kinds == kind)
-            c = np.array([cs[member] for member in members.tolist()], np.float32) if kind == "given" else None
-            orders = _orders(by_retrieval, scores[members], c, view, tie_break, fused=kind != "alone")
-            order, final = map(np.asarray, orders)
-            is_seen = np.take_along_axis(view[None], order, -1)
-            ranked = np.where(is_seen, np.take_along_axis(indices[None], order, -1), -1)
-            if options.sequence is not None:
-                pairs = zip(ranked, np.take_along_axis(final, order, -1), strict=True)
-                ranked = np.stack([options.sequence.rows(Ranked(*pair), number) for pair in pairs])
-            ranked = ranked[..., : max(options.ks)]
-            rows[members, :, : ranked.shape[-1]] = ranked
-        return rows
+
+def _first_rows(
+    scores: Float[np.ndarray, "settings queries candidates"], cs: Sequence[Any], candidates: Shortlist,
+    view: Bool[np.ndarray, "queries candidates"], number: int, options: SweepOptions,
+) -> Int[np.ndarray, "settings queries depth"]:  # fmt: skip
+    """Database rows by the scores of settings, each fused with its own c, in the view of a number."""
+    by_retrieval = retrieval_scores(candidates, options.retrieval_score)
+    tie_break = candidates.indices if breaks_ties_by_row(options.ties) else None
+    rows = np.full((*scores.shape[:2], max(options.ks)), -1, np.int32)
+    kinds = np.array([ALONE if c == ALONE else "balanced" if c is None else "given" for c in cs])
+    for kind in np.unique(kinds):
+        members = np.flatnonzero(kinds == kind)
+        c = np.array([cs[member] for member in members.tolist()], np.float32) if kind == "given" else None
+        orders = _orders(by_retrieval, scores[members], c, view, tie_break, fused=kind != ALONE)
+        order, final = map(np.asarray, orders)
+        is_seen = np.take_along_axis(view[None], order, -1)
+        ranked = np.where(is_seen, np.take_along_axis(candidates.indices[None], order, -1), -1)
+        if options.sequence is not None:
+            pairs = zip(ranked, np.take_along_axis(final, order, -1), strict=True)
+            ranked = np.stack([options.sequence.rows(Ranked(*pair), number) for pair in pairs])
+        ranked = ranked[..., : max(options.ks)]
+        rows[members, :, : ranked.shape[-1]] = ranked
+    return rows
 
 
 def block_scores(
@@ -266,21 +279,3 @@ def _orders(
         return ranking.rank(scores, view, tie_break=tie_break), scores
 
     return jax.lax.map(order, (scores, c))
-
-
-def _recipe(scorer: Any, settings: Sequence[Setting], options: SweepOptions) -> str | None:
-    """Fingerprint of what determines the rows besides the data; None if the scorer or a weight has no recipe."""
-    of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
-    blocks = options.settings_per_block, options.queries_per_block
-    try:
-        return fingerprint(recipe_of([scorer, settings, of_rows, blocks, versions()]))
-    except (TypeError, InputError) as error:
-        options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
-        return None
-
-
-def _read_rows(path: Path) -> np.ndarray | None:
-    """Stored rows of a block; None if they are missing or damaged."""
-    with suppress(OSError, InputError):
-        return read_arrays(path, path.stem)["rows"]
-    return None

@@ -112,6 +112,11 @@ class Axes:
         return None if is_none else _plain(value)
 
 
+def can_learn(scorer: Any) -> bool:
+    """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
+    return any(parameter.learned for parameter in parameters.parameters_of(scorer).values())
+
+
 def _plain(value: Any) -> Any:
     """The number that a scalar array holds; any other value as it is."""
     return value.item() if isinstance(value, np.generic | np.ndarray | jax.Array) else value

@@ -10,9 +10,8 @@ import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, RatioWeight
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
-from mfvpr.tuning.learning.models import Model
+from mfvpr.tuning.learning.models import TEACHER_SIGMA, Model, Options, of_matches
 from mfvpr.tuning.learning.splits import Batch
-from mfvpr.tuning.learning.teaching import TEACHER_SIGMA, Options, of_matches
 from mfvpr.tuning.learning.training import Schedule, fit
 from tests.builders import make_matches
 from tests.tuning.learning.paths import SIZES, split
