@@ -10,8 +10,9 @@ from mfvpr.evaluation.image_sizes import Note
 from mfvpr.evaluation.system import System
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import check_system
+from mfvpr.systems.choices import SystemSettings
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import from_values
 
 _ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
 _DECLARED = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", "final", "ties")
@@ -30,7 +31,7 @@ def read_declaration(folder: Path) -> dict[str, Any]:
                          "`Map.create`, or open a map of a system of your own with `Map(folder, system)`.")  # fmt: skip
     settings = json.loads(content)
     try:
-        check_system(settings)
+        from_values(SystemSettings, settings)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
     return settings
@@ -40,7 +41,7 @@ def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
     settings = read_declaration(folder)
     try:
-        return assembly.system(settings)
+        return assembly.system(from_values(SystemSettings, settings))
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 

@@ -15,7 +15,7 @@ import pytest
 from experiments.paper import program, systems
 from experiments.paper.runs import lock_output
 from mfvpr.report import Table
-from tests.programs import ROOT, composed, output_of
+from tests.programs import ROOT, output_of, settings_of
 from tests.programs import run as run_program
 
 pytestmark = pytest.mark.slow
@@ -156,7 +156,7 @@ def test_the_plan_comes_first_and_tables_before_the_seconds(tmp_path, monkeypatc
     monkeypatch.setattr(program, "paper_tables", lambda _: [("recall", "heading", table)])
     monkeypatch.setattr(program, "measure_times", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        program.paper(composed("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
+        program.paper(settings_of("systems=[sift_hist_10]", f"out={tmp_path}/out", config="paper"))
     assert (tmp_path / "out" / "tables" / "recall.csv").read_text() == "system\nSIFT\n"
     stdout, stderr = capsys.readouterr()
     assert "SIFT" in stdout
