@@ -1,6 +1,5 @@
-"""Every public function that takes a path takes it as text as well."""
+"""Functions that take a path take it as text as well, and replace no file of others."""
 
-import inspect
 import os
 from pathlib import Path
 
@@ -9,39 +8,16 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
-from mfvpr.baselines import weight_registry
 from mfvpr.baselines.learned_weight import LearnedWeight
 from mfvpr.baselines.weight_registry import read_weight, write_weight
-from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets, truth_files
-from mfvpr.datasets import image_reading as images
-from mfvpr.datasets.published import published_dataset
-from mfvpr.datasets.streets import draw_streets, streets_folder
+from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets
 from mfvpr.evaluation import Confidence, read_confidences, write_confidences
-from mfvpr.evaluation import confidence_calibration as calibration
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles
 from mfvpr.retrieval.precomputed import File
 from tests.builders import fill, random_matches
 from tests.io.other_programs import feature
 
 WEIGHT = LearnedWeight.create(jax.random.key(1), random_matches(np.random.default_rng(0), 30), 3)
-
-
-def public_functions():
-    modules = (calibration, datasets, images, io, truth_files, weight_registry)
-    functions = [getattr(module, name) for module in modules for name in dir(module) if not name.startswith("_")]
-    return {function for function in (*functions, draw_streets, published_dataset, streets_folder)
-            if inspect.isfunction(function) and function.__module__.startswith("mfvpr.")}  # fmt: skip
-
-
-def test_signatures_say_so():
-    checked = {function.__name__ for function in public_functions()}
-    assert {"open_features", "image_folder", "read_frames", "read_confidences", "truth_from_file"} <= checked
-    internal = {"choose_reader", "read_npz", "reading", "replacing", "require_all", "require_file"}
-    internal |= {"require_replaceable", "write_text"}
-    for function in public_functions():
-        if function.__name__ not in internal:
-            for parameter in inspect.signature(function).parameters.values():
-                assert parameter.annotation not in (Path, Path | None), (function.__name__, parameter.name)
 
 
 def test_files_of_other_programs(tmp_path):

@@ -190,8 +190,9 @@ def test_confidence_of_other_settings_is_said(evaluate, confidence):
     assert "other settings of scorer, fusion:" in stderr
     fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined")
     other, *_ = evaluate("fused", *fused)
-    for changed, warns in (("scorer.anchor.window=6", True), ("scorer.anchor.window=10", False)):
-        _, stderr, _ = evaluate(changed, f"confidence={other}/confidence.json", *fused, changed)
+    for window, warns in ((6, True), (10, False)):
+        changed = f"scorer.anchor.window={window}"
+        _, stderr, _ = evaluate(f"window_{window}", f"confidence={other}/confidence.json", *fused, changed)
         assert ("other settings of scorer:" in stderr) == warns
     _, stderr, _ = evaluate("third", f"confidence={confidence}", "scorer=paper")
     assert "other settings" not in stderr  # the histogram is the same beside others
