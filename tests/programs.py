@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from copy import deepcopy
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +24,7 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.match_files import MatchStore
 from mfvpr.systems.choices import CONF
 from mfvpr.utils import Stopwatch
+from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
@@ -41,6 +43,11 @@ def run(*arguments, program="evaluate", cwd=ROOT, **environment):
 def composed(*overrides, config="evaluate"):
     """The settings of a command line, not yet checked."""
     return deepcopy(_composed(config, overrides))
+
+
+def settings_of(*overrides, config="evaluate", **more):
+    """The checked settings of a command line; `more` replaces some."""
+    return replace(from_values(schema.PROGRAMS[config], composed(*overrides, config=config)), **more)
 
 
 @cache
@@ -77,7 +84,7 @@ def job_of(root, config, job, figures):
         with pytest.MonkeyPatch.context() as patch:
             if not pictures:
                 patch.setattr(*figures, lambda *_: [])
-            job(composed(*small(root), f"out={out}", *overrides, config=config))
+            job(settings_of(*small(root), f"out={out}", *overrides, config=config))
         return results(out)
 
     return call

@@ -12,9 +12,10 @@ from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
 from mfvpr.systems.choices import CONF, GROUPS, choices_of
-from mfvpr.utils.fields import flat, settings_of
+from mfvpr.utils.fields import settings_of
+from tests import programs
 from tests.needs import needs
-from tests.programs import QUICK, ROOT, composed, run, typed
+from tests.programs import QUICK, ROOT, run, typed
 
 pytestmark = needs("experiments")
 
@@ -61,10 +62,9 @@ def test_settings_of_commands_are_valid(command, config):
     chosen = [each for each in arguments if each != "-m" and not each.startswith(("launcher=", "cluster"))]
     if "-m" in arguments:  # the first of several values
         chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", each) for each in chosen]
-    settings = composed(*chosen, config=config)
-    schema.check(config, settings)
+    settings = programs.settings_of(*chosen, config=config)
     for name in ("also", "report"):
-        assert not settings.get(name) or compose_data_sets(name, settings[name])
+        assert not getattr(settings, name, None) or compose_data_sets(name, getattr(settings, name))
 
 
 def command_words(config):
@@ -136,10 +136,13 @@ def test_settings_that_pages_name_exist():
     names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
     assert len(names) > 20
     groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*GROUPS, "cluster", "name"}
-    known = {name for owner in schema.PROGRAMS.values() for name, _ in flat(settings_of(owner))} | {*schema.axes()}
+    known = {*schema.axes()}
+    for owner in schema.PROGRAMS.values():
+        members = settings_of(owner)
+        known |= {*members} | {name for each in members.values() if isinstance(each, dict) for name in each}
     known |= {name for group in GROUPS for each in choices_of(group).values() for name in each}
     known |= {name for owner in schema.OTHERS for name in settings_of(owner)}
-    assert {*names} <= {name.rpartition(".")[2] for name in known} | groups
+    assert {*names} <= known | groups
 
 
 def test_pages_name_no_machine_path():

@@ -11,9 +11,10 @@ from experiments.paper.pages import paper_figures, write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.checkpoints import how_to_install
-from mfvpr.cli import build, run_folder, truth
+from mfvpr.cli import run_folder
 from mfvpr.cli.console import tell
-from mfvpr.cli.inputs import dataset_of
+from mfvpr.cli.inputs import cache_of, dataset_of, describe_truth
+from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.rankings import RETRIEVAL
@@ -24,10 +25,10 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
 
-def paper(settings: dict[str, Any]) -> None:
+def paper(settings: Paper) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
-    rows = systems.chosen_rows(settings["systems"])
-    places, absent, refused = systems.places(settings["data"], settings["datasets"])
+    rows = systems.chosen_rows(settings.systems)
+    places, absent, refused = systems.places(settings.data, settings.datasets)
     lacking: dict[str, str] = {}  # a line for each evaluation whose networks are not installed
     for run in _names(rows) if places else ():
         if missing := systems.missing_weights(runs.settings_of(run, places[0], settings)):
@@ -43,16 +44,16 @@ def paper(settings: dict[str, Any]) -> None:
     tell(
         f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets ({', '.join(known)}), "
         f"{len(_finished_runs(rows, known, settings))} of {len(names) * len(places)} finished; then tables, seconds of "
-        f"a query, and figures in {settings['out']}"
+        f"a query, and figures in {settings.out}"
     )
     groups = {
-        f"data sets that are not in {settings['data'] or 'data=DIR'}, see `mfvpr data list`": absent,
+        f"data sets that are not in {settings.data or 'data=DIR'}, see `mfvpr data list`": absent,
         "evaluations without their weights, see `mfvpr weights list`": lacking,
     }
     parts = [f"{len(members)} {words} ({', '.join(members)})" for words, members in groups.items() if members]
     for line in [*(["; ".join(parts)] if parts else []), *refused]:
         tell(f"left out: {line}")
-    out = expand_user(settings["out"])
+    out = expand_user(settings.out)
     with runs.lock_output(out):
         _evaluate_and_report(rows, places, settings, out, left_out)
 
@@ -63,7 +64,7 @@ def _names(rows: Sequence[Row]) -> list[str]:
 
 
 def _evaluate_and_report(
-    rows: Sequence[Row], places: Sequence[Place], settings: Mapping[str, Any], out: Path, left_out: Sequence[str]
+    rows: Sequence[Row], places: Sequence[Place], settings: Paper, out: Path, left_out: Sequence[str]
 ) -> None:
     def write_tables(datasets: Mapping[str, Dataset]) -> None:
         _write_tables(out, _read_evaluations(rows, datasets, settings))
@@ -97,7 +98,7 @@ def _evaluate_and_report(
 def evaluate_all(
     rows: Sequence[Row],
     places: Sequence[Place],
-    settings: Mapping[str, Any],
+    settings: Paper,
     write_tables: Callable[[Mapping[str, Dataset]], None],
 ) -> tuple[dict[str, Dataset], list[str]]:
     """Evaluate, writing tables after each data set; return readable data sets, and a line per failed evaluation."""
@@ -113,10 +114,9 @@ def evaluate_all(
     for number, place in enumerate(places):
         try:
             chosen = runs.settings_of(names[0], place, settings)
-            dataset = dataset_of(chosen["dataset"])
-            description = truth.describe(chosen["dataset"], chosen["recall"], dataset)
-            runtime = build.runtime(chosen["devices"], chosen["memory"], chosen.get("cluster"))
-            cache = build.cache(chosen["cache"], runtime, on_bad_image=chosen["on_bad_image"])
+            dataset = dataset_of(chosen.dataset)
+            description = describe_truth(chosen.dataset, chosen.recall, dataset)
+            cache = cache_of(chosen)
             folders = {sequence.name: sequence.images for sequence in dataset.sequences}
             folders |= {"the database": dataset.database}
             images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}
@@ -148,15 +148,13 @@ def evaluate_all(
     return datasets, failures
 
 
-def _finished_runs(
-    rows: Sequence[Row], datasets: Iterable[str], settings: Mapping[str, Any]
-) -> dict[tuple[str, str], Path]:
+def _finished_runs(rows: Sequence[Row], datasets: Iterable[str], settings: Paper) -> dict[tuple[str, str], Path]:
     """Run folders by data set and evaluation."""
     folders = {(name, run): runs.folder_of(run, name, settings) for name in datasets for run in _names(rows)}
     return {key: folder for key, folder in folders.items() if (folder / LAST).is_file()}
 
 
-def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], settings: Mapping[str, Any]) -> Evaluations:
+def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], settings: Paper) -> Evaluations:
     results, sizes, folders = {}, {}, _finished_runs(rows, datasets, settings)
     for (name, run), folder in folders.items():
         content, size = runs.read_json(folder / LAST), runs.read_json(folder / runs.SIZES)
@@ -171,7 +169,7 @@ def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], sett
 
 
 def measure_times(
-    rows: Sequence[Row], place: Place, dataset: Dataset, settings: Mapping[str, Any], out: Path
+    rows: Sequence[Row], place: Place, dataset: Dataset, settings: Paper, out: Path
 ) -> dict[str, dict[str, Any]]:
     """Seconds by finished evaluation on a data set, measured once for the same settings, data and device."""
     times = {}

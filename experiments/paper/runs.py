@@ -14,9 +14,10 @@ import numpy as np
 
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
-from mfvpr.cli import evaluation, run_folder, schema
+from mfvpr.cli import evaluation, run_folder
 from mfvpr.cli.command_line import checked, compose
 from mfvpr.cli.inputs import Inputs
+from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
@@ -29,7 +30,8 @@ from mfvpr.retrieval import fit_to_database
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import expand_user, lock_folder
+from mfvpr.utils.fields import to_values
+from mfvpr.utils.files import expand_user, lock_folder, remove_leftovers
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.versions import versions
@@ -45,7 +47,7 @@ _MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
 _DATABASES = (100, 1000, 10_000, 100_000)  # images
 _ROUNDS = 5
 _OUTPUTS = {"runs", "tables", "figures", "comparisons", "seconds", PAGE}
-_FREE = {"out", "cache", "memory", "devices", "command"}  # settings that change no number
+_FREE = {"out", "cache", "memory", "devices", "compiled", "cluster"}  # settings that change no number
 
 
 @contextmanager
@@ -65,31 +67,29 @@ def lock_output(out: Path) -> Iterator[None]:
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
             raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
+        remove_leftovers(out)
         yield
 
 
-def settings_of(run: str, place: Place, settings: Mapping[str, Any]) -> dict[str, Any]:
+def settings_of(run: str, place: Place, settings: Paper) -> Evaluate:
     """The checked settings of an evaluation."""
     chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
-    composed = checked("evaluate", compose("evaluate", chosen))
-    composed |= {name: settings[name] for name in _SHARED}
-    composed["out"] = str(folder_of(run, place.name, settings))
-    schema.check("evaluate", composed)
-    del composed["compiled"]  # a setting of this process
-    return composed | {"command": f"mfvpr evaluate {' '.join(chosen)}"}
+    shared = {name: getattr(settings, name) for name in _SHARED}
+    out, command = str(folder_of(run, place.name, settings)), f"mfvpr evaluate {' '.join(chosen)}"
+    return replace(checked("evaluate", compose("evaluate", chosen)), out=out, command=command, **shared)
 
 
-def folder_of(run: str, dataset: str, settings: Mapping[str, Any]) -> Path:
+def folder_of(run: str, dataset: str, settings: Paper) -> Path:
     """The run folder of an evaluation."""
-    return expand_user(settings["out"]) / "runs" / dataset / run
+    return expand_user(settings.out) / "runs" / dataset / run
 
 
-def input_fingerprints(settings: Mapping[str, Any], images: Mapping[str, str], truth: str | None) -> dict[str, str]:
+def input_fingerprints(settings: Evaluate, images: Mapping[str, str], truth: str | None) -> dict[str, str]:
     """Fingerprints of the inputs of an evaluation: settings, images, truth, weights; and the version of the code."""
-    fixed = {name: value for name, value in settings.items() if name not in _FREE}
-    fixed["dataset"] = {name: value for name, value in settings["dataset"].items() if name not in ("root", "cache")}
+    fixed = {name: value for name, value in to_values(settings).items() if name not in _FREE}
+    fixed["dataset"] = {name: value for name, value in settings.dataset.items() if name not in ("root", "cache")}
     fixed["dataset"] |= {name: None for name in ("database", "queries") if name in fixed["dataset"]}  # folders
-    names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    names = [group.get("weights") for group in (settings.features, settings.retrieval, settings.matching)]
     weights = {name: files.read_manifest(name).sha256 for name in names if name in REGISTRY}
     return {
         "settings": fingerprint(fixed),
@@ -115,10 +115,10 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
     return True
 
 
-def evaluate(settings: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
+def evaluate(settings: Evaluate, inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
-    with run_folder.claim(settings["out"], settings["dataset"]["name"], own=True) as folder:
-        outcome = evaluation.evaluation_of(dict(settings))
+    with run_folder.claim(settings.out, settings.dataset["name"], own=True) as folder:
+        outcome = evaluation.evaluation_of(settings)
 
         def write(new: Path) -> None:
             write_run_folder(new, outcome.report, outcome.description)
@@ -155,7 +155,7 @@ def read_json(path: Path) -> Any:
         return None
 
 
-def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, float]:
+def measure_query(settings: Evaluate, dataset: Dataset) -> dict[str, float]:
     """Measure the seconds of a query by step.
 
     A part of the database is enough: only the search among descriptors depends on its size (see `search`). Queries are
@@ -164,12 +164,12 @@ def measure_query(settings: Mapping[str, Any], dataset: Dataset) -> dict[str, fl
     """
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
     number = min(QUERIES, len(sequence.images))
-    candidates = settings["candidates"]
+    candidates = settings.candidates
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
-    extractor, matcher = assembly.extractor(settings["features"], None), assembly.matcher(settings["matching"], None)
-    retriever = assembly.retriever(settings["retrieval"], extractor, None)
-    scorers, seconds = assembly.scorers(settings["scorer"]), dict[str, float]()
+    extractor, matcher = assembly.extractor(settings.features, None), assembly.matcher(settings.matching, None)
+    retriever = assembly.retriever(settings.retrieval, extractor, None)
+    scorers, seconds = assembly.scorers(settings.scorer), dict[str, float]()
     main = "histogram" if "histogram" in scorers else next(iter(scorers))
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
         cache = FeatureCache(Path(folder) / "cache")

@@ -1,18 +1,17 @@
 """Rows of the tables, the evaluations that give them, and the data sets at hand."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.registry import Entry
-from mfvpr.cli.build import expand_user
 from mfvpr.cli.command_line import override
-from mfvpr.cli.schema import DATA_SET_NAME
+from mfvpr.cli.schema import DATA_SET_NAME, Evaluate
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import expand_user
 
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
@@ -160,7 +159,7 @@ def _places_by_coordinates(root: Path) -> Iterator[Place]:
                 break
 
 
-def missing_weights(settings: Mapping[str, Any]) -> list[Entry]:
+def missing_weights(settings: Evaluate) -> list[Entry]:
     """Networks of the settings without installed weights."""
-    names = [settings[group].get("weights") for group in ("features", "retrieval", "matching")]
+    names = [group.get("weights") for group in (settings.features, settings.retrieval, settings.matching)]
     return [REGISTRY[name] for name in dict.fromkeys(names) if name in REGISTRY and not is_installed(REGISTRY[name])]

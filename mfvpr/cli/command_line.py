@@ -4,8 +4,9 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import hydra
@@ -17,10 +18,12 @@ from omegaconf import DictConfig, OmegaConf
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.cli import schema
 from mfvpr.cli.console import one_line, tell
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.choices import CONF, without
+from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import from_values
 
-Job = Callable[[dict[str, Any]], None]
+Job = Callable[[Any], None]  # of the settings of its program
 _STEERING_WEIGHTS = "aliked-n16"
 
 
@@ -45,22 +48,33 @@ def run(program: str, find_job: Callable[[], Job], command: str) -> None:
     def run_job(composed: DictConfig, typed: list[str], multirun: dict[str, Any] | None) -> None:
         settings = checked(program, composed)
         job = find_job()
-        from mfvpr.cli import build  # imported with the job
-
-        _set_up_jax(settings.pop("compiled"))
-        shown = shlex.join(argument for argument in typed if not argument.startswith("launcher="))
-        with build.cluster(settings.get("cluster")) as cluster:
-            settings |= {"multirun": multirun, "command": f"{command} {shown}", "cluster": cluster}
+        _set_up_jax(settings.compiled)
+        if not isinstance(settings, schema.Common):
             job(settings)
+            return
+        shown = shlex.join(argument for argument in typed if not argument.startswith("launcher="))
+        with _cluster(settings.cluster) as workers:
+            job(replace(settings, command=f"{command} {shown}", multirun=multirun, workers=workers))
 
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
 
 
-def checked(program: str, composed: DictConfig) -> dict[str, Any]:
-    """Composed settings as values, if they are allowed."""
-    settings: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-    schema.check(program, settings)
-    return settings
+def checked(program: str, composed: DictConfig) -> Any:
+    """Composed settings as the dataclass of the program, if they are allowed."""
+    values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+    return from_values(schema.PROGRAMS[program], values)
+
+
+@contextmanager
+def _cluster(settings: Mapping[str, Any]) -> Iterator[Cluster | None]:
+    """Connect to the cluster that the settings name, or start it, until the block ends."""
+    if not settings:
+        yield None
+        return
+    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
+    with starts[settings["name"]](**without(settings, "name")) as started:
+        tell(f"cluster: {started}")
+        yield started
 
 
 def compose(program: str, overrides: list[str]) -> DictConfig:
@@ -81,7 +95,7 @@ def compose_data_set(setting: str, name: str, values: dict[str, Any]) -> dict[st
     if missing := sorted(OmegaConf.missing_keys(config)):
         raise InputError(f"{setting}: dataset.{missing[0]}: expected a value of {name}")
     settings: Any = OmegaConf.to_container(config, resolve=True)
-    schema.check("learn", {"dataset": settings})
+    schema.check_data_set(settings)
     return settings
 
 

@@ -30,11 +30,22 @@ def read_file(path: str) -> ConfidenceFile:
     return ConfidenceFile(path, *read_confidences(expand_user(path)))
 
 
-def warn_of_absent_places(file: ConfidenceFile) -> None:
-    """Warn if the file was fitted on places only that the database shows."""
+def confidence_of(
+    file: ConfidenceFile, name: str, scorers: Collection[str], settings: Mapping[str, Any], candidates: int
+) -> Confidence:
+    """The confidence of a final score; warns if it was fitted without absent places, or with other settings."""
+    if name not in file.systems:
+        raise InputError(
+            f"confidence={file.path}: expected the confidence of {name}, which decides, got "
+            f"{', '.join(file.systems) or 'none'}; evaluate with the same scorer, final and fusion"
+        )
     if not file.origin.get("absent_queries"):
         tell(f"warning: confidence={file.path} was fitted without absent places, so that it is too high for them; "
              "evaluate again on a path that is long enough to leave out the images of a query's place")  # fmt: skip
+    if other := other_settings(file.origin, scorers, settings, candidates):
+        words = ", ".join(other)
+        tell(f"warning: confidence={file.path} was fitted with other settings of {words}: it may mean nothing here")
+    return file.systems[name]
 
 
 def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> ConfidenceFile:
@@ -42,32 +53,22 @@ def check_confidence(file: ConfidenceFile, system: System, inputs: Inputs) -> Co
 
     Warns if the file was fitted on the same images, or with other settings. The score that decides must be in the file.
     """
-    headline, settings = system.headline, system.settings or {}
-    if not file.systems:
-        raise InputError(f"confidence={file.path}: expected confidences of systems, got none: its run could fit "
-                            "none, as where there is but one candidate")  # fmt: skip
-    if headline not in file.systems:
-        raise InputError(f"confidence={file.path}: expected one of the system that decides, {headline}, got "
-                            f"{', '.join(file.systems)}; make it with the same scorer, final and fusion")  # fmt: skip
-    before, now = map(_query_fingerprints, (file.origin.get("data_fingerprint"), fingerprints(inputs.contents)))
-    if before & now:
+    headline, settings, scores = system.headline, system.settings or {}, system.final_scores
+    candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
+    confidence = confidence_of(file, headline, scores[headline].scorers, settings, candidates)
+    if _query_fingerprints(file.origin.get("data_fingerprint")) & _query_fingerprints(fingerprints(inputs.contents)):
         tell(f"warning: confidence={file.path} was fitted on these very images, so that it flatters")
-    warn_of_absent_places(file)
-    if not any(file.systems[headline].weights):
+    if not any(confidence.weights):
         tell(f"warning: confidence={file.path} has the same confidence for all predictions, correct or incorrect")
     threshold = inputs.thresholds and [middle(inputs.thresholds), inputs.ground_truth["unit"]]
-    recall = ["recall"] if threshold and threshold != file.origin.get("correct_within") else []
-    candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
-    scores = system.final_scores
-    other = {name: other_settings(file.origin, scores[name].scorers, settings, candidates) + recall
-             for name in file.systems if name in scores}  # fmt: skip
-    if other[headline]:
-        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other[headline])}: "
-             "it may mean nothing here")  # fmt: skip
-    usable = {name: file.systems[name] for name in other if {*other[name]} <= {*other[headline]}}
-    if unusable := [name for name in other if name not in usable]:
-        tell(f"confidence={file.path}: nothing is said of {', '.join(unusable)}, which had other settings there")
-    return file._replace(systems=usable)
+    if threshold and threshold != file.origin.get("correct_within"):
+        tell(f"warning: confidence={file.path} was fitted with other settings of recall: it may mean nothing here")
+    other = {
+        name: {*other_settings(file.origin, scores[name].scorers, settings, candidates)}
+        for name in file.systems
+        if name in scores
+    }
+    return file._replace(systems={name: file.systems[name] for name in other if other[name] <= other[headline]})
 
 
 def other_settings(

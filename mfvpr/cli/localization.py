@@ -1,9 +1,10 @@
 """Maps: build one, add images, print what it holds; localize images, a line of JSON for each, with figures of some."""
 
 import json
+import stat
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -12,8 +13,9 @@ from jaxtyping import UInt8
 
 from mfvpr.cli.console import tell, track
 from mfvpr.cli.inputs import dataset_of
-from mfvpr.cli.query_images import images
-from mfvpr.datasets import read_image
+from mfvpr.cli.schema import Localize, MapBuild
+from mfvpr.datasets import image_folder, read_image
+from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Located, Map, Route
 from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
@@ -22,14 +24,16 @@ from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
 from mfvpr.utils import Runtime
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import expand_user, printable, used_bytes
+from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable, used_bytes
+
+POLL = 0.2  # seconds between two looks at a folder
 
 
-def build_map(settings: dict[str, Any]) -> None:
+def build_map(settings: MapBuild) -> None:
     """Map the database of a data set."""
     system = assembly.system(settings)
-    images = dataset_of(settings["dataset"]).database
-    folder, warn = expand_user(settings["map"]), lambda line: tell(f"warning: {line}")
+    images = dataset_of(settings.dataset).database
+    folder, warn = expand_user(settings.map), lambda line: tell(f"warning: {line}")
     robot_map = Map(folder, fit_to_map(folder, system, images, warn))
     added = robot_map.build(images, track=track("images"))
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
@@ -60,14 +64,14 @@ def add_images(folder: Path, images: list[Path], place: str | None) -> None:
         print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
 
 
-def localize(settings: dict[str, Any]) -> None:
+def localize(settings: Localize) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
-    folder, runtime = expand_user(settings["map"]), Runtime(memory=settings["memory"])
+    folder, runtime = expand_user(settings.map), Runtime(memory=settings.memory)
     system = read_system(folder)
     confidence = _confidence(settings, system)
-    robot_map = Map(folder, system, confidence=confidence, threshold=settings["threshold"], runtime=runtime)
+    robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
     drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
-    for number, (name, image) in enumerate(images(settings)):
+    for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):
             tell(f"{len(robot_map):,} images in the map; the first image takes longer")
         try:
@@ -91,28 +95,28 @@ def localize(settings: dict[str, Any]) -> None:
 class _Drive:
     """One drive through a map: images are localized and added one by one."""
 
-    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+    def __init__(self, robot_map: Map, settings: Localize) -> None:
         self._map, self._settings = robot_map, settings
-        advance = None if settings["route"] == "auto" else settings["route"]
+        advance = None if isinstance(settings.route, str) else settings.route
         warn = lambda text: tell(f"warning: route={advance}: {text} (route=auto)")  # noqa: E731
-        self._route = None if settings["route"] is None else Route(Drive(advance), warn=warn)
+        self._route = None if settings.route is None else Route(Drive(advance), warn=warn)
 
     def localize(
         self, name: str, pixels: UInt8[np.ndarray, "height width channels"]
     ) -> tuple[Localization, dict[str, Any]]:
         """Localize an image and return its line; an image that is in the map sees only the images before it."""
         start = time.perf_counter()
-        row, recent = self._map.row(name) if self._settings["add"] else None, self._settings["recent"]
+        row, recent = self._map.row(name) if self._settings.add else None, self._settings.recent
         localized = self._map.localize_with_evidence(pixels, recent=recent, before=row, route=self._route)
         prediction = localized.prediction
-        line = prediction.as_json(self._settings["alternatives"]) | self._route_entry(prediction.located)
-        if (field_of_view := self._settings["field_of_view"]) is not None:
+        line = prediction.as_json(self._settings.alternatives) | self._route_entry(prediction.located)
+        if (field_of_view := self._settings.field_of_view) is not None:
             line |= {"shift_angles": prediction.shift_angles(field_of_view)}
         return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
 
     def add(self, name: str, localized: Localization) -> dict[str, Any]:
         """Add an image to the end of the map, unless it has one of this name, and return the entry in its line."""
-        if not self._settings["add"]:
+        if not self._settings.add:
             return {}
         features, vector = localized.described
         is_new = self._map.row(name) is None
@@ -123,7 +127,7 @@ class _Drive:
     def entry_without_image(self) -> dict[str, Any]:
         """The route's entry in the line of an image that cannot be read: the robot has moved."""
         rows = self._map.there
-        rows = rows[: max(0, len(rows) - self._settings["recent"])]
+        rows = rows[: max(0, len(rows) - self._settings.recent)]
         return self._route_entry(self._route and self._route(None, rows))
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:
@@ -136,12 +140,13 @@ class _Drive:
 class _LocalizationFigures:
     """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
 
-    def __init__(self, robot_map: Map, settings: Mapping[str, Any]) -> None:
+    def __init__(self, robot_map: Map, settings: Localize) -> None:
         """Read the settings `figures`, `out` and `root`."""
-        figures, self._map, self._failed = settings["figures"], robot_map, 0
+        figures, self._map, self._failed = settings.figures, robot_map, 0
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
-        self._out, self._root = (settings[name] and expand_user(settings[name]) for name in ("out", "root"))
+        self._out = Path() if settings.out is None else expand_user(settings.out)
+        self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
@@ -175,22 +180,63 @@ class _LocalizationFigures:
                                 "the lines have them, or the last parts of these")  # fmt: skip
 
 
-def _confidence(settings: Mapping[str, Any], system: System) -> Confidence | None:
+def _confidence(settings: Localize, system: System) -> Confidence | None:
     """The confidence that the settings name, of the score that the map was made with."""
-    if settings["confidence"] is None:
+    if settings.confidence is None:
         return None
     from mfvpr.cli import confidences  # here: it imports the reports
 
-    file = confidences.read_file(settings["confidence"])
-    map_settings, name = read_declaration(expand_user(settings["map"])), system.headline
+    map_settings, name = read_declaration(expand_user(settings.map)), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]
-    if name not in file.systems:
-        raise InputError(f"confidence={file.path}: expected the confidence of {name}, which the map scores by, got "
-                            f"{', '.join(file.systems) or 'none'}; evaluate with the map's settings")  # fmt: skip
-    confidences.warn_of_absent_places(file)
-    scorers = system.final_scores[name].scorers
-    if other := confidences.other_settings(file.origin, scorers, map_settings, map_settings["candidates"]):
-        tell(f"warning: confidence={file.path} was fitted with other settings of {', '.join(other)}: "
-             "it may mean nothing here")  # fmt: skip
-    return file.systems[name]
+    file, scorers = confidences.read_file(settings.confidence), system.final_scores[name].scorers
+    return confidences.confidence_of(file, name, scorers, map_settings, map_settings["candidates"])
+
+
+def images_of(settings: Localize) -> Iterator[tuple[str, Path | UInt8[np.ndarray, "height width channels"]]]:
+    """(name, file or pixels) in order; names do not depend on the spelling of a path."""
+    paths = settings.images if isinstance(settings.images, list) else [settings.images]
+    paths = [expand_user(path) for path in paths]
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"images={path}: expected an image, a folder or a video, got nothing")
+    if settings.watch and not (len(paths) == 1 and paths[0].is_dir()):
+        raise InputError(f"watch=true: expected images=DIR, one folder, got {settings.images}")
+    for path in paths:
+        if settings.watch:
+            yield from ((canonical_name(image), image) for image in _watch(path))
+        elif path.is_dir():
+            yield from ((canonical_name(image), image) for image in image_folder(path).paths)
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
+            name = canonical_name(path)
+            yield from ((f"{name}:{number}", image) for number, image in read_frames(path, every=settings.every))
+        else:
+            yield canonical_name(path), path
+
+
+def _watch(folder: Path) -> Iterator[Path]:
+    """Images of a folder, then new ones as soon as their files stop changing, until Ctrl-C.
+
+    An image whose file changes later, as when a camera writes slowly, comes again.
+    """
+    done: dict[str, tuple[int, int]] = {}
+    before: dict[str, tuple[int, int]] = {}
+    tell(f"watching {folder}; end with Ctrl-C")
+    while True:
+        paths = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
+        states = {path.name: state for path in paths if (state := _file_state(path)) is not None}
+        for name, state in states.items():
+            if before.get(name) == state != done.get(name):
+                done[name] = state
+                yield folder / name
+        before = states
+        time.sleep(POLL)
+
+
+def _file_state(path: Path) -> tuple[int, int] | None:
+    """Size and modification time; None if there is no regular file, or it has been removed."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None

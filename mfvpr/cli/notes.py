@@ -1,16 +1,18 @@
 """Notes and warnings about the data of a program, before it begins."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
-from typing import Any, Literal
+from typing import Any
 
 from mfvpr.baselines.weight_registry import provenance
 from mfvpr.cli.console import tell
+from mfvpr.cli.schema import Common
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.contents import Contents, OwnRows, fingerprints, own_rows, readings
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.systems import assembly
 
 # A learned match weight depends on these settings.
 _LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}
@@ -61,7 +63,7 @@ def _warn_of_reading(contents: Mapping[str, Contents], bits: int | None) -> None
               f"dataset.bits={used} would use their range")  # fmt: skip
 
 
-def note_candidates(candidates: int | Literal["all"], ks: Sequence[int], database: ImageFolder) -> None:
+def note_candidates(candidates: Any, ks: Sequence[int], database: ImageFolder) -> None:
     """Note that fewer candidates are available than `candidates` or `recall.ks` expect."""
     available = num_candidates(candidates, database)
     if isinstance(candidates, int) and candidates > available:
@@ -71,30 +73,28 @@ def note_candidates(candidates: int | Literal["all"], ks: Sequence[int], databas
         tell(f"note: {' and '.join(deeper)} {verb} R@{available}, of retrieval too: no more candidates are looked at")
 
 
-def warn_of_matching(
-    settings: Mapping[str, Any], weights: Iterable[str], dataset: str, contents: Mapping[str, Contents]
-) -> None:
+def warn_of_matching(settings: Common, dataset: str, contents: Mapping[str, Contents]) -> None:
     """Warn of features that LightGlue may not know, and of match weights that do not fit."""
-    if settings["features"]["name"] == "import" and settings["matching"]["name"] == "lightglue":
+    if settings.features["name"] == "import" and settings.matching["name"] == "lightglue":
         tell("warning: matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
-    for name in weights:
-        _warn_of_weight(name, settings, dataset, {*fingerprints(contents).values()})
+    names = {values.get("weight", "fs") for values in assembly.expand_weights(settings.scorer).values()}
+    names |= {*(getattr(settings, "grid", {}).get("weight") or ())}  # that a sweep tries
+    groups = {"features": settings.features, "matching": settings.matching}
+    for name in sorted(names):
+        _warn_of_weight(name, groups, dataset, {*fingerprints(contents).values()})
 
 
 def _warn_of_weight(name: str, settings: Mapping[str, Any], dataset: str, images: set[str]) -> None:
     """Warn of a match weight that was learned on these images, or with other features or matches."""
-    origin = provenance(name)
-    data_sets = origin["data_sets"] if isinstance(origin.get("data_sets"), list) else [origin]
-    if images & {str(folder) for each in data_sets for folder in _mapping(each, "data_fingerprint").values()}:
+    if not (origin := provenance(name)):
+        return
+    learned_on = {
+        folder for each in origin.get("data_sets", [origin]) for folder in each.get("data_fingerprint", {}).values()
+    }
+    if images & learned_on:
         tell(f"warning: weight={name} was learned on images of {dataset}, so that it flatters here")
-    for group, keys in _LEARNED_WITH.items() if origin else ():
-        before, now = _mapping(_mapping(origin, "settings"), group), settings[group]
+    for group, keys in _LEARNED_WITH.items():
+        before, now = origin.get("settings", {}).get(group, {}), settings[group]
         if other := [key for key in keys if before.get(key) != now.get(key)]:
             words = ", ".join(f"{before.get(key, 'unknown')} instead of {now.get(key)}" for key in other)
             tell(f"warning: weight={name} was learned with other {group} ({words}); it may mean nothing here")
-
-
-def _mapping(content: Any, name: str) -> Mapping[str, Any]:
-    """The mapping under a name in a file's content, which may be anything; empty if there is none."""
-    entry = content.get(name) if isinstance(content, Mapping) else None
-    return entry if isinstance(entry, Mapping) else {}

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.cli import console
+from mfvpr.cli.schema import Common
 from mfvpr.report import runs
 from mfvpr.report.pages import one_run
 from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user
-
-_NO_SETTINGS = ("multirun", "command", "cluster")  # added by `command_line`; results do not depend on them
 
 
 @contextmanager
@@ -28,7 +28,7 @@ def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
 
 
 def write_results(
-    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], *,
+    folder: Path, settings: Common, ground_truth: Mapping[str, Any], *,
     text: str, write: Callable[[Path], None], figures: Sequence[Figure],
 ) -> None:  # fmt: skip
     """Write the files, then print the text, then draw the figures, so that no failure loses earlier results.
@@ -41,20 +41,17 @@ def write_results(
         print(f"\n{text}", flush=True)
     draw_figures(folder, figures)
     print(f"results: {folder}")
-    if job := settings.get("multirun"):
+    if job := settings.multirun:
         runs.add_job(Path(job["multirun"]), job["number"], job["overrides"], folder)
         print(f"jobs: {job['multirun']}")
 
 
-def write_files(
-    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], write: Callable[[Path], None]
-) -> None:
+def write_files(folder: Path, settings: Common, ground_truth: Mapping[str, Any], write: Callable[[Path], None]) -> None:
     """Write the files of a run and run.json; arguments as of `write_results`."""
     try:
         with runs.writing(folder) as new:
             write(new)
-            about = {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
-            runs.write_about(new, about, ground_truth, settings.get("command"))
+            runs.write_about(new, to_values(settings), ground_truth, settings.command)
     except OSError as error:
         raise InputError(
             f"{folder}: the results cannot be written ({error.strerror}); they are printed above, and features and "

@@ -10,8 +10,10 @@ from omegaconf import OmegaConf
 
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.parameters import parameters_of
-from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
-from mfvpr.systems.choices import GROUPS, check_group, check_system, choices_of
+from mfvpr.evaluation.protocol import Split
+from mfvpr.evaluation.sequences import Method
+from mfvpr.systems.choices import GROUPS, SystemSettings, choices_of
+from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
     COUNT,
@@ -24,8 +26,10 @@ from mfvpr.utils.fields import (
     TEXT,
     Rule,
     Setting,
+    check_fields,
     check_values,
     default_values,
+    group,
     list_of,
     number,
     one_of,
@@ -38,11 +42,10 @@ from mfvpr.utils.fields import (
 )
 
 _SHARE = number(0, 1) | None
-_SEQUENCE = one_of("causal", "lagged", "smoothed")
+_SEQUENCE = word_of(Method)
 _QUERIES = list_of(Rule(lambda value: INDEX.holds(value) or TEXT.holds(value), "a row or a name of a query"))
 _FIGURES = Rule(lambda value: INDEX.holds(value) or _QUERIES.holds(value),
                 "how many (at most 1000000), or a list of rows or names of queries")  # fmt: skip
-_WEIGHTS = Rule(lambda value: value is None, "weights by name, such as {retrieval: 0.5, anchor: 1}, or null")
 _DATA_SETS = list_of(Rule(lambda value: TEXT.holds(value) or (isinstance(value, Mapping) and len(value) == 1),
                           "a data set, such as streets or {corridor: {root: DIR}}")) | None  # fmt: skip
 _MEMORY = "GB that features of the database may take while they are matched; null = a third of what is free"
@@ -61,20 +64,6 @@ def _compiled() -> Any:
 
 
 @dataclass(frozen=True)
-class FusionSettings:
-    """Fusion of scores with that of the retrieval."""
-
-    c: float | str = setting(
-        "auto",
-        NOT_NEGATIVE | one_of("auto", "zscore"),
-        "s = c * retrieval + score (the paper: about 1e6 with D2-Net's scores); auto = equal spread per query; zscore: "
-        "scores are standardized over the candidates of each query and added",
-    )
-    weights: Any = setting(None, _WEIGHTS, "of zscore, 1 each: {retrieval: 0.5, anchor: 1} adds the score of anchor")
-    retrieval_score: RetrievalScore = setting("cosine", word_of(RetrievalScore))
-
-
-@dataclass(frozen=True)
 class RecallSettings:
     """Which predictions count as correct."""
 
@@ -82,21 +71,15 @@ class RecallSettings:
     radius: float = setting(25.0, POSITIVE, "meters, where the ground truth has positions")
     ks: list[int] = setting((1, 5, 10), list_of(COUNT))
 
-
-@dataclass(frozen=True)
-class SystemSettings:
-    """Settings of a system, beside its groups."""
-
-    candidates: int | str = setting(50, COUNT | "all", "number of database images that are re-ranked per query, or all")
-    fusion: FusionSettings = field(default=FusionSettings())
-    final: str = setting("score", one_of("score", "combined"), "what decides: the score, or combined with retrieval")
-    ties: Ties = setting("retrieval", word_of(Ties), "equal scores keep the order of retrieval, or of the database")
+    __post_init__ = check_fields
 
 
 @dataclass(frozen=True)
 class Common(SystemSettings):
-    """Settings that evaluate, sweep and learn share."""
+    """Settings that evaluate, sweep and learn share, and how the job was started."""
 
+    dataset: Mapping[str, Any] = group()
+    cluster: Mapping[str, Any] = group()
     recall: RecallSettings = field(default=RecallSettings())
     memory: float | None = setting(None, POSITIVE | None, _MEMORY)
     devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
@@ -106,6 +89,18 @@ class Common(SystemSettings):
     compiled: bool = _compiled()
     on_bad_image: str = setting("fail", one_of("fail", "skip"))
     out: str | None = setting(None, PATH | None, "run folder; null = runs/<data set>/<time>")
+    command: str | None = None
+    multirun: Mapping[str, Any] | None = None  # folder, number and overrides of the job
+    workers: Cluster | None = None  # the cluster, once it is started
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_data_set(self.dataset)
+        if self.cluster:
+            known = {"name": Setting("", one_of("local", "slurm", "address")), **settings_of(_Workers)}
+            check_values(known, self.cluster, "cluster.")
+            if self.cache is None:
+                raise InputError("cluster: expected cache=DIR as well, a folder that all workers share")
 
 
 @dataclass(frozen=True)
@@ -128,6 +123,11 @@ class Evaluate(Common):
         None, _SHARE, "of the confidence: below it the prediction is `no place`; needs confidence"
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.threshold is not None and self.confidence is None:
+            raise InputError(f"threshold={self.threshold}: expected confidence=FILE as well, of a run on other images")
+
 
 @dataclass(frozen=True)
 class ChunkSettings:
@@ -136,28 +136,34 @@ class ChunkSettings:
     settings: int | None = setting(None, COUNT | None)
     queries: int | None = setting(None, COUNT | None)
 
+    __post_init__ = check_fields
+
 
 @dataclass(frozen=True)
 class Sweep(Common):
     """Search the parameters of the re-ranking over a whole data set."""
 
+    grid: Mapping[str, Any] = group()
     search: str = setting("grid", one_of("grid", "optuna"))
     trials: int = setting(200, whole(1, 100_000), "of optuna")
     seed: int = setting(0, INDEX, "of optuna")
-    split: str | None = setting(
-        None, one_of("first_half", "second_half", "both") | None, "choose on one half of the path, report on the other"
-    )
-    sequence: str | None = setting(None, _SEQUENCE | None, "rank the queries of a drive together")
+    split: Split | None = setting(None, word_of(Split) | None, "choose on one half of the path, report on the other")
+    sequence: Method | None = setting(None, _SEQUENCE | None, "rank the queries of a drive together")
     chunk: ChunkSettings = field(default=ChunkSettings())
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_values(_axes_of(self.scorer), self.grid, "grid.")
 
 
 @dataclass(frozen=True)
 class Learn(Common):
     """Learn the parameters of a score, and the weights of its matches."""
 
+    grid: Mapping[str, Any] = group()
     also: Any = setting(None, _DATA_SETS, "further data sets to learn on, such as [{streets: {seed: 1}}]")
     report: Any = setting(None, _DATA_SETS, "data sets to report on; null = the other half of the path")
-    split: str | None = setting("both", one_of("first_half", "second_half", "both") | None, "where to learn")
+    split: Split | None = setting("both", word_of(Split) | None, "where to learn")
     loss: str = setting("cross_entropy", one_of("cross_entropy", "recall", "average_precision"))
     steps: int = setting(200, COUNT)
     every: int = setting(5, COUNT, "steps from one validation to the next")
@@ -171,13 +177,28 @@ class Learn(Common):
     checkpoints: str | None = setting(None, PATH | None, "folder of unfinished trainings; null = beside the features")
     seed: int = setting(0, INDEX)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_values(_axes_of(self.scorer), self.grid, "grid.")
+        if self.also and not self.report:
+            raise InputError("also: expected report=[...] as well, to learn on several data sets and report on others")
+        if self.report and {self.features["name"], self.retrieval["name"], self.matching["name"]} & {"import", "pairs"}:
+            raise InputError("report: expected no files of other programs, since they are of one data set")
+        if self.report and self.split != "both":
+            raise InputError(f"split={self.split}: expected none with report=, since the data sets are it")
+
 
 @dataclass(frozen=True)
 class MapBuild(SystemSettings):
     """Build a map."""
 
+    dataset: Mapping[str, Any] = group()
     map: str = setting(REQUIRED, PATH, "folder of the map")
     compiled: bool = _compiled()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_data_set(self.dataset)
 
 
 @dataclass(frozen=True)
@@ -217,6 +238,11 @@ class Localize:
     root: str | None = setting(None, PATH | None, "folder of the map's images, which figures then show")
     compiled: bool = _compiled()
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.figures and self.out is None:
+            raise InputError(f"figures={self.figures}: expected out=DIR as well, where they are drawn")
+
 
 @dataclass(frozen=True)
 class Paper:
@@ -230,6 +256,8 @@ class Paper:
     memory: float | None = setting(None, POSITIVE | None, _MEMORY)
     devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
     compiled: bool = _compiled()
+
+    __post_init__ = check_fields
 
 
 DATA_SET_NAME = text(r"[\w-][\w.-]*", "letters, digits, - and _")
@@ -318,10 +346,10 @@ def register() -> None:
     store = ConfigStore.instance().store
     for program, owner in PROGRAMS.items():
         store(name=f"{program}_settings", node=default_values(settings_of(owner)))
-    for group in GROUPS:
-        for name, known in choices_of(group).items():
-            key = "method" if group == "scorer" else "name"
-            store(group=group, name=name, node={key: name, **default_values(known)})
+    for choice in GROUPS:
+        for name, known in choices_of(choice).items():
+            key = "method" if choice == "scorer" else "name"
+            store(group=choice, name=name, node={key: name, **default_values(known)})
     axis_lists = default_values(axes())
     store(name="sweep_axes", node={"grid": {**axis_lists}})
     del axis_lists["max_distance"]
@@ -337,72 +365,35 @@ def register() -> None:
     OmegaConf.register_new_resolver("settings", _describe, replace=True)
 
 
-def schema(program: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that a program knows, by name and group, given the choices of its groups."""
-    known: dict[str, Any] = settings_of(PROGRAMS[program])
-    for group, values in settings.items():
-        if group in GROUPS and isinstance(values, Mapping):
-            known[group] = choices_of(group).get(values.get("method" if group == "scorer" else "name", ""), {})
-        elif group == "grid":
-            method = settings.get("scorer", {}).get("method")
-            of_scorer = choices_of("scorer").get(method, {})
-            own_axes = {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in of_scorer.items()}
-            known[group] = {name: own_axes.get(name, each) for name, each in axes().items()}
-        elif group == "dataset":
-            known[group] = data_set_schema(values)
-        elif group == "cluster":
-            known[group] = {"name": Setting("", one_of("local", "slurm", "address")), **settings_of(_Workers)}
-    return known
+def _axes_of(scorer: Mapping[str, Any]) -> dict[str, Setting]:
+    """The axes of all scorers, with the allowed values of the chosen one."""
+    own = choices_of("scorer").get(scorer.get("method", ""), {})
+    own = {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in own.items()}
+    return {name: own.get(name, each) for name, each in axes().items()}
 
 
-def data_set_schema(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _data_set_schema(settings: Mapping[str, Any]) -> dict[str, Setting]:
     """The settings of a data set, by those that it has."""
     owner = _Drawn if "cache" in settings else _Published if "database" not in settings else _Folder
     known: dict[str, Any] = {"name": Setting("", DATA_SET_NAME), **settings_of(_Published), **settings_of(owner)}
     return {name: known[name] for name in settings if name in known}
 
 
-def check(program: str, settings: Mapping[str, Any]) -> None:
-    """Raise an InputError for the first value that is not allowed, by itself or together with others."""
-    known = schema(program, settings)
-    if weights := settings.get("fusion", {}).get("weights"):
-        if not isinstance(weights, Mapping):
-            raise InputError(
-                f"fusion.weights={weights}: expected weights by name, such as {{retrieval: 0.5, anchor: 1}}"
-            )
-        for name, weight in weights.items():
-            POSITIVE.check(f"fusion.weights.{name}", weight)
-        settings = {**settings, "fusion": {**settings["fusion"], "weights": None}}
-    for name, value in settings.items():
-        if name in GROUPS:
-            check_group(name, value)
-        elif not (name == "cluster" and value is None):
-            check_values(known, {name: value})
-    if "scorer" in settings:
-        check_system(settings)
-    needs = (
-        ("also", "report", "report=[...] as well, to learn on several data sets and report on others"),
-        ("cluster", "cache", "cache=DIR as well, a folder that all workers share"),
-        ("threshold", "confidence", "confidence=FILE as well, of a run on other images with ground truth"),
-    )
-    for name, needed, expected in needs:
-        if settings.get(name) is not None and settings[needed] is None and program != "localize":
-            raise InputError(f"{name}={settings[name]}: expected {expected}")
-    if program == "localize" and settings["figures"] and settings["out"] is None:
-        raise InputError(f"figures={settings['figures']}: expected out=DIR as well, where they are drawn")
-    if settings.get("report"):
-        for group in ("features", "retrieval", "matching"):
-            if (name := settings[group]["name"]) in ("import", "pairs"):
-                raise InputError(f"{group}={name}: expected none with report=, since the files are of one data set")
-        if settings["split"] != "both":
-            raise InputError(f"split={settings['split']}: expected none with report=, since the data sets are it")
+def check_data_set(settings: Mapping[str, Any]) -> None:
+    """Raise an InputError for a setting of a data set that is not allowed."""
+    check_values(_data_set_schema(settings), settings, "dataset.")
 
 
 def _describe(program: str, *, _root_: Any) -> str:
     """A line for each setting in `--help`, with its value, and what it means."""
     settings: Any = OmegaConf.to_container(_root_)
     settings = {name: value for name, value in settings.items() if name != "hydra"}
-    text = "\n".join(_lines(schema(program, settings), settings))
+    known: dict[str, Any] = settings_of(PROGRAMS[program])
+    for name in GROUPS:
+        known[name] = choices_of(name).get(settings.get(name, {}).get("method" if name == "scorer" else "name"), {})
+    known["grid"] = _axes_of(settings.get("scorer", {}))
+    known["dataset"], known["cluster"] = _data_set_schema(settings.get("dataset", {})), settings_of(_Workers)
+    text = "\n".join(_lines(known, settings))
     return text.replace("$", "$$")  # Hydra fills in names behind $
 
 

@@ -10,14 +10,13 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose, override
 from mfvpr.cli.console import explain
+from mfvpr.cli.schema import Evaluate
 from mfvpr.evaluation import System
 from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
-
-_PROGRAM = "evaluate"  # its settings include those of systems
+from mfvpr.utils.fields import from_values
 
 
 def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
@@ -37,13 +36,13 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
             says what was expected.
     """
     values = _read_run(Path(name), settings) if str(name).endswith(".json") else _compose(str(name), settings)
-    schema.check(_PROGRAM, values)
-    return assembly.system(values)
+    checked = from_values(Evaluate, values)
+    return assembly.system(checked, checked.previous_queries, checked.sequence)
 
 
 def _compose(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     try:
-        config = compose(_PROGRAM, [override("system", name), *_overrides(settings)])
+        config = compose("evaluate", [override("system", name), *_overrides(settings)])
         return OmegaConf.to_container(config, resolve=True)  # pyright: ignore[reportReturnType]
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(explain(error)) from error

@@ -9,8 +9,9 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.evaluation.system import Note, System
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import check_system
+from mfvpr.systems.choices import SystemSettings
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import from_values
 
 _ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
 _DECLARED = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", "final", "ties")
@@ -28,15 +29,19 @@ def read_declaration(folder: Path) -> dict[str, Any]:
         fix = "Make one with `mfvpr map build` or `Map.create`"
         own = "open a map of a system of your own with `Map(folder, system)`"
         raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {own}.")
-    return json.loads(content)
+    settings = json.loads(content)
+    try:
+        from_values(SystemSettings, settings)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+    return settings
 
 
 def read_system(folder: Path) -> System:
     """The system that a map was made with; raises as `read_declaration`, or if weights are missing."""
     settings = read_declaration(folder)
     try:
-        check_system(settings)
-        return assembly.system(settings)
+        return assembly.system(from_values(SystemSettings, settings))
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
@@ -30,9 +30,10 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
-from mfvpr.systems.choices import without
+from mfvpr.systems.choices import SystemSettings, without
 from mfvpr.utils import recipe_of
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
 
@@ -155,58 +156,51 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
     return files
 
 
-def pipeline(settings: Mapping[str, Any], data: Dataset | None) -> Pipeline:
+def pipeline(settings: SystemSettings, data: Dataset | None) -> Pipeline:
     """The pipeline that the settings name; files of other programs need their data set."""
-    local_settings, finding, matching = (settings[group] for group in ("features", "retrieval", "matching"))
-    with in_group("features", local_settings):
-        local = extractor(local_settings, data)
-    with in_group("retrieval", finding):
-        retrieval = retriever(finding, local, data)
-    with in_group("matching", matching):
-        match = matcher(matching, data)
-    size = local_settings["image_size"]
+    with in_group("features", settings.features):
+        local = extractor(settings.features, data)
+    with in_group("retrieval", settings.retrieval):
+        retrieval = retriever(settings.retrieval, local, data)
+    with in_group("matching", settings.matching):
+        match = matcher(settings.matching, data)
+    size = settings.features["image_size"]
     pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
-    return Pipeline(local, retrieval, match, settings["candidates"], pixels)
+    return Pipeline(local, retrieval, match, settings.candidates, pixels)
 
 
-def system(settings: Mapping[str, Any], data: Dataset | None = None) -> System:
-    """The system that the settings name; files of other programs need their data set."""
-    return System(pipeline(settings, data), **rankings(settings))
+def system(settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None) -> System:
+    """The system that the settings name, without files of other programs; further arguments as of `rankings`."""
+    return System(pipeline(settings, None), **rankings(settings, previous_queries, sequence))
 
 
-def rankings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All of a system but its pipeline: the main scorer is fused with the retrieval."""
-    chosen, fusing = scorers(settings["scorer"]), fusion(settings)
-    main = main_scorer(chosen)
-    with in_group("fusion", settings["fusion"]):
-        fusing.check(main, tuple(chosen))
-    headline = fusing.system(main) if settings["final"] == "combined" else main
-    previous, sequence = settings.get("previous_queries"), settings.get("sequence") or ()  # maps have none
-    methods: list[Any] = [sequence] if isinstance(sequence, str) else [*sequence]
+def rankings(
+    settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None
+) -> dict[str, Any]:
+    """All of a system but its pipeline: the main scorer is fused with the retrieval.
+
+    The ranking that decides is also made with the places of previous queries, and of the queries as a sequence.
+    """
+    chosen, fused = scorers(settings.scorer), settings.fusion
+    c = {"auto": None, "zscore": "zscore"}[fused.c] if isinstance(fused.c, str) else float(fused.c)
+    fusion: Any = Fusion(c, fused.retrieval_score, fused.weights or {})
+    histograms = (name for name, scorer in chosen.items() if isinstance(scorer, SCORERS["histogram"]))
+    main = next(histograms, next(iter(chosen)))
+    with in_group("fusion", ("c", "weights", "retrieval_score")):
+        fusion.check(main, tuple(chosen))
+    headline = fusion.system(main) if settings.final == "combined" else main
+    methods: list[Any] = [sequence] if isinstance(sequence, str) else [*(sequence or ())]
     if len({*methods}) < len(methods):
         raise InputError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
         "scorers": chosen,
-        "fused": {main: fusing},
-        "correlated": {headline: FrameCorrelation(previous)} if previous else {},
-        "ties": settings["ties"],
+        "fused": {main: fusion},
+        "correlated": {headline: FrameCorrelation(previous_queries)} if previous_queries else {},
+        "ties": settings.ties,
         "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {},
         "final": headline,
-        "settings": settings,
+        "settings": to_values(settings),
     }
-
-
-def main_scorer(scorers: Mapping[str, Any]) -> str:
-    """Name of the scorer that decides: the first histogram of shifts, or the first scorer."""
-    histograms = (name for name, scorer in scorers.items() if isinstance(scorer, SCORERS["histogram"]))
-    return next(histograms, next(iter(scorers)))
-
-
-def fusion(settings: Mapping[str, Any]) -> Fusion:
-    """The fusion of a score with that of the retrieval, and with those of other scorers."""
-    c, retrieval_score, weights = (settings["fusion"][name] for name in ("c", "retrieval_score", "weights"))
-    c = {"auto": None, "zscore": c}[c] if isinstance(c, str) else float(c)
-    return Fusion(c, retrieval_score, weights or {})
 
 
 def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
@@ -224,26 +218,15 @@ def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Settings by scorer; a list of weights makes a scorer of each, such as `histogram_fs` and `histogram_ratio`."""
-    variants = [each for name, values in by_scorer(settings).items() for each in _variants(name, values)]
-    names = [name for name, _ in variants]
-    if repeated := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"scorer: expected every scorer once, got {repeated[0]} twice; leave out one of its "
-                            "weights, or rename a file of weights")  # fmt: skip
-    return dict(variants)
-
-
-def _variants(name: str, values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """A scorer's name and settings for each of its weights."""
-    weights = values.get("weight")
-    if not isinstance(weights, list):
-        return [(name, values)]
-    return [(f"{name}_{Path(weight).stem}", {**values, "weight": weight}) for weight in weights]
-
-
-def weights(settings: Mapping[str, Any]) -> list[str]:
-    """Names of the match weights of the scorers, and of those that a sweep tries."""
-    names = {values.get("weight", "fs") for values in expand_weights(settings["scorer"]).values()}
-    return sorted(names | {*((settings.get("grid") or {}).get("weight") or ())})
+    variants: dict[str, Mapping[str, Any]] = {}
+    for scorer, values in by_scorer(settings).items():
+        weights = values.get("weight")
+        for weight in weights if isinstance(weights, list) else [None]:
+            name = scorer if weight is None else f"{scorer}_{Path(weight).stem}"
+            if name in variants:
+                raise InputError(f"scorer: expected every scorer once, got {name} twice; rename a file of weights")
+            variants[name] = values if weight is None else {**values, "weight": weight}
+    return variants
 
 
 def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -5,16 +5,17 @@ A choice that is named in a file is looked up here; nothing else can be made.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mfvpr import features
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.core.parameters import Parameter, parameters_of
 from mfvpr.core.weights import WEIGHTS
+from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
 from mfvpr.io.checks import Lengths
 from mfvpr.matchers import LightGlueMatcher, NearestNeighborMatcher
@@ -22,13 +23,17 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
     COUNT,
     FLAG,
+    NOT_NEGATIVE,
     PATH,
     POSITIVE,
     REQUIRED,
     SIZE,
     TEXT,
+    Rule,
     Setting,
+    check_fields,
     check_values,
+    group,
     list_of,
     number,
     one_of,
@@ -178,9 +183,9 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
     return {"features": _features, "retrieval": _retrieval, "matching": _matching}[group]()
 
 
-def check_group(group: str, values: Mapping[str, Any]) -> None:
+def check_group(group: str, values: Any) -> None:
     """Raise an InputError for a value of a choice that is not allowed, or a setting that the choice does not have."""
-    if group == "scorer" and "method" not in values:
+    if group == "scorer" and isinstance(values, Mapping) and "method" not in values:
         for name, each in values.items():
             _check_choice("scorer", f"scorer.{name}", each, "method")
     else:
@@ -189,42 +194,84 @@ def check_group(group: str, values: Mapping[str, Any]) -> None:
 
 def _check_choice(group: str, prefix: str, values: Any, key: str) -> None:
     choices = choices_of(group)
-    if not isinstance(values, Mapping) or values.get(key) not in choices:
-        got = values.get(key) if isinstance(values, Mapping) else values
-        raise InputError(f"{prefix}.{key}={got}: expected one of {', '.join(choices)}")
-    known = choices[values[key]]
+    choice = values.get(key) if isinstance(values, Mapping) else values
+    if not isinstance(values, Mapping) or choice not in choices:
+        raise InputError(f"{prefix}.{key}={choice}: expected one of {', '.join(choices)}")
+    known = choices[choice]
     if group == "scorer" and isinstance(values.get("weight"), list) and "weight" in known:
         known = {**known, "weight": replace(known["weight"], rule=list_of(known["weight"].rule))}
     check_values(known, without(values, key), f"{prefix}.")
 
 
-def check_system(settings: Mapping[str, Any]) -> None:
-    """Raise an InputError for settings of a system's groups that are not allowed, by themselves or together."""
-    for group in GROUPS:
-        check_group(group, settings[group])
-    if not isinstance(candidates := settings["candidates"], str) or candidates != "all":
-        COUNT.check("candidates", candidates)
-    _check_scorers(settings)
+def _is_weights(value: Any) -> bool:
+    return value is None or (isinstance(value, Mapping) and all(map(POSITIVE.holds, value.values())))
 
 
-def _check_scorers(settings: Mapping[str, Any]) -> None:
-    """Check scorers against the features: cells of a square grid, and the size of patches."""
-    local, matching, scorer = settings["features"], settings["matching"], settings["scorer"]
-    if scorer.get("method") == "grid":
+@dataclass(frozen=True)
+class FusionSettings:
+    """Fusion of scores with that of the retrieval."""
+
+    c: float | str = setting(
+        "auto",
+        NOT_NEGATIVE | one_of("auto", "zscore"),
+        "s = c * retrieval + score (the paper: about 1e6 with D2-Net's scores); auto = equal spread per query; zscore: "
+        "scores are standardized over the candidates of each query and added",
+    )
+    weights: Any = setting(
+        None,
+        Rule(_is_weights, "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}, or null"),
+        "of zscore, 1 each: {retrieval: 0.5, anchor: 1} adds the score of anchor",
+    )
+    retrieval_score: RetrievalScore = setting("cosine", word_of(RetrievalScore))
+
+    __post_init__ = check_fields
+
+
+@dataclass(frozen=True)
+class SystemSettings:
+    """Settings of a system: its groups, by name, and how its scores rank."""
+
+    features: Mapping[str, Any] = group()
+    retrieval: Mapping[str, Any] = group()
+    matching: Mapping[str, Any] = group()
+    scorer: Mapping[str, Any] = group()
+    candidates: int | Literal["all"] = setting(
+        50, COUNT | "all", "number of database images that are re-ranked per query, or all"
+    )
+    fusion: FusionSettings = field(default=FusionSettings())
+    final: str = setting("score", one_of("score", "combined"), "what decides: the score, or combined with retrieval")
+    ties: Ties = setting("retrieval", word_of(Ties), "equal scores keep the order of retrieval, or of the database")
+
+    def __post_init__(self) -> None:
+        """Raise an InputError for settings that are not allowed, by themselves or together."""
+        check_fields(self)
+        for name in GROUPS:
+            check_group(name, getattr(self, name))
+        self._check_grid_scorer()
+        self._check_places_of_patches()
+
+    def _check_grid_scorer(self) -> None:
+        """The scorer `grid` takes the cells of features in a square grid."""
+        local, matching = self.features, self.matching
+        if self.scorer.get("method") != "grid":
+            return
         if local["name"] not in ("ssm", "import") and matching["name"] != "import":
             raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
         if (check := matching.get("cross_check", matching["name"])) != "candidate":
-            raise InputError(f"matching.cross_check={check}: expected candidate, since scorer=grid takes a match of "
-                             "every cell of the candidate")  # fmt: skip
+            raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
         sides = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
-        if local["name"] == "ssm" and sides != [scorer["side"]] * 2:
-            raise InputError(f"scorer.side={scorer['side']}: expected the cells of features.image_size="
-                             f"{local['image_size']}, which are {sides[0]} x {sides[1]}")  # fmt: skip
-    if local["name"] == "patch_netvlad":
+        if local["name"] == "ssm" and sides != [self.scorer["side"]] * 2:
+            cells = f"the {sides[0]} x {sides[1]} cells of features.image_size={local['image_size']}"
+            raise InputError(f"scorer.side={self.scorer['side']}: expected {cells}")
+
+    def _check_places_of_patches(self) -> None:
+        """The scorer `rapid` divides by the largest place of a patch, which depends on the patches' size."""
+        local = self.features
+        if local["name"] != "patch_netvlad":
+            return
         sizes = [[16 * (pixels // 16 - patch) for pixels in local["image_size"]] for patch in local["patch_sizes"]]
-        several = {f"scorer.{name}": values for name, values in scorer.items()}
-        for name, values in ({"scorer": scorer} if "method" in scorer else several).items():
+        for values in (self.scorer,) if "method" in self.scorer else self.scorer.values():
             reach = values.get("size")
             if reach is not None and min(map(min, sizes)) >= 0 and [[*reach]] != sizes:
                 words = f"{sizes[0]}, the largest place of these patches, or null" if len(sizes) == 1 else "null"
-                raise InputError(f"{name}.size={reach}: expected {words}")
+                raise InputError(f"scorer.size={reach}: expected {words}")

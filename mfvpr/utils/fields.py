@@ -11,17 +11,18 @@ Programs make their settings, and what `--help` says about them, from these fiel
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from typing import Any, get_args
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
 from mfvpr.utils.errors import InputError
 
 REQUIRED = "???"  # the default of a setting without one, in Hydra's words
-_KEY = "setting"  # of the field's metadata
+_KEY, _GROUP = "setting", "group"  # of the field's metadata
 _MAX_SHOWN = 200  # characters of a value in an error
+Owner = TypeVar("Owner")
 
 
 @dataclass(frozen=True)
@@ -148,31 +149,49 @@ def default_values(known: Mapping[str, Any]) -> dict[str, Any]:
     return {name: each.default if isinstance(each, Setting) else default_values(each) for name, each in known.items()}
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings of all groups by dotted name."""
+def group() -> Any:
+    """Declare a field that holds the settings of a choice by name, which its owner checks."""
+    return field(default_factory=dict, metadata={_GROUP: True})
+
+
+def from_values(owner: type[Owner], values: Mapping[str, Any], prefix: str = "") -> Owner:
+    """A dataclass of settings from plain values by name, which stand behind `prefix` in errors."""
+    known = {each.name: each for each in _declared(owner)}
+    members = dict(values)
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+        if name not in known:
+            raise InputError(f"{prefix}{name}: unknown setting; expected one of {', '.join(known)}")
+        if is_dataclass(default := known[name].default):
+            if not isinstance(value, Mapping):
+                raise InputError(f"{prefix}{name}={value}: this is a group of settings; set one of its members")
+            members[name] = from_values(type(default), value, f"{prefix}{name}.")
+    try:
+        return owner(**members)
+    except InputError as error:
+        raise InputError(f"{prefix}{error}") from error
 
 
-def check_values(known: Mapping[str, Any], values: Mapping[str, Any], prefix: str = "") -> None:
+def to_values(settings: Any) -> dict[str, Any]:
+    """Plain values of a dataclass of settings, as `from_values` takes them."""
+    values = {each.name: getattr(settings, each.name) for each in _declared(settings)}
+    return {name: to_values(value) if is_dataclass(value) else value for name, value in values.items()}
+
+
+def _declared(owner: Any) -> list[Field[Any]]:
+    return [each for each in fields(owner) if {_KEY, _GROUP} & {*each.metadata} or is_dataclass(each.default)]
+
+
+def check_values(known: Mapping[str, Setting], values: Mapping[str, Any], prefix: str) -> None:
     """Raise an InputError for a value that its setting does not allow, or without one."""
     for name, value in values.items():
         if name not in known:
             raise InputError(f"{prefix}{name}: unknown setting; expected one of {', '.join(known)}")
-        if isinstance(known[name], Setting):
-            known[name].rule.check(f"{prefix}{name}", value)
-        elif isinstance(value, Mapping):
-            check_values(known[name], value, f"{prefix}{name}.")
-        else:
-            raise InputError(f"{prefix}{name}={value}: this is a group of settings; set one of its members")
+        known[name].rule.check(f"{prefix}{name}", value)
 
 
 def check_fields(owner: Any) -> None:
     """Raise an InputError for a field whose value its rule does not allow; arrays are not looked at."""
     for each in fields(owner):
         value = getattr(owner, each.name)
-        if _KEY in each.metadata and isinstance(value, bool | int | float | str | list | tuple | None):
+        if _KEY in each.metadata and isinstance(value, bool | int | float | str | list | tuple | Mapping | None):
             each.metadata[_KEY][0].check(each.name, value)

@@ -56,7 +56,7 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
     ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
     ("evaluate", ["fusion.c=zscores"], "fusion.c=zscores: expected a number from 0 to 1e+12, or auto, zscore"),
     ("evaluate", ["fusion.weights={retrieval: 2}"], "fusion.weights: expected c='zscore'"),
-    ("evaluate", ["fusion.c=zscore", "fusion.weights={retrieval: 0}"], ".retrieval=0: expected a number"),
+    ("evaluate", ["fusion.c=zscore", "fusion.weights={retrieval: 0}"], "'retrieval': 0}: expected weights above 0"),
     ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected retrieval"),
     ("evaluate", ["store=DIR"], "its name is cache now"),
     ("evaluate", ["fusion.filter_score=cosine"], "its name is fusion.retrieval_score now"),

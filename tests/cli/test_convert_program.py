@@ -9,7 +9,7 @@ import pytest
 from mfvpr.cli import evaluation
 from mfvpr.cli.inputs import dataset_of
 from mfvpr.io import read_shortlist
-from tests.programs import composed, csv_rows, output_of, shared, small
+from tests.programs import csv_rows, output_of, settings_of, shared, small
 
 pytestmark = pytest.mark.thorough
 
@@ -22,7 +22,7 @@ def root(tmp_path_factory):
 @pytest.fixture(scope="module")
 def settings(root, tmp_path_factory):
     run = tmp_path_factory.mktemp("convert") / "run"
-    settings = composed(*small(root), "scorer=histogram", "figures=0", f"out={run}")
+    settings = settings_of(*small(root), "scorer=histogram", "figures=0", f"out={run}")
     evaluation.evaluate(settings)
     return settings
 
@@ -47,29 +47,29 @@ def first_candidates(run):
 
 @pytest.mark.parametrize("layout", ["preds", "hloc", "kapture"])
 def test_candidates_of_a_run(convert, settings, layout):
-    dataset = dataset_of(settings["dataset"])
-    path, stdout, _ = convert(settings["out"], layout)
+    dataset = dataset_of(settings.dataset)
+    path, stdout, _ = convert(settings.out, layout)
     assert stdout == f"{path}: candidates of {len(dataset.queries)} queries\n"
     shortlist = read_shortlist(path, dataset.queries.names, dataset.database.names)
     first = {query: dataset.database.names[row]
              for query, row in zip(dataset.queries.names, shortlist.indices[:, 0], strict=True)}  # fmt: skip
-    assert first == first_candidates(settings["out"])
+    assert first == first_candidates(settings.out)
 
 
 def test_prefixes_stand_before_names(convert, settings):
-    dataset = dataset_of(settings["dataset"])
+    dataset = dataset_of(settings.dataset)
     prefixes = "--query-prefix", "queries/", "--database-prefix", "database/"
-    path, *_ = convert(settings["out"], "hloc", *prefixes)
+    path, *_ = convert(settings.out, "hloc", *prefixes)
     query, database = path.read_text().splitlines()[0].split(" ")
     assert query == f"queries/{dataset.queries.names[0]}"
     assert database.removeprefix("database/") in dataset.database.names
-    _, _, stderr = convert(settings["out"], "preds", *prefixes, out="preds", code=2)
+    _, _, stderr = convert(settings.out, "preds", *prefixes, out="preds", code=2)
     assert "--query-prefix, --database-prefix: expected none for --layout preds" in stderr
 
 
 def test_preds_have_full_paths_and_all_correct_images(convert, settings):
-    dataset = dataset_of(settings["dataset"])
-    path, *_ = convert(settings["out"], "preds")
+    dataset = dataset_of(settings.dataset)
+    path, *_ = convert(settings.out, "preds")
     lines = (path / "004.txt").read_text().splitlines()
     correct = dataset.truth.positives(1).of(4)  # the middle tolerance of this run
     assert lines[1] == str(dataset.queries.paths[4])
@@ -85,29 +85,29 @@ def poses_of(dataset, path, num_numbers):
 
 
 def test_trajectories_and_shifts_of_a_run(convert, settings, tmp_path):
-    dataset = dataset_of(settings["dataset"])
-    first = first_candidates(settings["out"])
+    dataset = dataset_of(settings.dataset)
+    first = first_candidates(settings.out)
     poses = poses_of(dataset, tmp_path / "kitti.txt", 12)
-    path, stdout, _ = convert(settings["out"], "kitti", "--poses", tmp_path / "kitti.txt")
+    path, stdout, _ = convert(settings.out, "kitti", "--poses", tmp_path / "kitti.txt")
     expected = [poses[first[query]] for query in dataset.queries.names]
     assert path.read_text().splitlines() == expected
     assert stdout == f"{path}: {len(expected)} images with a place, 0 without\n"
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     (tmp_path / "times.txt").write_text("".join(f"{row}.000000001\n" for row in range(len(expected))))
     times = ("--times", tmp_path / "times.txt")
-    path, *_ = convert(settings["out"], "tum", "--poses", tmp_path / "tum.txt", *times, out="tum")
+    path, *_ = convert(settings.out, "tum", "--poses", tmp_path / "tum.txt", *times, out="tum")
     expected = [f"{row}.000000001 {poses[first[query]]}" for row, query in enumerate(dataset.queries.names)]
     assert path.read_text().splitlines() == expected
-    path, *_ = convert(settings["out"], "shifts", *times, out="shifts")
+    path, *_ = convert(settings.out, "shifts", *times, out="shifts")
     rows = {row["image"]: row for row in csv_rows(path)}
     assert {name: row["place"] for name, row in rows.items()} == first
-    for row in csv_rows(Path(settings["out"]) / "shifts.csv"):
+    for row in csv_rows(Path(settings.out) / "shifts.csv"):
         assert rows[row["query"]]["shift_x"] == row["shift_x"]
         assert rows[row["query"]]["image_width"] == "160"
 
 
 def test_lines_of_localize(convert, tmp_path, settings):
-    dataset = dataset_of(settings["dataset"])
+    dataset = dataset_of(settings.dataset)
     poses = poses_of(dataset, tmp_path / "tum.txt", 7)
     line = {"image": "/drive/1403636579763555584.png", "place": "a", "confidence": None, "shift": None, "reason": None,
             "shift_interval": None, "image_width": 9,
@@ -133,7 +133,7 @@ def test_lines_of_localize(convert, tmp_path, settings):
     ],
 )
 def test_wrong_arguments_are_one_line(convert, settings, tmp_path, layout, more, words):
-    path, _, stderr = convert(settings["out"], layout, *more, code=2)
+    path, _, stderr = convert(settings.out, layout, *more, code=2)
     assert words in stderr
     assert stderr.count("\n") == 1
     assert not path.exists()
@@ -142,19 +142,19 @@ def test_wrong_arguments_are_one_line(convert, settings, tmp_path, layout, more,
 @pytest.mark.parametrize("layout", ["preds", "hloc", "kapture", "kitti", "shifts"])
 def test_files_that_exist_are_not_overwritten(convert, settings, tmp_path, layout):
     """Also those that are read."""
-    dataset = dataset_of(settings["dataset"])
+    dataset = dataset_of(settings.dataset)
     poses_of(dataset, tmp_path / "out", 12)
     (tmp_path / "times").write_text("".join(f"{row}.5\n" for row in range(len(dataset.queries))))
     before = (tmp_path / "out").read_text()
     more = {"kitti": ["--poses", tmp_path / "out"], "shifts": ["--times", tmp_path / "times"]}.get(layout, [])
-    _, _, stderr = convert(settings["out"], layout, *more, code=2)
+    _, _, stderr = convert(settings.out, layout, *more, code=2)
     assert stderr.startswith(f"error: {tmp_path}/out: expected a new")
     assert stderr.count("\n") == 1
     assert (tmp_path / "out").read_text() == before
 
 
 def test_one_file_of_times_is_of_one_sequence(convert, settings, tmp_path):
-    shutil.copytree(settings["out"], tmp_path / "run")
+    shutil.copytree(settings.out, tmp_path / "run")
     about = json.loads((tmp_path / "run" / "run.json").read_text())
     queries = Path(about["settings"]["dataset"]["queries"])
     shutil.copytree(queries, tmp_path / "second")
@@ -173,7 +173,7 @@ def test_other_sources_are_one_line(convert, settings, tmp_path):
                           (tmp_path / "none", "none: expected the run folder of mfvpr evaluate for --layout hloc"),
                           (tmp_path / "copy", "expected a run of mfvpr evaluate, got one of Python")):  # fmt: skip
         if source.name == "copy":
-            shutil.copytree(settings["out"], source)
+            shutil.copytree(settings.out, source)
             about = json.loads((source / "run.json").read_text())
             del about["settings"]["recall"]
             (source / "run.json").write_text(json.dumps(about))

@@ -11,7 +11,7 @@ from mfvpr.cli.evaluation import evaluate
 from mfvpr.cli.inputs import prepare
 from mfvpr.datasets.contents import readings
 from mfvpr.utils import Stopwatch
-from tests.programs import composed, csv_rows, folder
+from tests.programs import csv_rows, folder, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -26,7 +26,7 @@ def run(tmp_path, monkeypatch, capsys):
 
     def run(*settings, name="out"):
         place = tmp_path / name
-        evaluate(composed(*QUICK, f"out={place}", *settings) | {"multirun": False})
+        evaluate(settings_of(*QUICK, f"out={place}", *settings))
         return json.loads((place / "results.json").read_text()), capsys.readouterr(), place
 
     return run
@@ -109,7 +109,7 @@ def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
     Image.new("RGB", (120, 160)).save(tmp_path / "database" / "0.png", exif=exif)
     Image.fromarray(np.full((120, 160), 65535, np.uint16)).save(tmp_path / "queries" / "0.png")
     data = folder(tmp_path)[:3]
-    inputs = prepare(composed(*QUICK, *data, "dataset.ground_truth=order"), Stopwatch())
+    inputs = prepare(settings_of(*QUICK, *data, "dataset.ground_truth=order"), Stopwatch())
     assert readings(inputs.contents) == {
         "database": {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
         "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 1, "largest_16bit": 65535},
@@ -126,7 +126,7 @@ def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
 def test_a_range_of_16_bit_images_that_does_not_fit_is_told(tmp_path, capsys, largest, words):
     (tmp_path / "database").mkdir()
     Image.fromarray(np.full((120, 160), largest, np.uint16)).save(tmp_path / "database" / "0.png")
-    settings = composed(*QUICK, *same(tmp_path, "dataset.ground_truth=order", "dataset.bits=12"))
+    settings = settings_of(*QUICK, *same(tmp_path, "dataset.ground_truth=order", "dataset.bits=12"))
     prepare(settings, Stopwatch())
     stderr = capsys.readouterr().err
     assert words in stderr
@@ -142,4 +142,4 @@ def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     calls, root = [], value or "~/.cache/mfvpr"
     monkeypatch.setattr("mfvpr.cli.evaluation.evaluate", calls.append)
     succeed("evaluate")
-    assert (calls[0]["cache"], calls[0]["dataset"]["cache"]) == (f"{root}/features", root)
+    assert (calls[0].cache, calls[0].dataset["cache"]) == (f"{root}/features", root)

@@ -11,12 +11,14 @@ from PIL import Image
 
 from mfvpr import AnchorPoints, HistogramOfShifts, RatioWeight
 from mfvpr.baselines import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
-from mfvpr.cli import evaluation, schema
+from mfvpr.cli import evaluation
 from mfvpr.cli.command_line import override
+from mfvpr.cli.schema import Evaluate
 from mfvpr.systems import assembly
 from mfvpr.systems.choices import CONF
 from mfvpr.utils.errors import InputError
-from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run
+from mfvpr.utils.fields import from_values
+from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -38,31 +40,30 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     needs = paths.get(choice, ["dataset.root=r"] if choice in ("grief_season", "corridor") else [])
     programs = {"experiment": ["sweep"], "system": ["evaluate", "sweep", "learn"], "grid": ["learn"]}
     for config in programs.get(group, ["evaluate"]):
-        schema.check(config, composed(f"{group}={choice}", *needs, config=config))
+        settings_of(f"{group}={choice}", *needs, config=config)
 
 
 @pytest.mark.parametrize("features", ["sift", "aliked"])
 def test_features_of_a_named_system_may_be_replaced(features):
-    config = composed("system=ssm_hist", f"features={features}")
-    schema.check("evaluate", config)
-    assert (config["features"]["name"], config["retrieval"]["name"]) == (features, "ssm")
-    assert config["features"]["image_size"] == [336, 336]
-    assert (config["candidates"], config["scorer"]["method"]) == (50, "histogram")
+    settings = settings_of("system=ssm_hist", f"features={features}")
+    assert (settings.features["name"], settings.retrieval["name"]) == (features, "ssm")
+    assert settings.features["image_size"] == [336, 336]
+    assert (settings.candidates, settings.scorer["method"]) == (50, "histogram")
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
     (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),
-    (["system=ssm_vpr", "features.image_size=[336,320]"], "which are 40 x 38"),
+    (["system=ssm_vpr", "features.image_size=[336,320]"], "the 40 x 38 cells of"),
     (["features=aliked", "features.image_size=null"], "features.image_size=null: expected a list of 2"),
-    (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate, since"),
-    (["scorer=grid", "features=ssm", "matching=lightglue"], "cross_check=lightglue: expected candidate, since"),
+    (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate"),
+    (["scorer=grid", "features=ssm", "matching=lightglue"], "cross_check=lightglue: expected candidate"),
     (["system=ssm_vpr_ras2020", "features.stride=1"], "scorer.side=25: .* 50 x 50"),
 ])  # fmt: skip
 def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
     with pytest.raises(InputError, match=words):
-        schema.check("evaluate", composed(*arguments))
-    schema.check("evaluate", composed("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26"))
+        settings_of(*arguments)
+    settings_of("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26")
 
 
 def test_scorers_of_conf_are_as_their_fields_say():
@@ -82,7 +83,7 @@ def test_values_without_meaning_are_refused(name, value):
     config = OmegaConf.create(composed())
     OmegaConf.update(config, name, value)
     with pytest.raises(InputError, match=f"{name}=.*expected a number from 1e-06"):
-        schema.check("evaluate", OmegaConf.to_container(config))
+        from_values(Evaluate, OmegaConf.to_container(config))
 
 
 @pytest.mark.slow
@@ -133,12 +134,12 @@ def test_one_evaluation_compiles_few_programs_and_the_next_none(
 ):
     monkeypatch.chdir(tmp_path)
     common = folder(small_street, "figures=2", "features.max_keypoints=120", "retrieval.num_words=8", "candidates=7")
-    evaluation.evaluate(composed(*common))
+    evaluation.evaluate(settings_of(*common))
     assert 1 <= compilations.count <= 20
     compilations.reset()
     unused = ["scorer.histogram.sigma=9", "scorer.histogram.bin_size=14.5", "scorer.anchor.tolerance=2",
               "scorer.anchor.window=6", "fusion.c=auto"]  # fmt: skip
-    evaluation.evaluate(composed(*common, *unused))
+    evaluation.evaluate(settings_of(*common, *unused))
     assert compilations.count == 0
     assert len(list((tmp_path / "runs" / "folder").iterdir())) == 2
 

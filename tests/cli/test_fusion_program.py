@@ -5,9 +5,9 @@ import json
 import pytest
 
 from mfvpr import HistogramOfShifts, RatioWeight
-from mfvpr.cli import axes, evaluation, schema
+from mfvpr.cli import evaluation, sweeping
 from mfvpr.systems import assembly
-from tests.programs import composed, csv_rows, small
+from tests.programs import csv_rows, settings_of, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
 SYSTEM = "histogram + anchor + retrieval"
@@ -23,7 +23,7 @@ def ranked(out, name):
 def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     out = tmp_path / "out"
     more = ("final=combined", "previous_queries=1", "figures=1", f"out={out}")
-    evaluation.evaluate(composed(*small(root), *FUSED, *more))
+    evaluation.evaluate(settings_of(*small(root), *FUSED, *more))
     rows = json.loads((out / "results.json").read_text())
     rows_by_system = {row["system"]: row for row in rows if row["tolerance"] == 1}
     assert [*rows_by_system] == ["retrieval", "anchor", "histogram", SYSTEM, f"{SYSTEM} + frames"]
@@ -43,20 +43,17 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
 
 
 def test_weights_choose_what_is_fused():
-    fusion = assembly.fusion(composed(*FUSED))
+    [fusion] = assembly.rankings(settings_of(*FUSED))["fused"].values()
     assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": 0.5, "anchor": 1})
     assert fusion.system("histogram") == SYSTEM
-    assert assembly.fusion(composed(*FUSED, "fusion.weights=null")).system("anchor") == "anchor + retrieval"
 
 
 @pytest.mark.parametrize(("arguments", "features", "side"), [([], "aliked", 320), (["features=sift"], "sift", 336)])
 def test_our_system_ranks_by_the_histogram_of_ratios(arguments, features, side):
-    config = composed("system=mfvpr", *arguments)
-    schema.check("evaluate", config)
-    assert (config["features"]["name"], config["features"]["image_size"]) == (features, [side, side])
+    config = settings_of("system=mfvpr", *arguments)
+    assert (config.features["name"], config.features["image_size"]) == (features, [side, side])
     rankings = assembly.rankings(config)
     assert rankings["scorers"] == {"histogram": HistogramOfShifts(weight=RatioWeight())}
     assert rankings["final"] == "histogram"
-    config = composed("system=mfvpr", *arguments, "grid.sigma=[10]", config="sweep")
-    schema.check("sweep", config)
-    assert axes.search_axes(axes.with_final_axis(config)).grid() == [{"sigma": 10}]
+    config = settings_of("system=mfvpr", *arguments, "grid.sigma=[10]", config="sweep")
+    assert sweeping.axes_of(config).grid() == [{"sigma": 10}]

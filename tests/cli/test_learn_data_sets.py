@@ -10,7 +10,7 @@ import yaml
 from mfvpr.cli import evaluation, learning
 from mfvpr.cli.command_line import compose_data_set, compose_data_sets
 from mfvpr.datasets.streets import streets_folder
-from tests.programs import QUERIES, composed, results, small
+from tests.programs import QUERIES, results, settings_of, small
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +43,7 @@ def learned(root, streets, tmp_path_factory):
     common = (*SHORT, f"report=[{streets[2]}]")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
-        learning.learn(composed(*small(root), *common, f"also=[{streets[1]}]", f"out={out}/out", config="learn"))
+        learning.learn(settings_of(*small(root), *common, f"also=[{streets[1]}]", f"out={out}/out", config="learn"))
     return out, results(out / "out")
 
 
@@ -90,7 +90,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
     for name, of_queries in (("there", 1), ("back", 2)):
         database, queries = (read(streets[number]) for number in (1, of_queries))
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
-        settings = composed(*small(root), f"out={tmp_path}/out") | {"dataset": dataset | {"index_file": None}}
+        settings = settings_of(*small(root), f"out={tmp_path}/out", dataset=dataset | {"index_file": None})
         inputs = learning.prepare(settings, evaluation.Stopwatch())
         several.append(learning.Prepared(SimpleNamespace(name=name), inputs.contents, {}, {}))
     learning.require_disjoint([], several)
@@ -114,5 +114,5 @@ def test_a_learned_weight_knows_what_it_was_learned_on(root, streets, learned, t
         ]
         assert stderr.count("was learned") == len(warns)
     reported = read(streets[2])
-    learning.prepare(composed(*common, "scorer=sum") | {"dataset": reported}, evaluation.Stopwatch())
+    learning.prepare(settings_of(*common, "scorer=sum", dataset=reported), evaluation.Stopwatch())
     assert "was learned" not in capsys.readouterr().err

@@ -13,7 +13,7 @@ from mfvpr.cli import evaluation, learning, sweeping
 from mfvpr.tuning.learning import models, training
 from mfvpr.tuning.learning.splits import TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Record
-from tests.programs import QUERIES, composed, job_of, results, small, snapshot
+from tests.programs import QUERIES, job_of, results, settings_of, small, snapshot
 
 pytestmark = pytest.mark.slow
 
@@ -91,7 +91,7 @@ def test_pictures_and_weights(learned):
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
     grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
-    sweeping.sweep(composed(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
+    sweeping.sweep(settings_of(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
     swept = results(tmp_path / "out")
     rows = rows_of(learned[1])
     assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]
@@ -132,7 +132,7 @@ def test_nothing_that_is_reported_on_was_seen(learn, untrained, tmp_path, monkey
 def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, changes):
     changes = ("scorer=sum", "fusion.c=1e6", *changes)
     rows = rows_of(learn(tmp_path / "out", *SUM, *changes, "steps=1"))
-    evaluation.evaluate(composed(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
+    evaluation.evaluate(settings_of(*small(root), *changes, "figures=0", f"out={tmp_path}/evaluated"))
     expected = json.loads((tmp_path / "evaluated" / "results.json").read_text())
     names = {"sum": "paper", "sum + retrieval": "paper + retrieval"}
     for row in expected:
@@ -208,7 +208,7 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
     ]  # fmt: skip
     for change in changes:
         fixed = (*SUM, "grid.c=[1]", "split=second_half", "steps=1", f"out={tmp_path}/out")
-        learning.learn(composed(*small(root), *fixed, change, config="learn"))
+        learning.learn(settings_of(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
     assert len({call["checkpoints"].folder for call in untrained}) == 5 * len(changes)
     assert len({json.dumps(call["checkpoints"].recipe) for call in untrained}) == 5 * len(changes)

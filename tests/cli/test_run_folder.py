@@ -26,7 +26,7 @@ from mfvpr.evaluation.statistics import path_test
 from mfvpr.report import runs
 from mfvpr.report.query_figures import SequenceFigures
 from mfvpr.utils.errors import InputError
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, small
+from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
@@ -37,13 +37,13 @@ SYSTEMS = ("retrieval", "histogram", "histogram + retrieval")
 @pytest.fixture(scope="session")
 def evaluated(root, tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluated") / "out"
-    evaluation.evaluate(composed(*small(root), *LINES, f"out={out}"))
+    evaluation.evaluate(settings_of(*small(root), *LINES, f"out={out}"))
     return out
 
 
 @pytest.fixture(scope="session")
 def outcome(root):
-    return evaluation.evaluation_of(composed(*small(root), *LINES, "candidates=3"))
+    return evaluation.evaluation_of(settings_of(*small(root), *LINES, "candidates=3"))
 
 
 # --- contents ----------------------------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
 
 def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys):
     none = ("dataset.ground_truth=none", "dataset.index_file=null", "figures=2", f"out={tmp_path}/out")
-    evaluation.evaluate(composed(*small(root), *LINES, *none))
+    evaluation.evaluate(settings_of(*small(root), *LINES, *none))
     assert "no ground truth: rankings only" in capsys.readouterr().out
     entries = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [(row["system"], row["recall_at"]) for row in entries] == [(system, {}) for system in SYSTEMS]

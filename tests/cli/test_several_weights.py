@@ -7,14 +7,14 @@ import pytest
 import mfvpr
 from mfvpr.cli import evaluation
 from mfvpr.systems import assembly
-from tests.programs import composed, small
+from tests.programs import settings_of, small
 
 pytestmark = pytest.mark.slow
 
 
 def evaluate(root, out, *more):
     """A run without figures: its folder."""
-    evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *more))
+    evaluation.evaluate(settings_of(*small(root), "figures=0", f"out={out}", *more))
     return out
 
 
@@ -37,7 +37,7 @@ def test_every_weight_ranks_as_in_a_run_of_its_own(root, tmp_path):
      ["anchor", "histogram_ratio", "histogram_fs"], "histogram_ratio + retrieval"),
 ])  # fmt: skip
 def test_the_first_weight_of_the_main_scorer_decides(arguments, names, final):
-    rankings = assembly.rankings(composed(*arguments))
+    rankings = assembly.rankings(settings_of(*arguments))
     assert ([*rankings["scorers"]], rankings["final"]) == (names, final)
 
 
@@ -74,4 +74,4 @@ def test_weights_that_cannot_be_used(refuse_at_once, arguments, words):
 @pytest.mark.parametrize("program", ["sweep", "learn"])
 def test_a_sweep_compares_weights_by_its_grid(refuse_at_once, program):
     arguments = ["scorer=histogram", "scorer.weight=[fs,ratio]", "grid.weight=[unit]"]
-    assert "scorer.weight=[fs,ratio]: expected one weight" in refuse_at_once(program, *arguments)
+    assert "scorer.weight: expected one weight" in refuse_at_once(program, *arguments)

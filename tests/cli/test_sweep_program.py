@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import axes, evaluation, sweeping
-from tests.programs import CANDIDATES, QUERIES, ROOT, composed, job_of, small
+from mfvpr.cli import evaluation, sweeping
+from tests.programs import CANDIDATES, QUERIES, ROOT, job_of, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
@@ -44,7 +44,7 @@ def recall_of(content, **parameters):
 
 def evaluated(root, out, *overrides):
     """The rows of an evaluation, and their recall at ks by system and tolerance."""
-    evaluation.evaluate(composed(*small(root), "figures=0", f"out={out}", *overrides))
+    evaluation.evaluate(settings_of(*small(root), "figures=0", f"out={out}", *overrides))
     rows = json.loads((out / "results.json").read_text())
     return rows, {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
 
@@ -196,23 +196,6 @@ def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, 
 def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, program, arguments, words):
     assert refuse(program, *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_does_not_fit_in_memory_is_refused_with_its_size(root, swept, tmp_path, monkeypatch, refuse):
-    def refused(free, *arguments):
-        monkeypatch.setattr(axes, "free_host_bytes", lambda: free)
-        error = refuse("sweep", *small(root), *arguments, f"out={tmp_path}/out")
-        assert list(tmp_path.iterdir()) == []
-        return error
-
-    many = f"grid.sigma={list(range(1, 101))}", f"grid.bin_size={list(range(5, 105))}"
-    assert "10,000 settings would take about 20 MB of memory, 10 MB are free" in refused(10**7, *many)
-    few = f"grid.sigma={list(range(1, 101))}", "recall.ks=[1000]"
-    line = refused(10**6, *few)
-    assert "rankings of 24 queries by 101 settings would take about 10 MB of memory, 1 MB are free" in line
-    line = refused(2 * 10**5, SIGMA, "chunk.queries=24")
-    assert "chunk: 2 settings x 24 queries " in line
-    assert "chunk.settings or chunk.queries" in line
 
 
 @pytest.mark.slow

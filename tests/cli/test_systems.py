@@ -9,12 +9,12 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, load_system
-from mfvpr.cli import build, evaluation, programs
+from mfvpr.cli import evaluation, inputs, programs
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.choices import CONF
 from mfvpr.utils.fingerprints import recipe_of
-from tests.programs import CANDIDATES, composed, csv_rows, output_of, small
+from tests.programs import CANDIDATES, composed, csv_rows, output_of, settings_of, small
 
 FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
 SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CANDIDATES}
@@ -53,8 +53,8 @@ def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsy
 
 @pytest.mark.slow
 def test_a_run_records_the_size_that_the_images_decide(tmp_path):
-    settings = composed(*small(tmp_path), "features.image_size=19200", f"out={tmp_path}/run", "figures=0")
-    evaluation.evaluate(settings | {"multirun": False})
+    settings = settings_of(*small(tmp_path), "features.image_size=19200", f"out={tmp_path}/run", "figures=0")
+    evaluation.evaluate(settings)
     assert json.loads((tmp_path / "run/run.json").read_text())["settings"]["features"]["image_size"] == [160, 120]
 
 
@@ -86,11 +86,11 @@ def test_what_cannot_be_loaded_is_one_line(name, settings, words):
 @pytest.mark.slow
 def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path):
     arguments = ("system=steering", f"out={tmp_path}/run", "figures=0")
-    evaluation.evaluate(composed(*small(tmp_path), *arguments) | {"multirun": False})
+    evaluation.evaluate(settings_of(*small(tmp_path), *arguments))
     system = load_system("steering", **SMALL)
     again = load_system(tmp_path / "run" / "run.json")
     assert recipe_of(again.pipeline) == recipe_of(system.pipeline)
-    data = build.dataset(composed(*small(tmp_path))["dataset"], lambda done, total: None)
+    data = inputs.dataset_of(composed(*small(tmp_path))["dataset"])
     result = mfvpr.evaluate(data, system, cache=FeatureCache(tmp_path / "features"))
     names = np.array(data.database.names)[result.only.systems["histogram"][0].rows[:, 0]]
     rows = [row for row in csv_rows(tmp_path / "run" / "predictions.csv") if row["rank"] == "1"]

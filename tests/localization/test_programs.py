@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.cli import query_images
+from mfvpr.cli import localization
+from mfvpr.cli.schema import Localize
 from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
@@ -24,7 +25,7 @@ from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
-from tests.programs import ROOT, composed, output_of
+from tests.programs import ROOT, output_of, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -198,8 +199,9 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
 
 
 def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
-    settings = [composed(f"map={tmp_path}/map", *QUICK[:-1], f"candidates={number}", config="map") for number in (5, 6)]
-    systems = (assembly.system({**each, "previous_queries": 0}) for each in settings)
+    common = (f"map={tmp_path}/map", *QUICK[:-1])
+    settings = [settings_of(*common, f"candidates={number}", config="map") for number in (5, 6)]
+    systems = map(assembly.system, settings)
     first, second = (Map(tmp_path / "map", system) for system in systems)
     images = image_folder(small_street / "database")
     second.build(images)
@@ -341,10 +343,10 @@ def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_
     monkeypatch.chdir(small_street)
     expected = [str(small_street / "queries" / name) for name in NAMES]
     for folder in ("queries", small_street / "queries", "./database/../queries/", tmp_path / "link/queries"):
-        images = query_images.images({"images": str(folder), "watch": False})
+        images = localization.images_of(Localize("map", str(folder)))
         assert [name for name, _ in images] == expected
     monkeypatch.chdir(tmp_path)
-    name, _ = next(query_images.images({"images": video.name, "watch": False, "every": 1}))
+    name, _ = next(localization.images_of(Localize("map", video.name)))
     assert name == f"{video}:0"
 
 
@@ -353,16 +355,16 @@ def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(
     (tmp_path / "b.png").write_bytes(b"image")
     (tmp_path / "c.png").mkdir()
     monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was listed
-    monkeypatch.setattr(query_images, "POLL", 0)
-    name, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
+    monkeypatch.setattr(localization, "POLL", 0)
+    name, path = next(localization.images_of(Localize("map", str(tmp_path), watch=True)))
     assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
 
 
 def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
     image, writes = tmp_path / "a.png", [b"image", b"im"]
     image.write_bytes(b"i")
-    monkeypatch.setattr(query_images.time, "sleep", lambda _: writes and image.write_bytes(writes.pop()))
-    _, path = next(query_images.images({"images": str(tmp_path), "watch": True}))
+    monkeypatch.setattr(localization.time, "sleep", lambda _: writes and image.write_bytes(writes.pop()))
+    _, path = next(localization.images_of(Localize("map", str(tmp_path), watch=True)))
     assert path.read_bytes() == b"image"
 
 

@@ -14,7 +14,7 @@ from mfvpr.matchers import MatchSet
 from mfvpr.report.run_files import SHIFTS
 from mfvpr.utils import Stopwatch
 from tests.builders import make_matches, of_query
-from tests.programs import composed, csv_rows, shared, small
+from tests.programs import csv_rows, settings_of, shared, small
 
 pytestmark = pytest.mark.thorough
 
@@ -29,7 +29,7 @@ def root(tmp_path_factory):
 @pytest.mark.first_case
 @pytest.mark.parametrize("final", ["score", "combined"])
 def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, final):
-    settings = composed(*small(root), *STEERING, f"final={final}", f"out={tmp_path}/out")
+    settings = settings_of(*small(root), *STEERING, f"final={final}", f"out={tmp_path}/out")
     evaluation.evaluate(settings)
     lines, first = csv_rows(tmp_path / "out" / "shifts.csv"), {}
     for line in reversed(csv_rows(tmp_path / "out" / "predictions.csv")):
@@ -40,7 +40,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
     ]
     inputs = prepare(settings, Stopwatch())
     matches, candidates = inputs.match(Stopwatch())
-    weight = evaluation.assembly.scorers(settings["scorer"])["histogram"].weight
+    weight = evaluation.assembly.scorers(settings.scorer)["histogram"].weight
     scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
     names = inputs.dataset.database.names
     for row, line in enumerate(lines):
@@ -87,9 +87,9 @@ def test_the_refined_shift_stays_in_the_range_of_shifts():
 
 
 def test_refused_answers_have_no_shift(root, tmp_path):
-    evaluation.evaluate(composed(*small(root), *STEERING, f"out={tmp_path}/first"))
+    evaluation.evaluate(settings_of(*small(root), *STEERING, f"out={tmp_path}/first"))
     confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.25", f"out={tmp_path}/out")
-    evaluation.evaluate(composed(*small(root), *STEERING, *confidence))
+    evaluation.evaluate(settings_of(*small(root), *STEERING, *confidence))
     predictions = {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "top_predictions.csv")}
     places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
     assert 0 < len(places) < len(predictions)

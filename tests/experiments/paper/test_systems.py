@@ -1,6 +1,7 @@
 """Rows, settings and data sets of the evaluations, and the tables of their numbers."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,12 +11,13 @@ from experiments.paper.pages import mean_recalls
 from experiments.paper.runs import input_fingerprints, lock_output, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
+from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 from mfvpr.utils.errors import InputError
 
 pytestmark = pytest.mark.thorough
 
-SETTINGS = {"out": "out", "cache": None, "memory": None, "devices": 1}
+SETTINGS = Paper(out="out", cache=None)
 RUNS = list(dict.fromkeys(row.run for row in ROWS))
 
 
@@ -36,21 +38,21 @@ def test_every_evaluation_has_settings_of_the_paper(run):
     settings = compose(run)
     candidates = {"patch_netvlad": 100, "sift_10": 10, "aliked_10": 10, "mix_hist_10": 10, "mix_hist_comb_10": 10}
     expected = next((number for name, number in candidates.items() if run.startswith(name)), 50)
-    assert settings["candidates"] == expected
+    assert settings.candidates == expected
     sizes = {"mix": [320, 320], "ssm": [336, 336], "selavpr": [224, 224], "patch_netvlad": [640, 480]}
     for name, size in sizes.items():
         if run.startswith(name):
-            assert settings["features"]["image_size"] == size
-    assert settings["final"] == ("combined" if "comb" in run else "score")
+            assert settings.features["image_size"] == size
+    assert settings.final == ("combined" if "comb" in run else "score")
 
 
 def test_settings_depend_on_the_data_set(tmp_path):
     for run in ("patch_netvlad_performance", "patch_netvlad_speed"):
         settings = compose(run, "robotcar_seasons", tmp_path)
-        assert settings["features"]["image_size"] == [480, 480]
-        assert settings["dataset"]["root"] == str(tmp_path)
-    assert compose("sift_50")["recall"]["tolerances"] == [1, 2, 5]
-    assert compose("sift_50", "nordland_27592", tmp_path)["recall"]["tolerances"] == [10]
+        assert settings.features["image_size"] == [480, 480]
+        assert settings.dataset["root"] == str(tmp_path)
+    assert compose("sift_50").recall.tolerances == [1, 2, 5]
+    assert compose("sift_50", "nordland_27592", tmp_path).recall.tolerances == [10]
 
 
 def test_data_sets_are_found_by_their_names(tmp_path):
@@ -99,7 +101,7 @@ def test_weights_that_are_missing_are_named(monkeypatch):
 
 def test_a_run_is_known_by_what_decides_its_numbers(tmp_path):
     def inputs(run="sift_50", root="a", queries="b", **changes):
-        settings = compose(run, "corridor", tmp_path / root) | changes
+        settings = replace(compose(run, "corridor", tmp_path / root), **changes)
         return input_fingerprints(settings, {"database": "a", "queries": queries}, None)
 
     assert inputs(root="b", out="elsewhere") == inputs()
