@@ -410,6 +410,8 @@ def _lines(known: Mapping[str, Any], settings: Mapping[str, Any], indent: str = 
             yield f"{indent}{name}:"
             yield from _lines(about if isinstance(about, Mapping) else {}, value, f"{indent}  ")
         else:
-            words = [about.unit, about.note.replace("None", "null"), about.rule.expected] if isinstance(about, Setting) else []
+            words = ""
+            if isinstance(about, Setting):
+                words = "; ".join(filter(None, [about.unit, about.note.replace("None", "null"), about.rule.expected]))
             shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else value
-            yield f"{indent}{name}: {shown}" + f"  # {'; '.join(filter(None, words))}" * bool(words)
+            yield f"{indent}{name}: {shown}" + f"  # {words}" * bool(words)

@@ -230,7 +230,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
 @pytest.mark.parametrize(("arguments", "words"), [
     (["split=null"], "split=null: "),
     (["scorer=count"], "scorer=count: expected one to learn"),
-    (["scorer=all"], "scorer: expected one to learn"),
+    (["scorer=all"], "scorer=several: expected one to learn"),
     (["recall.tolerances=[30]"], "smaller tolerances or radius"),
     (["also=[streets]"], "expected report=[...] as well"),
     (["report=[streets]", "split=first_half"], "split=first_half: expected none with report="),

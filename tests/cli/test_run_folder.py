@@ -153,7 +153,7 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
     assert content["command"].startswith("mfvpr evaluate dataset=folder dataset.database=")
     assert content["command"].endswith(" scorer=count figures=0 'out=a b'")
     expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
-    assert content["settings"] == {name: value for name, value in expected.items() if name != "compiled"}
+    assert content["settings"] == expected | {"cluster": {}}
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert content["commit"] == head.stdout.strip()
     assert {"mfvpr", "jax", "python"} <= content["versions"].keys()
