@@ -4,10 +4,15 @@
 `checked` finds the same ones faster with products of bfloat16, and can be deleted. `weights` and `shifts` are what
 scores see of a match. `scorer` states the contract of a score, a function of the matches of one pair, and `parameters`
 declares the fields of its class. `aggregate` holds the shortest scores; read it before `histogram` and `anchor`, which
-also stand in one file each, from the equation to the result. `batch` scores all candidates of a query, and grids: what
-takes one pair is a plain function that JAX traces, what takes many pairs is compiled there with `vmap` and `lax.map`,
-once for each shape and whatever the numbers. `ranking` and `metrics` sort the scores and count the hits. To add a
-score, write a class like `MatchCount`, and call `mfvpr.testing.check_scorer` in its test.
+also stand in one file each, from the equation to the result. `batch` scores all candidates of a query, and grids, with
+`vmap` and `lax.map` around the function of one pair. `ranking` and `metrics` sort the scores and count the hits.
+
+A function is compiled where it says `@compiled`, which is `jax.jit` that keeps its programs: one for each shape of the
+arrays, static field, class of a scorer, and capacity of bins (a multiple of 8, from the sizes of images and bins).
+Other numbers in a scorer compile nothing. A score of one pair, `scorer(matches)`, runs operation by operation.
+
+To add a score, write a class like `AggregatedScore`, and call `mfvpr.testing.check_scorer` in its test; the README
+beside this file says how programs learn its name.
 
     unit = lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True)
     rng = np.random.default_rng(0)

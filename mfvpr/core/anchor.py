@@ -101,9 +101,9 @@ class AnchorPoints:
         winner = jnp.full(num_cells, num_cells, jnp.int32).at[member].min(contender, mode="drop")
 
         if few:  # every match stands for its cell; only the first match of a cell counts
-            number = jnp.arange(len(anchor), dtype=jnp.int32)
-            first = jnp.full(num_cells, len(anchor), jnp.int32).at[member].min(number, mode="drop")
-            cells, occupied = anchor, real & (first[anchor] == number)
+            slot = jnp.arange(len(anchor), dtype=jnp.int32)
+            first_slot = jnp.full(num_cells, len(anchor), jnp.int32).at[member].min(slot, mode="drop")
+            cells, occupied = anchor, real & (first_slot[anchor] == slot)
         else:
             cells = jnp.arange(num_cells, dtype=jnp.int32)
             occupied = winner < num_cells

@@ -47,7 +47,9 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     check_host(scorer)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
-    return _score_candidates(fit_to_sizes(partial(with_capacity, scorer, multiple=BIN_STEP), matches), matches)
+    scores = _score_candidates(fit_to_sizes(partial(with_capacity, scorer, multiple=BIN_STEP), matches), matches)
+    require_real(type(scorer).__name__, scores)
+    return scores
 
 
 @compiled
@@ -74,11 +76,14 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     check_candidates(matches)
     refuse_own_names(scorer, axes)
     check_host(scorer)
-    if "weight" in axes and hasattr(scorer, "weight"):
-        weights = _weights(axes["weight"])
-        scorer, axes["weight"] = replace(scorer, weight=ChosenWeight(weights, 0)), np.arange(len(weights))
+    weights = _weights(axes["weight"]) if "weight" in axes and hasattr(scorer, "weight") else ()
+    values = {
+        name: np.arange(len(weights)) if name == "weight" and weights else _axis(scorer, name, axis)
+        for name, axis in axes.items()
+    }
+    if weights:
+        scorer = replace(scorer, weight=ChosenWeight(weights, 0))
     plain, scorer = holds_function(scorer), with_static_functions(scorer)
-    values = {name: _axis(scorer, name, axis) for name, axis in axes.items()}
     inner = [name for name in values if name in WEIGHTINGS]
     outer = [name for name in values if name not in WEIGHTINGS]
     settings, weightings = _product(values, outer), _product(values, inner)
@@ -275,7 +280,7 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
             f"(nearest: {nearest[0]})"
         )
     points = np.asarray(axis) if is_concrete(axis) else jnp.asarray(axis)  # on the host, which takes them apart
-    if not (jnp.issubdtype(points.dtype, jnp.integer) and (name == "weight" or name in whole_numbers(scorer))):
+    if not (jnp.issubdtype(points.dtype, jnp.integer) and name in whole_numbers(scorer)):
         points = points.astype(jnp.result_type(float))
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")

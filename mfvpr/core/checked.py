@@ -82,7 +82,7 @@ class RoundedQuery(Query):
 
         def in_bfloat16() -> Neighbors:
             neighbors, settled = mutual_neighbors(rounded0, rounded1, with_second=with_second)
-            return jax.lax.cond(settled, lambda: neighbors.of(query.features), in_single)
+            return jax.lax.cond(settled, lambda: neighbors.without_padding(query.features), in_single)
 
         # Traced arrays do not say where they are: the program may be compiled for another device than the default.
         return jax.lax.platform_dependent(cpu=in_bfloat16, default=in_single)

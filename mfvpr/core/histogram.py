@@ -25,7 +25,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, POSITIVE, check_fields, list_of, one_of, setting, whole
 from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt
 
-MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
+MAX_BINS = 1024  # per axis: the histograms of 50 pairs then take 200 MB
 PAIRS_AT_ONCE = 8  # on a CPU, divided by the weightings: few and long operations that still stay in the cache
 CHUNK = 2**29  # bytes of the votes and bins that exist at the same time on an accelerator
 _NEAR = 32.0  # temperatures; e^32 is far from overflow
@@ -119,9 +119,7 @@ class HistogramOfShifts:
         self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
     ) -> Float[jax.Array, " weightings"]:
         """The (smooth) maximum over bins of one pair for each weighting of its matches (0 on padding)."""
-        votes_x, votes_y = bins.votes(0, shifts), bins.votes(1, shifts)
-        rows = (weights[:, None] * votes_y[None]).reshape(len(weights) * len(votes_y), weights.shape[1])
-        scores = bin_scores(votes_x, rows).reshape(len(weights), len(votes_y), len(votes_x))
+        scores = bins.scores(shifts, weights)
         if self.temperature is None:
             return jnp.max(scores, axis=(1, 2))  # of all: bins beyond the last only repeat it
         smooth = partial(smooth_maximum, mask=bins.inside, temperature=positive(self.temperature, scores.dtype))
@@ -145,8 +143,9 @@ class HistogramOfShifts:
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
-        scores, bins, usable = self._vote(matches)
-        return ShiftHistogram(jnp.where(usable, scores, jnp.nan), *(bins.centers(axis, bins.index) for axis in (0, 1)))
+        scores, bins, shifts, weights = self._vote(matches)
+        scores = jnp.where(bins.are_usable(shifts, weights), scores, jnp.nan)
+        return ShiftHistogram(scores, *(bins.centers(axis, bins.index) for axis in (0, 1)))
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Float[jax.Array, "2"]:
         """Shift of the tallest bin, (x, y) px, candidate minus query; (0, 0) without votes.
@@ -250,12 +249,12 @@ class HistogramOfShifts:
         first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
         return _Bins(first, num_bins, bin_size, self._deviation(dtype), truncate, self._capacity(matches))
 
-    def _vote(self, matches: Matches) -> tuple[Float[Array, "bins bins"], "_Bins", Bool[Array, ""]]:
-        """Scores of the bins (y, x), -inf out of range; the bins; whether they are usable."""
+    def _vote(
+        self, matches: Matches
+    ) -> tuple[Float[Array, "bins bins"], "_Bins", Float[Array, "2 slots"], Float[Array, " slots"]]:
+        """Scores of the bins (y, x), -inf out of range, and what they follow from: bins, shifts, weights."""
         bins, shifts, weights = self._bins(matches), self._shifts(matches), match_weights(self.weight, matches)
-        scores = bin_scores(bins.votes(0, shifts), bins.votes(1, shifts) * weights[None])
-        usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights))
-        return jnp.where(bins.inside, scores, -jnp.inf), bins, usable
+        return jnp.where(bins.inside, bins.scores(shifts, weights[None])[0], -jnp.inf), bins, shifts, weights
 
     def _shifts(self, matches: Matches) -> Float[Array, "2 slots"]:
         """Shifts along x and along y."""
@@ -300,23 +299,27 @@ class _Bins:
         """(y, x), True for bins within the range of shifts."""
         return (self.index < self.num_bins[1])[:, None] & (self.index < self.num_bins[0])[None]
 
-    @property
-    def are_usable(self) -> Bool[Array, ""]:
-        """Whether the bins fit the capacity, and `deviation` and `truncate` are numbers."""
+    def scores(
+        self, shifts: Float[Array, "2 slots"], weights: Float[Array, "weightings slots"]
+    ) -> Float[Array, "weightings bins bins"]:
+        """s_ij of equation 1, (y, x), by weighting: one product of all weighted votes along y and those along x."""
+        votes_x, votes_y = self.votes(0, shifts), self.votes(1, shifts)
+        rows = (weights[:, None] * votes_y[None]).reshape(len(weights) * len(votes_y), weights.shape[1])
+        sums = jnp.matmul(rows, votes_x.T, precision=jax.lax.Precision.HIGHEST)
+        return sums.reshape(len(weights), len(votes_y), len(votes_x))
+
+    def are_usable(self, shifts: Array, weights: Float[Array, "*weightings slots"]) -> Bool[Array, "*weightings"]:
+        """Whether the bins fit the capacity, and `deviation`, `truncate`, shifts and weights are numbers."""
         # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
         fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= self.capacity))
-        return fits & ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate)
-
-
-def bin_scores(votes_x: Float[Array, "bins slots"], weighted_votes_y: Float[Array, "rows slots"]) -> Array:
-    """s_ij of equation 1, (y, x): weighted sums of the votes."""
-    return jnp.matmul(weighted_votes_y, votes_x.T, precision=jax.lax.Precision.HIGHEST)
+        numbers = ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate) & jnp.all(jnp.isfinite(shifts))
+        return fits & numbers & jnp.all(jnp.isfinite(weights), axis=-1)
 
 
 def smooth_maximum(
     values: Float[Array, "*bins"], mask: Bool[Array, "*bins"], *, temperature: Array
 ) -> Float[Array, ""]:
-    """T log(mean of e^(v / T)) of the values where `mask`."""
+    """T log(mean of e^(v / T)) of the values where `mask`; the others are within the range of these."""
     # Relative to the maximum nothing overflows. The maximum drops out, so that its gradient would be 0.
     largest = jax.lax.stop_gradient(jnp.max(values))
     below = (masked(values, mask, largest) - largest) / temperature
@@ -335,16 +338,15 @@ def _where_usable(
     weights: Float[Array, "_ slots"],
 ) -> Float[jax.Array, "*"]:
     """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
-    usable = bins.are_usable & jnp.all(jnp.isfinite(shifts)) & jnp.all(jnp.isfinite(weights), axis=1)
+    usable = bins.are_usable(shifts, weights)
     return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
 
 
 @partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, bins, _ = scorer._vote(matches)
+    scores, bins, shifts, weights = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([bins.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
-    shifts, weights = scorer._shifts(matches), match_weights(scorer.weight, matches)
     if refine:
         shift = climb(shift, shifts.T, weights, bins.deviation)
         if scorer.shift_range is not None:
@@ -357,7 +359,7 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
     """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
-    scores, bins, usable = scorer._vote(matches)
+    scores, bins, shifts, weights = scorer._vote(matches)
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
@@ -369,7 +371,7 @@ def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, s
         below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
         return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], bins.centers(axis, edges))
 
-    return jnp.where(usable, jnp.stack([along(0), along(1)], axis=1), jnp.nan)
+    return jnp.where(bins.are_usable(shifts, weights), jnp.stack([along(0), along(1)], axis=1), jnp.nan)
 
 
 def climb(

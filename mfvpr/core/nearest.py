@@ -117,7 +117,7 @@ class Neighbors(NamedTuple):
     second: Int[Array, " keypoints0"]  # the nearest of the others
     has_second: Bool[Array, " keypoints0"]
 
-    def of(self, features: Features) -> "Neighbors":
+    def without_padding(self, features: Features) -> "Neighbors":
         """Neighbors of the slots of these features, without those that fill up the last block of products."""
         return Neighbors(*(values[: features.mask.shape[-1]] for values in self))
 
@@ -148,7 +148,7 @@ class Query:
             match, largest = nearest(lines_of(picked, axis=1))
             real = jnp.isfinite(largest)
         neighbors = Neighbors(match, real, nearest1.index, second1.index, second1.similarity > -jnp.inf)
-        return neighbors.of(self.features)
+        return neighbors.without_padding(self.features)
 
 
 def prepare_query(query: Features, *_: Any) -> Query:

@@ -44,10 +44,10 @@ def rank(
     Ties keep their order (the order of the retrieval), or are ordered by ascending `tie_break`, such as the database
     index. NaN comes after all numbers, and entries where `mask` is False come last.
     """
-    return _rank(_in_32_bits(as_array(scores)), mask, _in_32_bits(as_array(tie_break)))
+    return _rank(_as_order_keys(as_array(scores)), mask, _as_order_keys(as_array(tie_break)))
 
 
-def _in_32_bits(keys: Array | None) -> Array | None:
+def _as_order_keys(keys: Array | None) -> Array | None:
     """Replace 64-bit integers, which JAX truncates, by smaller integers in the same order."""
     if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64):
         return np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
@@ -57,12 +57,11 @@ def _in_32_bits(keys: Array | None) -> Array | None:
 @compiled
 def _rank(scores: Array, mask: Array | None, tie_break: Array | None) -> Array:
     present = jnp.ones(scores.shape, bool) if mask is None else mask.astype(bool)
-    number = present & ~jnp.isnan(scores)
-    group = jnp.where(present, jnp.where(number, 0, 1), 2)
-    scores = jnp.asarray(scores)
+    is_number = present & ~jnp.isnan(scores)
+    group = jnp.where(present, jnp.where(is_number, 0, 1), 2)
     # ~ reverses the order of integers, also of unsigned ones and of the smallest, which have no negative.
     descending = -scores if jnp.issubdtype(scores.dtype, jnp.floating) else ~scores
-    descending = masked(descending, number, jnp.zeros((), scores.dtype))
+    descending = masked(descending, is_number, jnp.zeros((), scores.dtype))
     keys = (descending, group) if tie_break is None else (tie_break, descending, group)
     return jnp.lexsort(keys, axis=-1).astype(jnp.int32)
 

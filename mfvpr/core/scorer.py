@@ -51,13 +51,15 @@ def on_host(scorer: Any) -> bool:
 
 def shares_weightings(scorer: Any) -> bool:
     """Whether `score_weightings` is there, and of the class that defines the score: a subclass may score otherwise."""
-    names, classes = ("score_weightings", "__call__"), type(scorer).__mro__
-    owners = [[cls for cls in classes if name in vars(cls)][:1] for name in names]
-    return bool(owners[0]) and owners[0] == owners[1]
+    owners = [
+        next((cls for cls in type(scorer).__mro__ if name in vars(cls)), None)
+        for name in ("score_weightings", "__call__")
+    ]
+    return owners[0] is not None and owners[0] is owners[1]
 
 
-class Static:
-    """A plain function as a static part of a scorer. `jit` takes no two of them for the same."""
+class StaticFunction:
+    """A plain function as a static part of a scorer: a program is used again for this object alone."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
@@ -66,12 +68,15 @@ class Static:
         return self.function(matches)
 
 
-jax.tree_util.register_static(Static)
+jax.tree_util.register_static(StaticFunction)
 
 
 def with_static_functions(scorers: Tree) -> Tree:
-    """Scorers with plain functions as static parts, new ones at each call: `compiled` reuses its programs for them."""
-    return jax.tree.map(lambda leaf: Static(leaf) if callable(leaf) else leaf, scorers)
+    """Scorers with plain functions as static parts, for one evaluation, in which they may share programs.
+
+    The next call makes new parts, and compiles again: what a function closes over may have changed.
+    """
+    return jax.tree.map(lambda leaf: StaticFunction(leaf) if callable(leaf) else leaf, scorers)
 
 
 def check_host(scorer: Any) -> None:

@@ -4,6 +4,8 @@ Axis letters: Q queries, C candidates, N keypoints, K match slots, D descriptor 
 Points are (x, y) in pixels of the image that the detector saw. `mask` is True on real entries; what padding holds
 never matters, NaN included. Every field may carry leading batch axes. Arrays may be NumPy's or JAX's. Features and
 Matches also take lists, arrays of torch and other libraries (DLPack) on any device, and masks of integers.
+
+Arrays of fewer axes are never broadcast silently in this package: `values[None]` says so (the tests raise otherwise).
 """
 
 from collections.abc import Callable

@@ -16,6 +16,7 @@ from mfvpr import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     HistogramOfShifts,
+    InputError,
     MatchCount,
     UnitWeight,
     filter_matches,
@@ -170,3 +171,11 @@ def test_numbers_out_of_bounds_are_refused_in_a_grid_as_in_the_scorer():
     for scorer, axes in ((HistogramOfShifts(), {"sigma": [-3.0, 10.0]}), (AnchorPoints(), {"tolerance": [np.nan]})):
         with pytest.raises(ValueError, match="expected a"):
             score_grid(scorer, pairs, **axes)
+
+
+def test_scores_are_real_and_indices_of_weights_are_no_axis():
+    matches = stack([random_matches(np.random.default_rng(0), 9)])
+    with pytest.raises(InputError, match="expected real numbers as scores, got complex64"):
+        score_candidates(lambda pair: jnp.sum(pair.distance).astype(jnp.complex64), matches)
+    with pytest.raises(ValueError, match=r"no numeric parameter 'weight\.index'"):
+        score_grid(HistogramOfShifts(), matches, weight=["fs", "unit"], **{"weight.index": [0, 1]})
