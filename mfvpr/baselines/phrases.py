@@ -34,10 +34,7 @@ class VisualPhrases:
     cell_size: float | Array = setting(15.0, POSITIVE, unit="px")
     align: str = setting("zero_center", one_of("zero_center", "zero_edge"), static=True)
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-        if not 1 <= self.length <= MAX_LENGTH:
-            raise ValueError(f"VisualPhrases(length={self.length}): expected from 1 to {MAX_LENGTH} matches")
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""
