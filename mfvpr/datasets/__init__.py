@@ -3,7 +3,7 @@
     data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
 
 Read first: datasets (folders of images), ground_truth and positives (what is correct), image_reading (decoding and
-resizing), contents (fingerprints of files), then published/ (layouts of known data sets) and streets/ (the synthetic
+resizing), contents (fingerprints of files), then published (layouts of known data sets) and streets/ (the synthetic
 street).
 """
 

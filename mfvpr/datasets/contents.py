@@ -86,7 +86,8 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
             process replaces meanwhile, costs time only.
     """
     root = folder.root.absolute()
-    path = None if cache is None else Path(cache) / f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}.json"
+    name = f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}-{FORMAT}.json"
+    path = None if cache is None else Path(cache) / name
     records, start = {} if path is None else _read_records(path), time.time_ns()
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
     unchanged = {name for name, state in states.items() if state and name in records and records[name][:4] == state}
@@ -95,7 +96,9 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     files = {name: Content(*records[name][4:]) for name in unchanged} | dict(zip(changed, new, strict=True))
     if path is not None and changed:  # records of other files of this folder, from other data sets, stay
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < start - SETTLED}
-        _write_records(path, records | {name: [*state, *astuple(files[name])] for name, state in settled.items()})
+        records |= {name: [*state, *astuple(files[name])] for name, state in settled.items()}
+        with suppress(OSError):  # records only save time
+            write_text(path, json.dumps(records, separators=(",", ":")))  # ASCII: file names may be no UTF-8
     return Contents(folder, tuple(files[name] for name in folder.names))
 
 
@@ -154,17 +157,6 @@ def read_content(path: Path) -> Content:
 def _read_records(path: Path) -> dict[str, list[Any]]:
     """State and content of files by name; empty if the record file is missing or damaged."""
     try:
-        check, _, text = path.read_text(encoding="ascii").partition("\n")
-    except (OSError, UnicodeError):
+        return json.loads(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
         return {}
-    return json.loads(text) if check == _checksum(text) else {}
-
-
-def _write_records(path: Path, records: Mapping[str, Any]) -> None:
-    text = json.dumps(records, separators=(",", ":"))  # ASCII: file names may be no UTF-8
-    with suppress(OSError):  # records only save time
-        write_text(path, f"{_checksum(text)}\n{text}")
-
-
-def _checksum(text: str) -> str:
-    return f"{FORMAT} {hashlib.sha256(text.encode('ascii')).hexdigest()}"

@@ -2,14 +2,14 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.ground_truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_by_order, truth_from_names
+from mfvpr.datasets.ground_truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_from_names
 from mfvpr.datasets.image_reading import read_image
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
@@ -141,8 +141,10 @@ class Dataset:
     def only(self) -> QuerySequence:
         """The only sequence; InputError if there are several."""
         if len(self.sequences) != 1:
-            raise InputError(f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of "
-                             f"{', '.join(sequence.name for sequence in self.sequences)}")  # fmt: skip
+            names = ", ".join(sequence.name for sequence in self.sequences)
+            raise InputError(
+                f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of {names}"
+            )
         return self.sequences[0]
 
     @property
@@ -177,16 +179,29 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
         InputError: no such folder, a folder that cannot be listed, a broken link, a link to a parent folder, or no
             images.
     """
-    root = Path(root)
+    root, names = Path(root), []
     if not root.is_dir():
         got = "a file" if os.path.lexists(root) else "nothing"
         raise InputError(f"{root}: expected a folder of images, got {got}; check the path")
-    names = [path.relative_to(root).as_posix() for path in _images_below(root)]
-    if not names:
-        raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
     if bits is not None and not 8 <= bits <= 16:
         raise InputError(f"bits={bits}: expected from 8 to 16 bits in use, or none")
+    for folder, folders, files in os.walk(root, onerror=_refuse, followlinks=True):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for path in (Path(folder, name) for name in folders):
+            if path.is_symlink() and path.parent.resolve().is_relative_to(path.resolve()):
+                raise InputError(f"{path}: a link back to {path.resolve()}, which it is in; remove it")
+        for path in (Path(folder, name) for name in files if not name.startswith(".")):
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                names.append(path.relative_to(root).as_posix())
+            elif path.is_symlink() and not path.exists():
+                raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
+    if not names:
+        raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
     return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
+
+
+def _refuse(error: OSError) -> None:
+    raise InputError(f"{error.filename}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
 
 
 def folder(
@@ -220,13 +235,9 @@ def folder(
         return Dataset(name, images, (_sequence(name, images, queries, ground_truth),))
     folders = [Path(path) for path in queries]
     names = [(path.resolve() if path.name in ("", "..") else path).name for path in folders]
-    if not names:
-        raise InputError("queries: expected the folder of at least one sequence, got none")
-    if len({*names}) < len(names):
-        duplicate = max(names, key=names.count)
-        raise InputError(f"queries: expected sequences of different names, got {duplicate} twice; rename a folder")
-    for mean in {*names} & {*MEANS}:
-        raise InputError(f"queries: expected no sequence called {mean}, the name of a mean in results; rename it")
+    if not names or len({*names, *MEANS}) < len(names) + len(MEANS):
+        got = ", ".join(names) or "none"
+        raise InputError(f"queries: expected folders of different names, none called {' or '.join(MEANS)}, got {got}")
     sequences = [_sequence(part, images, path, ground_truth, path) for part, path in zip(names, folders, strict=True)]
     return Dataset(name, images, tuple(sequences))
 
@@ -237,10 +248,15 @@ def _sequence(
     images = image_folder(queries, orient=database.orient, bits=database.bits)
     names = images.names, database.names
     match ground_truth:
-        case None | "none" | Truth():
-            truth = ground_truth if isinstance(ground_truth, Truth) else None
+        case None | "none":
+            truth = None
+        case Truth():
+            truth = ground_truth
         case "order":
-            truth = truth_by_order(len(images), len(database))
+            if len(images) != len(database):
+                got = f"{len(images)} and {len(database)}; name the pairs in an index file"
+                raise InputError(f"ground_truth=order: expected as many queries as database images, got {got}")
+            truth = FrameTruth(tuple((row,) for row in range(len(images))), len(database))
         case "utm":
             truth = truth_from_names(*names)
         case IndexFile(path, is_widened):
@@ -248,34 +264,9 @@ def _sequence(
         case LabelFiles(query_file, database_file):
             truth = truth_from_labels(root / query_file, root / database_file, *names)
         case _:
-            raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; files are given as "
-                             "mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)")  # fmt: skip
+            files = "files are given as mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)"
+            raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; {files}")
     return QuerySequence(name, images, truth)
-
-
-def _images_below(root: Path) -> Iterator[Path]:
-    waiting: list[tuple[Path, tuple[tuple[int, int], ...]]] = [(root, ())]  # folders with their parents' numbers
-    while waiting:
-        folder, parents = waiting.pop()
-        try:
-            status = folder.stat()
-            entries = list(os.scandir(folder))
-            folders = {entry.name for entry in entries if entry.is_dir()}
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
-        number = (status.st_dev, status.st_ino)
-        if number in parents:
-            raise InputError(f"{folder}: a link back to {folder.resolve()}, which it is in; remove it")
-        for entry in entries:
-            path = folder / entry.name
-            if entry.name.startswith("."):
-                continue
-            if entry.name in folders:
-                waiting.append((path, (*parents, number)))
-            elif path.suffix.lower() in IMAGE_SUFFIXES:
-                yield path
-            elif entry.is_symlink() and not path.exists():
-                raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:

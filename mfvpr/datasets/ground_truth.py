@@ -210,28 +210,20 @@ def require_positions(where: str, xy: np.ndarray, count: int) -> None:
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
 
 
-def truth_by_order(num_queries: int, num_database: int) -> FrameTruth:
-    """Ground truth where query i shows database image i, in file order."""
-    if num_queries != num_database:
-        raise InputError(
-            f"ground_truth=order: expected as many queries as database images, got {num_queries} and {num_database}; "
-            "name the pairs in an index file, or use another ground truth"
-        )
-    return FrameTruth(tuple((row,) for row in range(num_queries)), num_database)
-
-
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
     """UTM easting and northing from names `@easting@northing@...` (the convention of VPR-datasets-downloader)."""
-    return RadiusTruth(*(np.array([_position(name) for name in names]) for names in (query_names, database_names)))
-
-
-def _position(name: str) -> tuple[float, float]:
-    """Easting and northing in a file's name; its folders may contain '@' as well."""
-    try:
-        easting, northing = map(parse_number, PurePosixPath(name).name.split("@")[1:3])
-        if abs(easting) <= FARTHEST and abs(northing) <= FARTHEST:  # NaN neither
-            return easting, northing
-    except ValueError:
-        pass
-    expected = f"a name like @easting@northing@..., in meters up to {FARTHEST:g}"
-    raise InputError(f"{name}: expected {expected}; or choose another ground truth")
+    sides = []
+    for names in (query_names, database_names):
+        positions = []
+        for name in names:
+            parts = PurePosixPath(name).name.split("@")[1:3]  # folders may contain '@' as well
+            try:
+                easting, northing = map(parse_number, parts)
+                if not abs(easting) + abs(northing) <= FARTHEST:  # NaN neither
+                    raise ValueError
+            except ValueError:
+                expected = f"a name like @easting@northing@..., in meters up to {FARTHEST:g}"
+                raise InputError(f"{name}: expected {expected}; or choose another ground truth") from None
+            positions.append((easting, northing))
+        sides.append(np.array(positions))
+    return RadiusTruth(*sides)

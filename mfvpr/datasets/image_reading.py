@@ -34,10 +34,14 @@ _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic":
 _GRAY, _COLOR = ("I", "I;16", "I;16L", "I;16B", "I;16N"), ("RGB", "RGBA", "LA")  # Pillow's modes of 16-bit files
 _ORIENTATION = 0x0112
 _TURN = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
-}  # fmt: skip
+}
 _INVERSE = {6: 8, 8: 6}  # all others are their own inverse
 _MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of a PNG file
 
@@ -132,8 +136,8 @@ def read_header(content: bytes) -> tuple[int, int | None]:
 
     Returns:
         orientation: EXIF's, 1 .. 8; 1 = as stored, or a file that cannot be read.
-        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, cannot be decoded, or
-            has 32 bits; None = an image of 8 bits, or a file that cannot be read.
+        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, or has
+            32 bits; None = an image of 8 bits, or a file that cannot be read.
     """
     try:
         with open_image(BytesIO(content)) as image:
@@ -142,8 +146,11 @@ def read_header(content: bytes) -> tuple[int, int | None]:
             orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, `_orientation` decodes all
             if used is None:  # the range of 32 bits is unknown
                 return orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None
-            has_range = used != 16 or image.format == "PPM"
-            return orientation, 0 if has_range else _largest(image, content)
+            if used != 16 or image.format == "PPM":  # the file states its range
+                return orientation, 0
+            is_gray = image.mode in _GRAY
+            values = np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))
+            return orientation, int(values.max())
     except Exception:  # decoders share no class of errors, and reading the image raises an InputError
         return 1, None
 
@@ -228,14 +235,6 @@ def _as_rgb(image: Image.Image, path: Path, used: int | None) -> Image.Image:
     values = _color_values(np.fromfile(path, np.uint8)) if is_color else np.asarray(image)
     upper = np.clip(values.astype(np.int32), 0, 2**used - 1) >> (used - 8)
     return Image.fromarray(upper.astype(np.uint8)).convert("RGB")
-
-
-def _largest(image: Image.Image, content: bytes) -> int:
-    try:
-        is_gray = image.mode in _GRAY
-        return int((np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))).max())
-    except Exception:  # as in `read_header`
-        return 0
 
 
 def _color_values(content: np.ndarray) -> np.ndarray:

@@ -52,8 +52,8 @@ class Positives:
         if flat.dtype.kind not in "iu":
             raise InputError(f"positives: expected rows as whole numbers, got {flat.dtype}; from_matrix takes matrices")
         if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
-            raise InputError(f"positives: expected rows of a database of {num_database} images, got {flat.min()} to "
-                             f"{flat.max()}; check the ground truth")  # fmt: skip
+            got = f"{flat.min()} to {flat.max()}; check the ground truth"
+            raise InputError(f"positives: expected rows of a database of {num_database} images, got {got}")
         offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
         content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
         return cls._from_csr(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
@@ -105,8 +105,8 @@ class Positives:
         if not rows.size:
             return is_correct
         if rows.dtype.kind not in "iu" or rows.max() >= self.num_database:
-            raise InputError(f"rows: expected whole numbers below {self.num_database}, got {rows.dtype} up to "
-                             f"{rows.max()}; rank images of this database")  # fmt: skip
+            got = f"{rows.dtype} up to {rows.max()}; rank images of this database"
+            raise InputError(f"rows: expected whole numbers below {self.num_database}, got {got}")
         step = max(1, _AT_A_TIME * len(self) // (rows.size + len(self.rows)))
         for first in range(0, len(self), step):
             block, block_rows = self.take(slice(first, first + step)), rows[..., first : first + step, :]

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from mfvpr.datasets.ground_truth import FrameTruth, LabelTruth, RadiusTruth, Truth, require_positions
-from mfvpr.io.containers import choose_reader, reading, shorten
+from mfvpr.io.containers import choose_reader, read_npz, reading, shorten
 from mfvpr.io.names import require_all
-from mfvpr.io.npz import read_npz
 from mfvpr.utils.errors import InputError
 
-MAX_DIGITS = 20  # of a row number
 _LINES = "lines (with an empty cell if it has no place or label)"
 _reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets/README.md")
 
@@ -29,9 +27,20 @@ def truth_from_labels(
     A query with an empty label has no correct database image, and a database image with an empty label is never
     correct. Labels are compared as text, without spaces around them.
     """
-    labels = [_labels(Path(query_file), query_names), _labels(Path(database_file), database_names)]
-    numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*labels[0], *labels[1]} - {""}))}
-    return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in labels))
+    sides = []
+    for path, names in ((Path(query_file), query_names), (Path(database_file), database_names)):
+        with _reading(path):
+            lines = _csv_columns(path, choices=(("name", "label"),))
+        table, labels = _row_table(names), dict[int, str]()
+        for number, (name, label) in enumerate(lines, start=1):
+            row = table.get(name.strip())
+            if row is None or row in labels:
+                got = f"{shorten(name)!r} {'again' if row in labels else ', which none or several have'}"
+                raise InputError(f"{path}: entry {number}: expected the path of an image, each once, got {got}")
+            labels[row] = label.strip()
+        sides.append(require_all(path, names, [labels.get(row) for row in range(len(names))], _LINES))
+    numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*sides[0], *sides[1]} - {""}))}
+    return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in sides))
 
 
 def truth_from_file(
@@ -49,45 +58,28 @@ def truth_from_file(
     """
     path = Path(path)
     csv_pairs = partial(_csv_columns, choices=(("query", "database"), ("live", "reference")))
-    readers: dict[str, Callable[[Path], Any]] = {".csv": csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs}
     with _reading(path):
-        content = choose_reader(path, readers)(path)
-    if not isinstance(content, dict):
-        return _frame_truth(path, content, query_names, database_names, widened)
-    for (name, xy), images in zip(content.items(), (query_names, database_names), strict=True):
-        require_positions(f"{path}: {name}", xy, len(images))
-    return RadiusTruth(*content.values())
-
-
-def _frame_truth(
-    path: Path, pairs: Iterable[tuple[Any, Any]], queries: Sequence[str], database: Sequence[str], widened: bool
-) -> Truth:
-    query_rows, database_rows = _row_table(queries), _row_table(database)
+        content = choose_reader(path, {".csv": csv_pairs, ".npz": _npz_pairs, ".json": _json_pairs})(path)
+    if isinstance(content, dict):
+        for (name, xy), images in zip(content.items(), (query_names, database_names), strict=True):
+            require_positions(f"{path}: {name}", xy, len(images))
+        return RadiusTruth(*content.values())
+    sides = ("query", query_names, _row_table(query_names)), ("database", database_names, _row_table(database_names))
     rows: dict[int, list[int]] = {}
-    for line, (query, place) in enumerate(pairs, start=1):
-        row = _row(path, line, "query", query, query_rows, len(queries))
-        places = rows.setdefault(row, [])
-        if str(place).strip():
-            places.append(_row(path, line, "database", place, database_rows, len(database)))
-    places_by_query = require_all(path, queries, [rows.get(row) for row in range(len(queries))], _LINES)
-    return FrameTruth(tuple(map(tuple, places_by_query)), len(database), widened)
-
-
-def _labels(path: Path, names: Sequence[str]) -> list[str]:
-    table = _row_table(names)
-    labels: dict[int, str] = {}
-    with _reading(path):
-        lines = _csv_columns(path, choices=(("name", "label"),))
-    for number, (name, label) in enumerate(lines, start=1):
-        row = table.get(name.strip())
-        if row is None:
-            several = any(PurePosixPath(image).name == name.strip() for image in names)
-            mend = "several images have this name, give their paths" if several else "no image has this name, remove it"
-            raise InputError(f"{path}: entry {number}: got {shorten(name)!r}; {mend}")
-        if row in labels:
-            raise InputError(f"{path}: entry {number}: {shorten(name)!r} has a label already; keep one of them")
-        labels[row] = label.strip()
-    return require_all(path, names, [labels.get(row) for row in range(len(names))], _LINES)
+    for line, pair in enumerate(content, start=1):
+        places: list[int] = []
+        for (side, names, table), value in zip(sides, pair, strict=True):
+            text = str(value).strip()
+            text = text.lstrip("0") or "0" if text.isdecimal() else text
+            if side == "database" and not text:
+                continue
+            if text not in table:
+                expected = f"the name of a {side} image or a number from 0 to {len(names) - 1}"
+                raise InputError(f"{path}: pair {line}: expected {expected}, got {shorten(text)!r}")
+            places.append(table[text])
+        rows.setdefault(places[0], []).extend(places[1:])
+    found = require_all(path, query_names, [rows.get(row) for row in range(len(query_names))], _LINES)
+    return FrameTruth(tuple(map(tuple, found)), len(database_names), widened)
 
 
 def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -109,40 +101,22 @@ def _npz_pairs(path: Path) -> list[tuple[Any, Any]] | dict[str, np.ndarray]:
     if {"utmQ", "utmDb"} <= arrays.keys():
         return {name: arrays[name].astype(np.float64) for name in ("utmQ", "utmDb")}
     if {"query", "database"} <= arrays.keys():
-        query, database = arrays["query"], arrays["database"]
-        if query.shape != database.shape or query.ndim != 1:
-            shapes = f"{query.shape} and {database.shape}"
-            raise InputError(f"{path}: expected query and database of one length, got {shapes}")
-        return list(zip(query.tolist(), database.tolist(), strict=True))
-    raise InputError(
-        f"{path}: expected arrays query and database, or utmQ and utmDb; got {shorten(', '.join(arrays)) or 'neither'}"
-    )
+        return list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
+    got = shorten(", ".join(arrays)) or "neither"
+    raise InputError(f"{path}: expected arrays query and database, or utmQ and utmDb; got {got}")
 
 
 def _json_pairs(path: Path) -> list[tuple[Any, Any]]:
     entries = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(entries, list) or not all(
-        isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in entries
-    ):
+    if not all(isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in entries):
         raise InputError(f"{path}: expected [[query, [database, ...]], ...] as in VPR-Bench")
     return [(query, place) for query, places in entries for place in (places or [""])]
 
 
 def _row_table(names: Sequence[str]) -> dict[str, int]:
-    """Rows by relative path, and by unique file names."""
+    """Rows by number, by unique file names, and by relative path, which counts first."""
     bases = [PurePosixPath(name).name for name in names]
     counts = Counter(bases)
-    table = {base: row for row, base in enumerate(bases) if counts[base] == 1}
+    table = {str(row): row for row in range(len(names))}
+    table |= {base: row for row, base in enumerate(bases) if counts[base] == 1}
     return table | {name: row for row, name in enumerate(names)}
-
-
-def _row(path: Path, line: int, side: str, value: Any, table: dict[str, int], count: int) -> int:
-    text = str(value).strip()
-    if text in table:
-        return table[text]
-    if text.isascii() and text.isdigit() and len(text) < MAX_DIGITS and int(text) < count:
-        return int(text)
-    raise InputError(
-        f"{path}: pair {line}: expected the name of a {side} image or a number from 0 to {count - 1}, got "
-        f"{shorten(text)!r}"
-    )

@@ -1,7 +1,7 @@
 """Read, check and write features, global descriptors and shortlists of other programs.
 
 Read first: features and descriptors (the formats), names (matches entries of a file to images), then the readers:
-npz, h5, and formats/ (matches, and MATLAB files and pickles, read as data).
+containers (arrays by image), and formats/ (matches, and MATLAB files and pickles, read as data).
 """
 
 import lazy_loader

@@ -20,5 +20,4 @@ from .descriptors import read_global_descriptors, write_global_descriptors
 from .features import ImportedFeatures, open_features, write_features
 from .matches import Images, ImportedMatches, open_matches
 from .shortlists import read_shortlist, reranked_shortlist, write_shortlist
-from .stamps import read_stamps, stamps_in_names
-from .trajectories import read_poses, write_trajectory
+from .trajectories import read_poses, read_stamps, stamps_in_names, write_trajectory

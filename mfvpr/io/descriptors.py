@@ -8,10 +8,8 @@ from jaxtyping import Float, Float32
 
 from mfvpr.core.types import Array
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
-from mfvpr.io.containers import FileEntry, choose_reader, reading, shorten
-from mfvpr.io.h5 import H5File, write_h5
+from mfvpr.io.containers import FileEntry, H5File, choose_reader, read_npz, reading, shorten, write_h5, write_npz
 from mfvpr.io.names import match_names, require_all, require_different
-from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -47,8 +45,31 @@ def read_with_entries(
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_word("lengths", lengths, Lengths)
-    readers = {".npy": _from_npy, ".npz": _from_npz, ".h5": _from_h5, ".hdf5": _from_h5}
-    entries, values = choose_reader(path, readers)(path, names)
+    kind = choose_reader(path, {".npy": np.load, ".npz": read_npz, ".h5": H5File, ".hdf5": H5File})
+    if kind is H5File:
+        values, entries = _read_h5(H5File(path), names)
+    else:
+        if kind is np.load:
+            with reading(path):
+                arrays = {"descriptors": np.load(path, allow_pickle=False)}
+        else:
+            arrays = read_npz(path, ("descriptors", "names"))
+        if "descriptors" not in arrays:
+            raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
+        values, file_names = arrays["descriptors"], arrays.get("names")
+        if file_names is None:
+            _require_rows(path, values, names)
+            rows = np.argsort(_sorted_rows(names)).tolist()
+            entries = [f"row {row}" for row in rows]
+        else:
+            if file_names.dtype.kind != "U" or file_names.shape != values.shape[:1]:
+                got = f"{file_names.dtype}{list(file_names.shape)} and {list(values.shape)}"
+                raise InputError(f"{path}: expected names as text [M] and descriptors [M, D], got {got}")
+            require_different(path, file_names.tolist())
+            places = {name: row for row, name in enumerate(file_names.tolist())}
+            entries = require_all(path, names, match_names(path, names, places), "descriptors")
+            rows = [places[entry] for entry in entries]
+        values = values[rows]
     _require_rows(path, values, names)
     values = with_length(str(path), as_float32(str(path), values), lengths)
     return values, [FileEntry(path, entry) for entry in entries]
@@ -82,52 +103,20 @@ def write_global_descriptors(
         raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5")
 
 
-Rows = tuple[list[str], np.ndarray]  # entries [M] of the images and their descriptors [M, D]
-
-
-def _from_npy(path: Path, names: Sequence[str]) -> Rows:
-    with reading(path):
-        return _from_name_order(path, names, np.load(path, allow_pickle=False))
-
-
-def _from_npz(path: Path, names: Sequence[str]) -> Rows:
-    arrays = read_npz(path, ("descriptors", "names"))
-    if "descriptors" not in arrays:
-        raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
-    descriptors, file_names = arrays["descriptors"], arrays.get("names")
-    if file_names is None:
-        return _from_name_order(path, names, descriptors)
-    if file_names.dtype.kind != "U" or file_names.shape != descriptors.shape[:1]:
-        got = f"{file_names.dtype}{list(file_names.shape)} and {list(descriptors.shape)}"
-        raise InputError(f"{path}: expected names as text [M] and descriptors [M, D], got {got}")
-    rows = {name: row for row, name in enumerate(file_names.tolist())}
-    if len(rows) < len(file_names):
-        raise InputError(f"{path}: expected different names, got {len(file_names) - len(rows)} again; keep one of each")
-    images = require_all(path, names, match_names(path, names, rows), "descriptors")
-    return images, descriptors[[rows[image] for image in images]]
-
-
-def _from_h5(path: Path, names: Sequence[str]) -> Rows:
-    file = H5File(path)
-    images = require_all(path, names, match_names(path, names, file.images), "descriptors")
+def _read_h5(file: H5File, names: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    images = require_all(file.path, names, match_names(file.path, names, file.images), "descriptors")
     rows = []
     for image, parts in zip(images, file.arrays(images, (PART,)), strict=True):
         if PART not in parts or parts[PART].shape != (rows[0] if rows else parts[PART].reshape(-1)).shape:
             got = list(parts[PART].shape) if PART in parts else "none"
-            raise InputError(f"{path}: {shorten(image)}: expected {PART} [D], the same D for all, got {got}")
+            raise InputError(f"{file.path}: {shorten(image)}: expected {PART} [D], the same D for all, got {got}")
         rows.append(parts[PART])
-    return images, np.stack(rows) if rows else np.zeros((0, 0), np.float32)
+    return np.stack(rows) if rows else np.zeros((0, 0), np.float32), images
 
 
 def _require_rows(path: Path, descriptors: np.ndarray, names: Sequence[str]) -> None:
     if descriptors.ndim != 2 or len(descriptors) != len(names) or not descriptors.shape[1]:
         raise InputError(f"{path}: expected descriptors [{len(names)}, D] of the images, got {list(descriptors.shape)}")
-
-
-def _from_name_order(path: Path, names: Sequence[str], descriptors: np.ndarray) -> Rows:
-    _require_rows(path, descriptors, names)
-    rows = np.argsort(_sorted_rows(names))
-    return [f"row {row}" for row in rows.tolist()], descriptors[rows]
 
 
 def _sorted_rows(names: Sequence[str]) -> np.ndarray:

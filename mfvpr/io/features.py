@@ -27,10 +27,19 @@ from jaxtyping import Float32, Int32
 
 from mfvpr.core.types import Features
 from mfvpr.io.checks import Lengths, as_float32, convert_floats, with_length
-from mfvpr.io.containers import Container, FileEntry, Shapes, choose_reader, shorten
-from mfvpr.io.h5 import H5File, write_h5
+from mfvpr.io.containers import (
+    Container,
+    FileEntry,
+    H5File,
+    NpzFile,
+    NpzFolder,
+    Shapes,
+    choose_reader,
+    shorten,
+    write_h5,
+    write_npz,
+)
 from mfvpr.io.names import match_paths, require_all, require_different
-from mfvpr.io.npz import NpzFile, NpzFolder, write_npz
 from mfvpr.utils.errors import InputError, require_word
 
 SCORES = ("scores", "keypoint_scores")
@@ -84,13 +93,11 @@ class ImportedFeatures:
             yield row, self._features(row, f"{self.path}: {shorten(images[row])}", parts)
 
     def _features(self, row: int, where: str, parts: Mapping[str, np.ndarray]) -> Features:
-        count = int(self.counts[row])
-        _require_parts(where, parts)
+        count, score = int(self.counts[row]), _score_part(parts)
         keypoints = as_float32(f"{where}: keypoints", parts["keypoints"], "fiu")[:, :2]
         descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
         descriptors = descriptors.T if self._transposed else descriptors
-        part = _score_part(parts)
-        scores = as_float32(f"{where}: {part}", parts[part]).reshape(-1) if part else np.zeros(count, np.float32)
+        scores = as_float32(f"{where}: {score}", parts[score]).reshape(-1) if score else np.zeros(count, np.float32)
         if not count and not descriptors.size:  # [D, 0], [0, D] or [0]
             descriptors = np.zeros((0, self.dimension), np.float32)
         if not len(keypoints) == len(scores) == count or descriptors.shape != (count, self.dimension):
@@ -99,7 +106,11 @@ class ImportedFeatures:
                 f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; has the file changed since it was "
                 "opened?"
             )
-        size = _image_size(where, parts.get("image_size"), None if self._sizes is None else self._sizes[row])
+        given = None if self._sizes is None else self._sizes[row]
+        size = as_float32(f"{where}: image_size", np.asarray(parts.get("image_size", given)), "fiu").reshape(-1)
+        if size.shape != (2,) or not (size > 0).all() or (given is not None and (size != given).any()):
+            expected = "(width, height) in pixels" if given is None else f"{given.tolist()} as it was given"
+            raise InputError(f"{where}: image_size: expected {expected}, got {size.tolist()}")
         require_inside(where, keypoints, size)
         return Features(
             keypoints=np.ascontiguousarray(keypoints),
@@ -136,9 +147,13 @@ def open_features(
         InputError: the file is missing, damaged or has another format; images are missing or ambiguous; arrays do not
             fit each other.
     """
-    path = Path(path)
+    path, sizes = Path(path), None
     require_word("lengths", lengths, Lengths)
-    sizes = None if image_size is None else _explicit_sizes(image_size, len(names))
+    if image_size is not None:
+        sizes = np.asarray(image_size, np.float32)
+        if sizes.shape not in ((2,), (len(names), 2)) or not (np.isfinite(sizes) & (sizes > 0)).all():
+            raise InputError(f"image_size: expected (width, height) in pixels, or [M, 2] of them, got {image_size}")
+        sizes = np.broadcast_to(sizes, (len(names), 2))
     readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFile}
     container: Container = NpzFolder(path) if path.is_dir() else choose_reader(path, readers)(path)
     images = match_paths(path, names, paths, container.images)
@@ -147,8 +162,16 @@ def open_features(
     rows = {image: row for row, image in enumerate(images) if image is not None}
     shapes = dict(zip(rows, container.shapes(rows, ("keypoints", "descriptors")), strict=True))
     counts = np.full(len(names), -1, np.int32)
-    for image, row in rows.items():
-        counts[row] = _count(f"{path}: {shorten(image)}", shapes[image], needs_size=sizes is None)
+    for image, parts in shapes.items():
+        where = f"{path}: {shorten(image)}"
+        required = ("keypoints", "descriptors") if sizes is not None else ("keypoints", "descriptors", "image_size")
+        if missing := [part for part in required if part not in parts]:
+            mend = "; give it as image_size=" if missing == ["image_size"] else ""
+            raise InputError(f"{where}: expected {', '.join(required)}, got no {' and no '.join(missing)}{mend}")
+        shape = parts["keypoints"]
+        if len(shape) != 2 or not 2 <= shape[1] <= 4:
+            raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
+        counts[rows[image]] = shape[0]
     transposed, dimension = _layout(path, shapes, container.transposed)
     without = [image for image, parts in shapes.items() if _score_part(parts) is None]
     if without and len(without) < len(shapes):  # a missing score would become 1
@@ -199,71 +222,33 @@ def write_features(
             write_npz(path / f"{name}.npz", arrays.items())
 
 
-def _require_parts(where: str, parts: Collection[str]) -> None:
-    if missing := [part for part in ("keypoints", "descriptors") if part not in parts]:
-        raise InputError(f"{where}: expected keypoints and descriptors, got no {' and no '.join(missing)}")
-
-
-def _count(where: str, shapes: Shapes, *, needs_size: bool) -> int:
-    """Number of an image's keypoints."""
-    _require_parts(where, shapes)
-    shape = shapes["keypoints"]
-    if len(shape) != 2 or not 2 <= shape[1] <= 4 or shape[0] > np.iinfo(np.int32).max:
-        raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
-    if needs_size and "image_size" not in shapes:
-        raise InputError(f"{where}: expected image_size (width, height) in the file, got none; give it as image_size=")
-    return shape[0]
-
-
 def _layout(path: Path, shapes: Mapping[str, Shapes], default: bool) -> tuple[bool, int]:
     """Whether descriptors are `[D, N]`, and D, both the same for all images.
 
     An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
     """
-    is_transposed: dict[bool, str] = {}  # an image of each layout
+    layouts: set[bool] = set()
     dimensions: set[int] = set()
     for image, parts in shapes.items():
         count, shape = parts["keypoints"][0], parts["descriptors"]
-        if count and (len(shape) != 2 or count not in shape):
+        if not count:
+            continue
+        if len(shape) != 2 or count not in shape:
             expected = f"[{count}, D] or [D, {count}] like the keypoints"
             raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
-        if count and shape[0] != shape[1]:
-            is_transposed.setdefault(shape[1] == count, image)
-        if count:
-            dimensions.add(shape[0] if shape[1] == count else shape[1])
-    if len(is_transposed) == 2 or len(dimensions) > 1:
+        dimensions.add(shape[0] if shape[1] == count else shape[1])
+        if shape[0] != shape[1]:
+            layouts.add(shape[1] == count)
+    if len(layouts) > 1 or len(dimensions) > 1:
         raise InputError(
             f"{path}: expected descriptors of one layout, [D, N] or [N, D], and of one length for all images, got "
             f"lengths {sorted(dimensions)}"
         )
-    return next(iter(is_transposed), default), next(iter(dimensions), 0)
+    return next(iter(layouts), default), next(iter(dimensions), 0)
 
 
 def _score_part(parts: Collection[str]) -> str | None:
     return next((part for part in SCORES if part in parts), None)
-
-
-def _explicit_sizes(image_size: Any, count: int) -> Float32[np.ndarray, "images 2"]:
-    sizes = np.asarray(image_size, np.float32)
-    if sizes.shape not in ((2,), (count, 2)) or not (np.isfinite(sizes) & (sizes > 0)).all():
-        got = f"shape {list(sizes.shape)} or sizes that are not positive"
-        raise InputError(f"image_size: expected (width, height) in pixels, or [{count}, 2] of them, got {got}")
-    return np.broadcast_to(sizes, (count, 2))
-
-
-def _image_size(
-    where: str, stored_size: np.ndarray | None, explicit_size: Float32[np.ndarray, "2"] | None
-) -> Float32[np.ndarray, "2"]:
-    """Size in the file, or the one that the caller states."""
-    if stored_size is None and explicit_size is not None:
-        return explicit_size.copy()
-    size = as_float32(f"{where}: image_size", np.asarray(stored_size), "fiu").reshape(-1)
-    if size.shape != (2,) or not (size > 0).all():
-        raise InputError(f"{where}: image_size: expected (width, height) in pixels, got {size.tolist()}")
-    if explicit_size is not None and (size != explicit_size).any():
-        expected = explicit_size.tolist()
-        raise InputError(f"{where}: expected the image_size that was given, {expected}, got {size.tolist()}")
-    return size
 
 
 def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:

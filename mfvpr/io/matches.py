@@ -11,21 +11,26 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Float32, Num
 
 from mfvpr.core.types import Features, Matches, Shortlist
 from mfvpr.io.checks import as_float32
 from mfvpr.io.containers import FileEntry, choose_reader, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
-from mfvpr.io.formats.colmap import ColmapPairs
-from mfvpr.io.formats.hloc import HlocPairs
-from mfvpr.io.formats.kapture import KapturePairs
-from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
-from mfvpr.io.formats.predictions import PredictionPairs
-from mfvpr.io.formats.result_files import ResultFiles
-from mfvpr.io.names import ImageOfEntry, match_paths, require_one_image
-from mfvpr.io.plain_matches import numbered_matches, point_matches
+from mfvpr.io.formats.pair_files import (
+    ColmapPairs,
+    FileMatches,
+    HlocPairs,
+    KapturePairs,
+    Pair,
+    PairReader,
+    Size,
+)
+from mfvpr.io.formats.result_files import PredictionPairs, ResultFiles
+from mfvpr.io.names import match_paths, require_one_image
 from mfvpr.utils.errors import InputError
+
+_ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
 
 
 class Images(NamedTuple):
@@ -61,7 +66,20 @@ class ImportedMatches:
         self._image_size, self._use_confidences = image_size, confidences
         self._has_confidences: bool | None = None  # whether the first pair that was read has confidences
         self.numbered = reader.by_number
-        self.names = _names(reader, sides)
+        names, known = [], {}
+        for side, word in zip(sides, ("queries", "database images"), strict=True):
+            paths = [] if side.has_prefix else [*map(reader.spelling, side.paths)]
+            matched = match_paths(reader.path, [*map(reader.spelling, side.names)], paths, reader.images)
+            if not reader.sided and side.paths:
+                entries = [None if name is None else FileEntry(reader.path, name) for name in matched]
+                require_one_image(reader.path, [*map(Path, side.paths)], entries, known)
+            if not any(matched):
+                raise InputError(
+                    f"{reader.path}: expected matches of the {len(matched)} {word}, got none of their names, such as "
+                    f"{shorten(next(iter(reader.images), 'none'))}; give the prefix of their folder"
+                )
+            names.append(matched)
+        self.names: tuple[list[str | None], list[str | None]] = (names[0], names[1])
 
     def contains(self, query: int, candidate: int) -> bool:
         """Whether the file has matches of a pair, in either order; they may be none."""
@@ -109,10 +127,7 @@ class ImportedMatches:
         first = f"{shorten(self._sides[0].names[query])} and {shorten(self._sides[1].names[row])}"
         count = f"{len(missing)} of {len(pairs)} pairs of the shortlist"
         if len(missing) == len(pairs):
-            raise InputError(
-                f"{self.path}: expected matches of the {len(pairs)} pairs of the shortlist, got none; the first is "
-                f"{first}; match these pairs, or check the prefixes"
-            )
+            raise InputError(f"{self.path}: expected matches of {count}, got none; the first is {first}")
         return [f"{self.path}: no matches of {count}, the first {first}; they score 0"]
 
     def _features(self, side: int, rows: list[int]) -> dict[tuple[int, int], Features]:
@@ -136,25 +151,20 @@ class ImportedMatches:
             return None
         has_confidence = raw.confidence is not None
         if self._has_confidences not in (None, has_confidence):
-            raise InputError(
-                f"{where}: expected confidences of all pairs or of none, unlike the first pair; ignore them with "
-                "confidences=False"
-            )
+            raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
         self._has_confidences = has_confidence
         return raw.confidence
 
     def _size(self, side: int, row: int, stored: Size | None) -> Size:
         """Size of the image that points are in; an InputError if nobody knows it."""
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
-            expected = list(self._image_size)
-            raise InputError(f"{self.path}: expected the image_size that was given, {expected}, got {list(stored)}")
+            given = list(self._image_size)
+            raise InputError(f"{self.path}: expected the image_size that was given, {given}, got {list(stored)}")
         size_of = self._sides[side].size if self._reader.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
         if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):
-            raise InputError(
-                f"{self.path}: expected the size of an image, width and height in px, got {size and list(size)}; set "
-                "image_size=[W,H]"
-            )
+            got = f"{size and list(size)}; set image_size=[W,H]"
+            raise InputError(f"{self.path}: expected the size of an image, width and height in px, got {got}")
         return size
 
 
@@ -213,26 +223,85 @@ def _open(path: Path, queries: Images, database: Images, verified: bool) -> Pair
     return reader(path)
 
 
-def _names(reader: PairReader, sides: tuple[Images, Images]) -> tuple[list[str | None], list[str | None]]:
-    """Names in the file of the images of each side."""
-    names = tuple(
-        match_paths(
-            reader.path,
-            [*map(reader.spelling, side.names)],
-            [] if side.has_prefix else [*map(reader.spelling, side.paths)],
-            reader.images,
-        )
-        for side in sides
+def numbered_matches(
+    where: str, first: Any, second: Any, confidence: Any, features0: Features, features1: Features
+) -> Matches:
+    """Matches `[M]` from numbers of keypoints.
+
+    Args:
+        where: the pair, for messages.
+        first: numbers `[M]` of keypoints of `features0`; `second` of `features1`.
+        confidence: `[M]` from 0 to 1; None = 1.
+        features0: of the query, without padding; distances are 0 without descriptors.
+        features1: of the candidate.
+    """
+    numbers = []
+    for values, features in ((first, features0), (second, features1)):
+        values = np.asarray(values) if np.size(values) else np.zeros(0, np.int32)
+        if values.ndim != 1 or values.dtype.kind not in "iu":
+            raise InputError(f"{where}: expected numbers of keypoints [M], got {values.dtype}{list(values.shape)}")
+        if values.size and not 0 <= values.min() <= values.max() < len(features.mask):
+            got = f"{values.min()} to {values.max()}; give the features that were matched"
+            raise InputError(f"{where}: expected numbers of {len(features.mask)} keypoints, got {got}")
+        numbers.append(values.astype(np.int32))
+    number0, number1 = numbers
+    if len(number0) != len(number1):
+        raise InputError(f"{where}: expected pairs of keypoints, got {len(number0)} and {len(number1)} numbers")
+    dimensions = [np.shape(features.descriptors)[1] for features in (features0, features1)]
+    if dimensions[0] != dimensions[1]:
+        got = f"{dimensions[0]} and {dimensions[1]}; give the features that were matched"
+        raise InputError(f"{where}: expected descriptors of one length, got {got}")
+    differences = np.asarray(features0.descriptors)[number0] - np.asarray(features1.descriptors)[number1]
+    return Matches(
+        points0=features0.keypoints[number0],
+        points1=features1.keypoints[number1],
+        distance=np.linalg.norm(differences, axis=1).astype(np.float32),
+        scores0=features0.scores[number0],
+        scores1=features1.scores[number1],
+        mask=np.ones(len(number0), bool),
+        image_size0=features0.image_size,
+        image_size1=features1.image_size,
+        confidence=_confidences(where, confidence, len(number0)),
+        index0=number0,
+        index1=number1,
+        count0=np.int32(len(features0.mask)),
+        count1=np.int32(len(features1.mask)),
     )
-    images: ImageOfEntry = {}
-    for side, each in zip(sides, names, strict=True):
-        entries = [None if name is None else FileEntry(reader.path, name) for name in each]
-        if not reader.sided and side.paths:
-            require_one_image(reader.path, [*map(Path, side.paths)], entries, images)
-    for side, each in zip(("queries", "database images"), names, strict=True):
-        if not any(each):
-            raise InputError(
-                f"{reader.path}: expected matches of the {len(each)} {side}, got none of their names, such as "
-                f"{shorten(next(iter(reader.images), 'none'))}; give the prefix of their folder"
-            )
-    return names[0], names[1]
+
+
+def point_matches(where: str, first: Any, second: Any, confidence: Any, size0: Size, size1: Size) -> Matches:
+    """Matches `[M]` from points `[M, 2]` (x, y) in images of these sizes, px; their distances are 0, their scores 1."""
+    points, sizes = [], [np.array(size, np.float32) for size in (size0, size1)]
+    for values, size in zip((first, second), sizes, strict=True):
+        values = as_float32(f"{where}: points", np.asarray(values), "fiu")
+        values = values if values.size else np.zeros((0, 2), np.float32)
+        if values.ndim != 2 or values.shape[1] != 2:
+            raise InputError(f"{where}: expected points (x, y) [M, 2], got {list(values.shape)}")
+        require_inside(where, values, size)
+        points.append(values)
+    if len(points[0]) != len(points[1]):
+        raise InputError(f"{where}: expected as many points in both images, got {len(points[0])} and {len(points[1])}")
+    ones = np.ones(len(points[0]), np.float32)
+    return Matches(
+        points0=points[0],
+        points1=points[1],
+        distance=np.zeros_like(ones),
+        scores0=ones,
+        scores1=ones,
+        mask=ones > 0,
+        image_size0=sizes[0],
+        image_size1=sizes[1],
+        confidence=_confidences(where, confidence, len(ones)),
+    )
+
+
+def _confidences(where: str, confidence: Any, count: int) -> Float32[np.ndarray, " matches"]:
+    if confidence is None:
+        return np.ones(count, np.float32)
+    values = as_float32(f"{where}: confidences", np.asarray(confidence), "fiu")
+    if values.shape != (count,):
+        raise InputError(f"{where}: expected {count} confidences, got {list(values.shape)}")
+    if count and not -_ROUNDING <= values.min() <= values.max() <= 1 + _ROUNDING:
+        got = f"{values.min():g} to {values.max():g}; scale them, or leave them out (confidences=False for files)"
+        raise InputError(f"{where}: expected confidences from 0 to 1, got {got}")
+    return np.clip(values, 0, 1)

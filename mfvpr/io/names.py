@@ -1,6 +1,5 @@
 """Match the names in a file of another program to the images of a data set."""
 
-import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
@@ -11,8 +10,9 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 
 Entry = TypeVar("Entry")
-Prefix = tuple[tuple[str, ...], tuple[str, ...]]  # folders only in the file's names, only in the images' names
-ImageOfEntry = dict[tuple[int, int, str], Path]  # device, inode and name of an entry -> image
+Parts = tuple[str, ...]
+Prefix = tuple[Parts, Parts]  # folders only in the file's names, only in the images' names
+ImageOfEntry = dict[tuple[Path, str], Path]  # file and name of an entry -> image
 _NO_PREFIX: Prefix = ((), ())
 _FULL_NAMES = "give names with their folders as the file has them"
 
@@ -39,17 +39,32 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     foreign = dict.fromkeys(foreign)
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
+    prefix = _NO_PREFIX if any(matched) else None
     for spellings in (lambda name: [name], _stems):
-        by_file = defaultdict(list)  # free names, and each as it may be spelled, by the last part of the path
+        spelled = defaultdict(list)  # free names by the last part of each of their spellings
         for name in foreign.keys() - set(matched):
             for spelling in spellings(printable(name)):
-                by_file[PurePosixPath(spelling).name].append((name, _parts(spelling)))
-        candidates = {}
+                spelled[PurePosixPath(spelling).name].append((name, spelling))
+        found: dict[Prefix, list[tuple[int, str]]] = defaultdict(list)  # rows and names
         for row in (row for row, match in enumerate(matched) if match is None):
-            spelling = spellings(printable(names[row]))[0]
-            named_alike = by_file[PurePosixPath(spelling).name]
-            candidates[row] = {name for name, parts in named_alike if _has_same_end(parts, _parts(spelling))}
-        _choose(path, names, candidates, matched)
+            ours = spellings(printable(names[row]))[0]
+            for name, theirs in spelled[PurePosixPath(ours).name]:
+                if (each := _prefix(ours, theirs)) is not None and prefix in (None, each):
+                    found[each].append((row, name))
+        pairs = [pair for each in found.values() for pair in dict.fromkeys(each)]
+        for position in (0, 1):
+            counts = Counter(pair[position] for pair in pairs)
+            several = [pair for pair in sorted(pairs) if counts[pair[position]] > 1]
+            if several:
+                got = " and ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in several[:2])
+                raise InputError(f"{path}: expected one name for each image, got {got}; {_FULL_NAMES}")
+        if len(found) > 1:
+            firsts = [each[0] for each in found.values()][:2]
+            got = " but ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in firsts)
+            raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {got}; give it")
+        for row, name in pairs:
+            matched[row] = name
+        prefix = next(iter(found), prefix)
     return matched
 
 
@@ -87,66 +102,30 @@ def require_one_image(
     `images` and `entries` `[M]` are of a folder; None = the file lacks the image. They are added to `known`, the images
     of the entries of earlier folders.
     """
+    resolved = {entry.file: entry.file.resolve() for entry in entries if entry is not None}
     for image, entry in zip(images, entries, strict=True):
         if entry is None:
             continue
-        status = entry.file.stat()  # identifies the file, which may have several paths
-        other = known.setdefault((status.st_dev, status.st_ino, entry.name), image)
-        if other != image and os.path.realpath(other) != os.path.realpath(image):
+        other = known.setdefault((resolved[entry.file], entry.name), image)
+        if other != image and other.resolve() != image.resolve():
             name = shorten(entry.name or entry.file.name)
-            first, second = (shorten(str(file), 300) for file in (other, image))
             raise InputError(
-                f"{path}: expected one image for each entry, got {name} for {first} and for {second}; {_FULL_NAMES}, "
-                "or a file for each folder"
+                f"{path}: expected one image for each entry, got {name} for {shorten(str(other), 300)} and for "
+                f"{shorten(str(image), 300)}; {_FULL_NAMES}, or a file for each folder"
             )
 
 
 def adds_folders(name: str, match: str) -> bool:
     """Whether the name in a file has folders before the part that it shares with the image's name."""
-    return bool(_prefix(name, match)[0])
+    return len(_parts(match)) > len(_parts(name))
 
 
-def _choose(path: Path, names: Sequence[str], candidates: dict[int, set[str]], matched: list[str | None]) -> None:
-    """Fill `matched` for pairs of an image and a foreign name that have no other candidates.
-
-    Candidates have the prefix of earlier matches, or none: a name at the image's own path contradicts an earlier prefix
-    and is an error.
-    """
-    examples: dict[Prefix, tuple[str, str]] = {}  # an image and its name in the file
-    for name, match in zip(names, matched, strict=True):
-        if match is not None:
-            examples.setdefault(_prefix(name, match), (name, match))
-    prefixes = {*examples, _NO_PREFIX}
-    if examples:
-        candidates = {
-            row: {match for match in matches if _prefix(names[row], match) in prefixes}
-            for row, matches in candidates.items()
-        }
-    num_images = Counter(name for row_candidates in candidates.values() for name in row_candidates)
-    for row, row_candidates in candidates.items():
-        if not row_candidates:
-            continue
-        if len(row_candidates) > 1 or num_images[next(iter(row_candidates))] > 1:
-            several = " and ".join(shorten(name) for name in sorted(row_candidates)[:2])
-            raise InputError(
-                f"{path}: {shorten(names[row])}: expected its relative path in the file, got {several}, which may mean "
-                f"other images as well; {_FULL_NAMES}"
-            )
-        matched[row] = match = next(iter(row_candidates))
-        examples.setdefault(_prefix(names[row], match), (names[row], match))
-    if len(examples) > 1:
-        pairs = " but ".join(f"{shorten(match)} for {shorten(name)}" for name, match in [*examples.values()][:2])
-        raise InputError(
-            f"{path}: expected names with one prefix for all images of a folder, got {pairs}; give the prefix of the "
-            "folder, or name the images by their relative paths"
-        )
-
-
-def _prefix(name: str, match: str) -> Prefix:
-    """Folders before the shared end of both names."""
-    ours, theirs = (tuple(_parts(text)) for text in (name, match))
+def _prefix(name: str, match: str) -> Prefix | None:
+    """Folders before the shared end of both names; None unless one of two paths is the end of the other."""
+    ours, theirs = _parts(name), _parts(match)
     shared = min(len(ours), len(theirs))
-    return theirs[: len(theirs) - shared], ours[: len(ours) - shared]
+    prefix = theirs[: len(theirs) - shared], ours[: len(ours) - shared]
+    return prefix if theirs[len(prefix[0]) :] == ours[len(prefix[1]) :] else None
 
 
 def _stems(name: str) -> list[str]:
@@ -155,11 +134,5 @@ def _stems(name: str) -> list[str]:
     return [path.with_suffix("").as_posix(), name] if path.suffix.lower() in IMAGE_SUFFIXES else [name]
 
 
-def _has_same_end(first: Sequence[str], second: Sequence[str]) -> bool:
-    """Whether one of two paths is the end of the other."""
-    shared = min(len(first), len(second))
-    return first[len(first) - shared :] == second[len(second) - shared :]
-
-
-def _parts(name: str) -> list[str]:
-    return [part for part in name.split("/") if part not in ("", ".")]
+def _parts(name: str) -> Parts:
+    return tuple(part for part in name.split("/") if part not in ("", "."))

@@ -12,16 +12,13 @@ import numpy as np
 
 from mfvpr.core.types import Ranking, Shortlist
 from mfvpr.io.checks import parse_number
-from mfvpr.io.containers import FileEntry, reading, shorten
-from mfvpr.io.formats.predictions import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
+from mfvpr.io.containers import FileEntry, read_npz, reading, shorten, write_npz
+from mfvpr.io.formats.result_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.io.names import adds_folders, match_names, require_different
-from mfvpr.io.npz import read_npz, write_npz
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import printable, require_file, require_replaceable, write_text
+from mfvpr.utils.files import printable, require_replaceable, write_text
 
 PairLayout = Literal["hloc", "kapture", "preds"]
-Candidates = dict[int, float | None]  # database rows and scores of one query, best first
-Scored = tuple[int, int, float | None]  # rows of a query and a database image, and their score
 _SEPARATORS = {"hloc": " \t\n\r", "kapture": ",\n\r", "preds": "\n\r"}  # characters that names must not contain
 
 
@@ -67,8 +64,6 @@ def read_with_entries(
     Only names with additional folders are entries: a file name alone may mean a query and a database image.
     """
     path = Path(path)
-    if not path.is_dir():
-        require_file(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
     queries, database = {}, {}
@@ -79,12 +74,23 @@ def read_with_entries(
         queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
         database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
-    candidates: list[Candidates] = [{} for _ in query_names]
+    candidates: list[dict[int, float | None]] = [{} for _ in query_names]  # database rows and scores, best first
     for query, row, score in pairs:
         candidates[query].setdefault(row, score)  # of several scores, the first counts
     if not any(candidates):
         raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
-    shortlist = _shortlist(path, candidates, query_names, num_candidates)
+    if len(has_score := {score is not None for rows in candidates for score in rows.values()}) == 2:
+        raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
+    depth = num_candidates or max(map(len, candidates))
+    indices = np.full((len(candidates), depth), -1, np.int32)
+    scores = np.zeros((len(candidates), depth), np.float32)
+    for query, rows in enumerate(candidates):
+        count = min(len(rows), depth)
+        indices[query, :count] = list(rows)[:count]
+        scores[query, :count] = np.arange(depth, depth - count, -1)
+        if has_score == {True}:
+            scores[query, :count] = _descending(f"{path}: {shorten(query_names[query])}", [*rows.values()])[:count]
+    shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
     return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
 
 
@@ -153,7 +159,7 @@ def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
     return Shortlist(indices=np.where(mask, indices, -1), scores=np.where(mask, scores, 0), mask=mask)
 
 
-def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Scored]:
+def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[tuple[int, int, float | None]]:
     arrays = read_npz(path, ("predictions", "scores"))
     predictions, scores = arrays.get("predictions", np.zeros(0)), arrays.get("scores")
     if predictions.ndim != 2 or predictions.dtype.kind not in "iu" or len(predictions) != num_queries:
@@ -163,8 +169,7 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[Score
         got = f"{predictions.min()} to {predictions.max()}"
         raise InputError(f"{path}: expected database rows from 0 to {num_database - 1}, or -1 for none, got {got}")
     if scores is not None and (scores.shape != predictions.shape or scores.dtype.kind not in "fiu"):
-        got = f"{scores.dtype}{list(scores.shape)}"
-        raise InputError(f"{path}: expected scores {list(predictions.shape)} of numbers, got {got}")
+        raise InputError(f"{path}: expected scores as many as predictions, got {scores.dtype}{list(scores.shape)}")
     values = [[None] * predictions.shape[1]] * num_queries if scores is None else scores.tolist()
     for query, (rows, row_scores) in enumerate(zip(predictions.tolist(), values, strict=True)):
         yield from ((query, row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0)
@@ -185,7 +190,7 @@ def _read_pairs(path: Path) -> list[Pair]:
         except ValueError:  # another number of words, or no number
             raise InputError(
                 f"{path}: line {number}: expected 'query database', or 'query, database' and a score, got "
-                f"{shorten(line)!r}; names with spaces need commas between the columns, names with commas an .npz"
+                f"{shorten(line)!r}"
             ) from None
     return pairs
 
@@ -198,22 +203,12 @@ def _read_predictions(folder: Path) -> list[Pair]:
         if (other := files.setdefault(query, path)) != path:
             raise InputError(f"{path}: expected another query than in {other.name}; remove the files of older runs")
         results = path.with_suffix(".torch")
-        if not results.exists():
-            pairs += [Pair(query, database) for database in predictions]
-            continue
-        counts = read_num_inliers(results)
-        if not 0 < len(counts) <= len(predictions):
-            raise InputError(
-                f"{results}: expected results of at most {len(predictions)} predictions, as in the text file, got "
-                f"{len(counts)}; match the predictions of this run"
-            )
-        scored = zip(predictions, counts, strict=False)  # predictions that were not matched are no candidates
-        pairs += [
-            Pair(query, *each) for each in sorted(scored, key=lambda each: -each[1])
-        ]  # equal ones keep their order
+        counts = read_num_inliers(results, len(predictions)) if results.exists() else [None] * len(predictions)
+        scored = list(zip(predictions, counts, strict=False))  # predictions that were not matched are no candidates
+        scored.sort(key=lambda pair: -(pair[1] or 0))  # equal ones keep their order
+        pairs += [Pair(query, *each) for each in scored]
     if not files:
-        mend = "; copy the .torch files beside those of preds" if any(folder.glob("*.torch")) else ""
-        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none{mend}")
+        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
     return pairs
 
 
@@ -225,9 +220,8 @@ def _write_predictions(
     positives: Sequence[Sequence[int]] | None,
 ) -> None:
     """Write a file for each query that has predictions; its number is the query's row."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
-    folder.mkdir(parents=True, exist_ok=True)
+    require_replaceable(folder)
+    folder.mkdir(parents=True)
     for row, query in enumerate(query_names):
         if predictions[row]:
             parts = [[QUERY, query], [PREDICTIONS, *(database_names[each] for each in predictions[row])]]
@@ -243,8 +237,8 @@ def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str)
     for name in foreign:
         if name not in rows:
             raise InputError(
-                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none of the "
-                f"{len(names)} has, or one has by its full path; give names with their folders as the file has them"
+                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none "
+                f"of the {len(names)} has, or one has by its full path"
             )
     return rows
 
@@ -254,24 +248,6 @@ def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[Fil
     return [entries.get(row) for row in range(len(names))]
 
 
-def _shortlist(path: Path, candidates: list[Candidates], names: Sequence[str], num_candidates: int | None) -> Shortlist:
-    depth = num_candidates or max(map(len, candidates))
-    indices = np.full((len(candidates), depth), -1, np.int32)
-    scores = np.zeros((len(candidates), depth), np.float32)
-    has_score = {score is not None for rows in candidates for score in rows.values()}
-    if len(has_score) == 2:
-        raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
-    for query, rows in enumerate(candidates):
-        count = min(len(rows), depth)
-        indices[query, :count] = list(rows)[:count]
-        if has_score == {True}:
-            values = _descending(f"{path}: {shorten(names[query])}", list(rows.values()))
-            scores[query, :count] = values[:count]
-        else:
-            scores[query, :count] = np.arange(depth, depth - count, -1)
-    return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-
-
 def _descending(where: str, scores: Any) -> np.ndarray:
     """Scores as float32; raises an InputError unless they are finite and descend, as distances do not."""
     with np.errstate(over="ignore"):
@@ -279,8 +255,5 @@ def _descending(where: str, scores: Any) -> np.ndarray:
     if not np.isfinite(values).all():
         raise InputError(f"{where}: expected finite scores, got others")
     if (np.diff(values) > 0).any():
-        raise InputError(
-            f"{where}: expected scores, larger = better, that descend, got ascending ones; sort the candidates, and "
-            "negate distances"
-        )
+        raise InputError(f"{where}: expected scores that descend, got ascending ones; negate distances")
     return values

@@ -1,18 +1,67 @@
-"""Read poses of images, and write the trajectory of localized images: TUM's and KITTI's text files."""
+"""Times and poses of images in text files (TUM's, KITTI's), and the trajectory of localized images.
+
+Times are whole nanoseconds: no time is rounded to a float.
+"""
 
 import math
+import re
 from collections.abc import Sequence
-from pathlib import Path
+from contextlib import suppress
+from decimal import Decimal
+from pathlib import Path, PurePosixPath
 
 from mfvpr.io.checks import parse_number
-from mfvpr.io.containers import shorten
-from mfvpr.io.stamps import SECOND, parse_line_stamp, read_content_lines, stamps_in_names
+from mfvpr.io.containers import reading, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
 
+SECOND = 10**9  # nanoseconds
+_END = Decimal(2**31)  # seconds, of ROS; a larger number has another unit
+_DIGITS = (13, 16, 19)  # of whole numbers of ms, us and ns since 1970
+_NUMBER = re.compile(r"[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]{1,3})?")
+_NAME = re.compile(r"[0-9]+\.[0-9]+|[1-9][0-9]{9}([0-9]{3}){0,3}")  # a frame number is no time
 _TUM, _KITTI = 7, 12  # numbers of a pose
-_WORDS = (_TUM + 1, _KITTI)  # of a line
 _LARGEST_GAP = SECOND // 100  # between an image and its pose, as evo allows
+
+
+def parse_stamp(text: str, where: str = "time") -> int:
+    """Nanoseconds of a time in seconds, or in ms, us or ns since 1970 if it is a whole number of 13, 16 or 19 digits.
+
+        parse_stamp("1305031102.175304")  # 1305031102175304000
+
+    More than 9 decimals of seconds are rounded. An `InputError` that begins with `where` if it is no time before 2038.
+    """
+    scale = len(text) - 10 if len(text) in _DIGITS and text.isdigit() and text[0] != "0" else 0
+    seconds = Decimal(text).scaleb(-scale) if _NUMBER.fullmatch(text) else _END
+    if seconds >= _END:
+        expected = "a time in s, or a whole number of ms, us or ns since 1970"
+        raise InputError(f"{where}: expected {expected}, got {shorten(text)!r}")
+    return int(seconds.scaleb(9).to_integral_value())
+
+
+def stamps_in_names(names: Sequence[str]) -> list[int]:
+    """Times of images in ns, which are the names of their files, as `parse_stamp` reads them.
+
+        stamps_in_names(["cam0/1403636579763555584.png", "rgb/12.345.png"])  # [1403636579763555584, 12345000000]
+
+    A whole number with fewer than 10 digits, or with a 0 at its beginning, is an `InputError`: it numbers the frames.
+    """
+    for name in names:
+        if not _NAME.fullmatch(PurePosixPath(name).stem):
+            raise InputError(
+                f"{shorten(name)}: expected the time as the name of the file, such as 1403636579763555584.png (ns) or "
+                "12.345.png (s); rename the images, or give a file of times (read_stamps, or --times FILE)"
+            )
+    return [parse_stamp(PurePosixPath(name).stem, shorten(name)) for name in names]
+
+
+def read_stamps(path: Path | str, num_images: int) -> list[int]:
+    """Times of images in ns from a text file: a line for each image, as `parse_stamp` reads it; # begins a comment."""
+    path = Path(path)
+    stamps = [parse_stamp(line, where) for where, line in _lines(path, "a text file of times")]
+    if len(stamps) != num_images:
+        raise InputError(f"{path}: expected times of {num_images} images, a line for each, got {len(stamps)}")
+    return stamps
 
 
 def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
@@ -32,17 +81,32 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
             the images'; or the number of poses is not M.
     """
     path = Path(path)
-    lines = [(where, line.split()) for where, line in read_content_lines(path, "a text file of poses")]
+    lines = [(where, line.split()) for where, line in _lines(path, "a text file of poses")]
     num_words = len(lines[0][1]) if lines else 0
     for where, words in lines:
-        if len(words) != num_words or num_words not in _WORDS:
+        if len(words) != num_words or num_words not in (_TUM + 1, _KITTI):
             raise InputError(f"{where}: expected 8 numbers (TUM) or 12 (KITTI) in all lines, got {len(words)}")
     if len(lines) != len(names):
         raise InputError(f"{path}: expected a pose of each of the {len(names)} images, got {len(lines)}")
-    if num_words == _KITTI:
-        return [_pose(where, words) for where, words in lines]
-    _check_stamps(path, lines, names)
-    return [_pose(where, words[1:]) for where, words in lines]
+    if num_words != _KITTI:
+        stamps = [parse_stamp(words[0], where) for where, words in lines]
+        lines = [(where, words[1:]) for where, words in lines]
+        image_stamps = stamps
+        with suppress(InputError):  # names that are no times
+            image_stamps = stamps_in_names(names)
+        before = -1
+        for (where, _), stamp, image_stamp, name in zip(lines, stamps, image_stamps, names, strict=True):
+            if stamp <= before:
+                got = f"{_seconds(stamp)} after {_seconds(before)}"
+                raise InputError(f"{where}: expected ascending timestamps, got {got}; sort the lines by time")
+            if abs(stamp - image_stamp) > _LARGEST_GAP:
+                expected = f"the pose of {shorten(name)}, within 10 ms"
+                raise InputError(f"{where}: expected {expected}, got one at {_seconds(stamp)}")
+            before = stamp
+    for where, words in lines:
+        if not all(map(_is_finite, words)):
+            raise InputError(f"{where}: expected finite numbers, got {shorten(' '.join(words))!r}")
+    return [" ".join(words) for _, words in lines]
 
 
 def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequence[int] | None = None) -> None:
@@ -83,36 +147,19 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
     write_text(path, "".join(f"{line}\n" for line in lines))
 
 
-def _pose(where: str, words: Sequence[str]) -> str:
-    """Text of a pose, if all its words are finite numbers."""
+def _lines(path: Path, kind: str) -> list[tuple[str, str]]:
+    """Lines without spaces around them, each with its place for messages; no empty lines, no comments after #."""
+    with reading(path, mend=f"expected {kind}"):
+        text = path.read_text(encoding="utf-8-sig")
+    lines = ((f"{path}: line {number}", line.strip()) for number, line in enumerate(text.split("\n"), start=1))
+    return [(where, line) for where, line in lines if line and not line.startswith("#")]
+
+
+def _is_finite(text: str) -> bool:
     try:
-        is_finite = all(math.isfinite(parse_number(word)) for word in words)
+        return math.isfinite(parse_number(text))
     except ValueError:
-        is_finite = False
-    if not is_finite:
-        raise InputError(f"{where}: expected finite numbers, got {shorten(' '.join(words))!r}")
-    return " ".join(words)
-
-
-def _check_stamps(path: Path, lines: Sequence[tuple[str, Sequence[str]]], names: Sequence[str]) -> None:
-    """Raise an InputError unless the timestamps ascend, and are those of the images if their names are times."""
-    stamps = [parse_line_stamp(where, words[0]) for where, words in lines]
-    for (where, _), before, stamp in zip(lines[1:], stamps, stamps[1:], strict=False):
-        if stamp <= before:
-            raise InputError(
-                f"{where}: expected ascending timestamps, got {_seconds(stamp)} after {_seconds(before)}; sort the "
-                "lines by time"
-            )
-    try:
-        image_stamps = stamps_in_names(names)
-    except InputError:
-        return
-    for (where, _), stamp, image_stamp, name in zip(lines, stamps, image_stamps, names, strict=True):
-        if abs(stamp - image_stamp) > _LARGEST_GAP:
-            raise InputError(
-                f"{where}: expected the pose of {shorten(name)}, within 10 ms, got one at {_seconds(stamp)}; take the "
-                "pose at the time of each image"
-            )
+        return False
 
 
 def _seconds(stamp: int) -> str:

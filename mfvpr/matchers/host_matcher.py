@@ -13,7 +13,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.io.containers import shorten
-from mfvpr.io.plain_matches import numbered_matches, point_matches
+from mfvpr.io.matches import numbered_matches, point_matches
 from mfvpr.matchers.batched_matching import Pair, join_candidates
 from mfvpr.matchers.match_set import QueryMatches
 from mfvpr.utils.errors import InputError, require_word

@@ -15,8 +15,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.positives import Positives
 from mfvpr.io.containers import reading, shorten
 from mfvpr.io.shortlists import write_shortlist
-from mfvpr.io.stamps import SECOND
-from mfvpr.io.trajectories import read_poses, write_trajectory
+from mfvpr.io.trajectories import SECOND, read_poses, write_trajectory
 from mfvpr.report.evaluation_files import NO_PLACE
 from mfvpr.report.tables import read_csv, write_csv
 from mfvpr.utils.errors import InputError

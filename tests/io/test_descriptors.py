@@ -88,19 +88,16 @@ def test_written_and_read(tmp_path, descriptors, suffix, half):
     "file, arrays, message",
     [
         ("g.npy", np.ones((2, 8)), r"descriptors \[3, D\].* got \[2, 8\]"),
-        ("g.npy", np.ones((3, 0)), r"descriptors \[3, D\].* got \[3, 0\]"),
         ("g.npy", np.ones((3, 8), int), "floating-point .*got int64"),
         ("g.npy", np.full((3, 4), 1.5), r"g\.npy: .*unit length, got length 3 "),
         ("g.npy", np.array([[{}]], object), "cannot be read"),
         ("g.npz", {"names": NAMES}, "got no descriptors"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": NAMES[:2]}, r"expected names as text \[M\]"),
-        ("g.npz", {"descriptors": np.ones((3, 8)), "names": np.arange(3)}, r"got int64\[3\] and \[3, 8\]"),
-        ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got 1 again"),
+        ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got a twice"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": [*NAMES[:2], "x"]}, r"first without is image10\.jpg"),
-        ("g.npz", {"descriptors": np.array([{}, 1, 2], object)}, "cannot be read"),
         ("g.csv", None, r"expected a file named \.npy, \.npz, \.h5, \.hdf5, got \.csv"),
     ],
-)  # fmt: skip
+)
 def test_what_is_refused(tmp_path, file, arrays, message):
     path = tmp_path / file
     if arrays is None:
@@ -115,21 +112,6 @@ def test_what_is_refused(tmp_path, file, arrays, message):
 
 def test_what_is_refused_of_hloc(tmp_path, descriptors):
     path = hloc(tmp_path / "g.h5", NAMES, descriptors)
-    with pytest.raises(InputError, match=r"all 4 images, got 3; .*x\.jpg"):
-        read_global_descriptors(path, [*NAMES, "x.jpg"])
     append_hloc(path, "x.jpg", {"global_descriptor": np.ones(9, np.float16)})
-    append_hloc(path, "y.jpg", {"keypoints": np.ones((9, 2), np.float16)})
     with pytest.raises(InputError, match=r"x\.jpg: .*global_descriptor \[D\].* got \[9\]"):
         read_global_descriptors(path, [*NAMES, "x.jpg"])
-    with pytest.raises(InputError, match=r"y\.jpg: .*global_descriptor \[D\].* got none"):
-        read_global_descriptors(path, [*NAMES, "y.jpg"])
-
-
-def test_what_cannot_be_written(tmp_path, descriptors):
-    with pytest.raises(InputError, match=r"\[2, D\] .*got \[3, 8\]"):
-        write_global_descriptors(tmp_path / "g.npy", NAMES[:2], descriptors)
-    with pytest.raises(InputError, match="expected values that float16 holds"):
-        write_global_descriptors(tmp_path / "g.npy", NAMES, descriptors * 1e6, half=True)
-    with pytest.raises(InputError, match=r"name .*\.npy, \.npz, \.h5 or \.hdf5"):
-        write_global_descriptors(tmp_path / "g", NAMES, descriptors)
-    assert not list(tmp_path.iterdir())

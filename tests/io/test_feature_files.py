@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError
 from mfvpr.io import open_features, write_features
-from tests.builders import make_features
 from tests.io.other_programs import NAMES, assert_equal, feature
 
 PATHS = ["feats.h5", "feats.hdf5", "feats.npz", "feats"]
@@ -27,18 +26,6 @@ def test_written_and_read(tmp_path, file, half):
         assert_equal(features, type(features)(**(vars(written[row]) | values)))
     if file != "feats":
         assert [path.name for path in tmp_path.iterdir()] == [file]
-
-
-@pytest.mark.parametrize("file", PATHS)
-def test_padding_is_left_out_and_rows_may_be_few(tmp_path, file):
-    padded = make_features(np.random.default_rng(0), 9, capacity=20, garbage=np.nan)
-    write_features(tmp_path / file, NAMES, [(1, padded)])
-    source = open_features(tmp_path / file, NAMES, partial=True)
-    assert source.counts.tolist() == [-1, 9, -1]
-    [(row, features)] = source.read()
-    assert row == 1
-    np.testing.assert_array_equal(features.keypoints, padded.keypoints[:9])
-    np.testing.assert_array_equal(features.descriptors, padded.descriptors[:9])
 
 
 def test_hloc_reads_what_is_written(tmp_path):

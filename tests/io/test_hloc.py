@@ -2,15 +2,13 @@
 
 import sys
 
-import h5py
 import numpy as np
 import pytest
 
-import mfvpr.io.h5
 from mfvpr import InputError
 from mfvpr.io import open_features
-from tests.io.checks import memory_below, one_line_error
-from tests.io.other_programs import NAMES, SIZE, append_hloc, assert_equal, feature, hloc_parts, write_hloc
+from tests.io.checks import one_line_error
+from tests.io.other_programs import NAMES, append_hloc, assert_equal, feature, hloc_parts, write_hloc
 
 
 @pytest.fixture
@@ -39,13 +37,6 @@ def test_float16_becomes_float32_of_unit_length(path):
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1.2e-6)
     assert_equal(features, written, atol=0.13)  # float16 at 480 px
     np.testing.assert_allclose(features.descriptors, written.descriptors, atol=5e-4)
-
-
-def test_the_file_is_closed_between_readings_and_may_hold_other_images(path):
-    write_hloc(path, NAMES)
-    source = open_features(path, NAMES[:1])
-    append_hloc(path, "query/later.jpg", hloc_parts(feature(5)))
-    assert len(dict(source.read())) == 1
 
 
 def test_images_without_keypoints(path):
@@ -94,14 +85,14 @@ def test_image_size_that_the_file_lacks_is_given(path):
     parts = hloc_parts(feature(0))
     del parts["image_size"]
     append_hloc(path, "x.jpg", parts)
-    with pytest.raises(InputError, match=r"x\.jpg: .*image_size .*got none; .*image_size="):
+    with pytest.raises(InputError, match=r"x\.jpg: .*got no image_size; .*image_size="):
         open_features(path, ["x.jpg"])
     for size in ((640, 480), [[640, 480]]):
         [(_, features)] = open_features(path, ["x.jpg"], image_size=size).read()
         assert features.image_size.tolist() == [640, 480]
-    with pytest.raises(InputError, match=r"a/image 1\.jpg: .*image_size .*\[320"):
+    with pytest.raises(InputError, match=r"a/image 1\.jpg: .*image_size: .*\[320"):
         next(open_features(path, NAMES, image_size=(320, 240)).read())
-    for size in ((0, 3), (np.nan, 1), (1, 2, 3), [[1, 2]]):
+    for size in ((0, 3), (1, 2, 3)):
         with pytest.raises(InputError, match=r"image_size: .*width, height"):
             open_features(path, NAMES, image_size=size)
 
@@ -116,20 +107,14 @@ def test_missing_images(path):
     for row in (2, 3, -1):
         with pytest.raises(InputError, match=f"image {row}, got none"):
             next(source.read([row]))
-    with pytest.raises(InputError, match="got 0; the first without"):
-        open_features(path, ["other.jpg"], partial=True)
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         (lambda p: {"keypoints": p["keypoints"]}, "got no descriptors"),
-        (lambda p: {"descriptors": p["descriptors"]}, "got no keypoints"),
         (lambda p: p | {"keypoints": p["keypoints"][:, :1]}, r"keypoints: expected \[N, 2\].* got \[30, 1\]"),
-        (lambda p: p | {"keypoints": p["keypoints"].T}, r"keypoints: expected \[N, 2\].* got \[2, 30\]"),
-        (lambda p: p | {"keypoints": p["keypoints"][0]}, r"keypoints: expected \[N, 2\].* got \[2\]"),
         (lambda p: p | {"descriptors": p["descriptors"][:, :-1]}, r"expected \[30, D\] or \[D, 30\].* got \[16, 29\]"),
-        (lambda p: p | {"descriptors": p["descriptors"][0]}, r"expected \[30, D\] or \[D, 30\].* got \[30\]"),
         (lambda p: p | {"descriptors": p["descriptors"][:8]}, "of one length .*got lengths"),
         (lambda p: p | {"descriptors": p["descriptors"].T}, r"one layout, \[D, N\] or \[N, D\]"),
     ],
@@ -158,13 +143,8 @@ def spoiled(part, value, row=3):
         (lambda p: p | {"scores": np.full(30, 1e300)}, "scores: .*finite .*1e.300"),
         (lambda p: p | {"descriptors": p["descriptors"] * 2}, r"got length 2.* lengths='normalize'"),
         (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "floating-point .*got uint8"),
-        (lambda p: p | {"keypoints": np.zeros((30, 2), np.complex64)}, "keypoints: .*numbers, got complex64"),
         (lambda p: p | {"scores": p["scores"][1:]}, r"expected 30 keypoints with scores .* got 30, 29 and \[30, 16\]"),
-        (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .* got \[640\.0, 0\.0\]"),
-        (
-            lambda p: p | {"image_size": np.array([640, 480, 3])},
-            r"image_size: expected .* got \[640\.0, 480\.0, 3\.0\]",
-        ),
+        (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .*got \[640\.0, 0\.0\]"),
         (spoiled("keypoints", 700), r"keypoints .*640 x 480 .*got \(700, 700\)"),
     ],
 )
@@ -175,8 +155,10 @@ def test_values_that_cannot_be_used(path, change, message):
         list(source.read())
 
 
-@pytest.mark.parametrize(("point", "is_inside"), [((645, 200), True), ((-6, 483), True), ((646, 200), False),
-                                                  ((-7, 200), False), ((300, 484), False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("point", "is_inside"),
+    [((645, 200), True), ((-6, 483), True), ((646, 200), False), ((-7, 200), False), ((300, 484), False)],
+)
 def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point, is_inside):
     """640 x 480 pixels: as float16 rounds them, and as detectors extrapolate."""
     append_hloc(path, "a.jpg", spoiled("keypoints", point)(hloc_parts(feature(1))))
@@ -204,41 +186,8 @@ def test_lengths_of_descriptors(path):
         open_features(path, ["a.jpg"], lengths="l2")  # type: ignore[arg-type]
 
 
-def test_a_file_that_changes_after_it_was_opened(path):
-    parts, longer = hloc_parts(feature(0)), hloc_parts(feature(0, count=31))
-    append_hloc(path, "a.jpg", parts)
-    source = open_features(path, ["a.jpg"])
-    for name, changed, words in (
-        ("a.jpg", longer, r"a\.jpg: .*30 keypoints .*changed"),
-        ("b.jpg", longer, "cannot be read"),
-    ):
-        path.unlink()
-        append_hloc(path, name, changed)
-        with pytest.raises(InputError, match=words):
-            list(source.read())
-
-
-def test_opening_and_reading_take_the_memory_of_what_is_read(path):
-    """200 images of 200 KB each, of which 5 are read; the others cannot be, as they were never written."""
-    shared = hloc_parts(feature(0, count=50, dimension=1024), half=False)
-    names = [f"db/{index // 100}/{index:05d}.jpg" for index in range(200)]
-    with h5py.File(path, "w", libver="latest") as file:
-        for index, name in enumerate(names):
-            for part in ("keypoints", "descriptors"):
-                data = {"data": shared[part]} if index < 5 else {"shape": shared[part].shape, "dtype": np.float32}
-                file.create_dataset(f"{name}/{part}", **data)
-    with memory_below(6e6):  # of 40 MB
-        source = open_features(path, names[:5], image_size=SIZE)
-        read = list(source.read())
-    assert len(read) == 5
-    assert (source.counts == 50).all()
-    with pytest.raises(InputError, match=r"db/0/00005\.jpg/.*: .*not written"):
-        open_features(path, names[5:6], image_size=SIZE)
-
-
 def test_without_h5py(path, monkeypatch):
     path.write_bytes(b"")
-    assert not hasattr(mfvpr.io.h5, "h5py")  # it is imported where it is needed
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r"h5py; pip install 'mfvpr\[hloc\]'"):
         open_features(path, NAMES)

@@ -76,12 +76,6 @@ def test_values_that_were_not_written(path):
     check_refused(path, r"a\.jpg/scores: .*not written")
 
 
-def test_no_images(path):
-    with h5py.File(path, "w") as file:
-        file.create_group("a.jpg")
-    check_refused(path, "group .*image.* got no datasets")
-
-
 def test_truncated_at_any_place(tmp_path, path):
     content = write_hloc(tmp_path / "whole.h5", ["a.jpg", "b.jpg"]).read_bytes()
     for length in (0, 10, 100, len(content) // 2, len(content) - 1):

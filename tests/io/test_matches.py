@@ -54,14 +54,6 @@ def test_distances_are_those_of_hlocs_descriptors(tools):
     assert matches.distance.min() > 0
 
 
-def test_scores_of_0_as_hlocs_sift_writes_them_count_as_1(tools):
-    [matches] = open_tool(tools, "hloc").read(0, [0])
-    with h5py.File(tools / "hloc/feats.h5") as file:
-        assert not file["queries/0000.png/scores"][:].any()
-    assert (matches.scores0 == 1).all()
-    assert (matches.scores1 == 1).all()
-
-
 @pytest.mark.parametrize(("tool", "missing"), [("hloc", 1), ("kapture", 1), ("colmap", 1), ("vismatch", 1)])
 def test_missing_pairs_are_one_warning(tools, tool, missing):
     indices = np.array([[0, 1], [0, 1]])
@@ -84,8 +76,10 @@ def test_of_both_orders_of_a_pair_that_of_query_and_database_counts(tmp_path):
 
 def test_names_without_prefixes_are_identified_by_the_folders_of_the_images(tools):
     """Queries and database images have the same names; their folders tell them apart."""
-    sides = [Images(QUERIES, [f"/data/set/{folder}/{name}" for name in QUERIES], size=lambda row: SIZE)
-             for folder in ("queries", "database")]  # fmt: skip
+    sides = [
+        Images(QUERIES, [f"/data/set/{folder}/{name}" for name in QUERIES], size=lambda row: SIZE)
+        for folder in ("queries", "database")
+    ]
     matches = open_matches(tools / "kapture", *sides).read(0, [1])[0]
     np.testing.assert_array_equal(
         matches.points0, GOLDEN["expected/kapture/queries/0000.png:database/0001.png:points0"]
@@ -98,8 +92,10 @@ def test_one_name_is_not_of_a_query_and_of_another_database_image(tmp_path):
     """Also with prefixes, which tell nothing apart if they are the same."""
     path = write_hloc(tmp_path / "m.h5", ["0000.png/0001.png"], keypoints0=POINTS, keypoints1=POINTS)
     size = lambda row: SIZE  # noqa: E731
-    sides = [Images(QUERIES, [f"/data/{folder}/{name}" for name in QUERIES], has_prefix, size)
-             for folder, has_prefix in (("queries", True), ("database", True))]  # fmt: skip
+    sides = [
+        Images(QUERIES, [f"/data/{folder}/{name}" for name in QUERIES], has_prefix, size)
+        for folder, has_prefix in (("queries", True), ("database", True))
+    ]
     for row in (0, 1):
         for folder in ("queries", "database"):
             (tmp_path / folder).mkdir(exist_ok=True)
@@ -111,8 +107,13 @@ def test_one_name_is_not_of_a_query_and_of_another_database_image(tmp_path):
 
 
 def test_a_pair_in_the_other_order_is_exchanged(tmp_path):
-    path = write_hloc(tmp_path / "m.h5", ["d-1.jpg/q-1.jpg"], keypoints0=POINTS, keypoints1=POINTS + 5,
-                      scores=np.float32([0.1, 0.2, 0.3]))  # fmt: skip
+    path = write_hloc(
+        tmp_path / "m.h5",
+        ["d-1.jpg/q-1.jpg"],
+        keypoints0=POINTS,
+        keypoints1=POINTS + 5,
+        scores=np.float32([0.1, 0.2, 0.3]),
+    )
     sizes = [(100, 80), (120, 90)]
     sides = [Images([name], size=lambda row, size=size: size) for name, size in zip(("q/1.jpg", "d/1.jpg"), sizes)]  # noqa: B905
     [matches] = open_matches(path, *sides).read(0, [0])
@@ -154,8 +155,12 @@ def test_npz_with_names_may_have_either_order(tmp_path):
 
 def test_npz_of_superglue(tmp_path):
     """A partner for each keypoint of the first image, -1 = none."""
-    arrays = {"keypoints0": POINTS, "keypoints1": POINTS[::-1] + 1, "matches": np.array([2, -1, 0]),
-              "match_confidence": np.float32([0.5, 0, 0.25])}  # fmt: skip
+    arrays = {
+        "keypoints0": POINTS,
+        "keypoints1": POINTS[::-1] + 1,
+        "matches": np.array([2, -1, 0]),
+        "match_confidence": np.float32([0.5, 0, 0.25]),
+    }
     matches = pair_of(npz_folder(tmp_path, **arrays), image_size=(640, 480))
     np.testing.assert_array_equal(matches.points0, POINTS[[0, 2]])
     np.testing.assert_array_equal(matches.points1, POINTS[[0, 2]] + 1)

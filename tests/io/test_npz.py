@@ -1,7 +1,6 @@
 """Features in npz: D2-Net's files, one for each image, one for all."""
 
 import os
-import zipfile
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def test_files_of_d2net_beside_their_images(tmp_path):
     assert source.counts.tolist() == [30] * 3
     for (_, features), expected in zip(source.read(), written[::-1], strict=True):
         assert_equal(features, expected)
-    with pytest.raises(InputError, match=r"b/1\.jpg: expected image_size"):
+    with pytest.raises(InputError, match=r"b/1\.jpg: .*got no image_size"):
         open_features(tmp_path, names[::-1])
 
 
@@ -61,23 +60,6 @@ def test_one_for_all(tmp_path):
     assert source.counts.tolist() == [5, 6, 7]
     for row, features in source.read([2, 0, 1]):
         assert_equal(features, written[row])
-
-
-def test_only_what_is_asked_for_is_read(tmp_path):
-    """The other member's values are damaged: its header is not, so that nobody notices until it is read."""
-    written = {name: feature(seed, count=2000) for seed, name in enumerate(("a.jpg", "b.jpg"))}
-    path = tmp_path / "all.npz"
-    np.savez(path, **named_parts(written))
-    with zipfile.ZipFile(path) as archive:
-        start = archive.getinfo("b.jpg/descriptors.npy").header_offset
-    content = bytearray(path.read_bytes())
-    content[start + 5000] ^= 1
-    path.write_bytes(content)
-    source = open_features(path, ["a.jpg", "b.jpg"])
-    [(_, features)] = source.read([0])
-    assert_equal(features, written["a.jpg"])
-    with pytest.raises(InputError, match=r"all\.npz: .*CRC-32 .*'b\.jpg/descriptors\.npy'"):
-        list(source.read([1]))
 
 
 def test_pipes_are_not_waited_for(tmp_path):
@@ -116,9 +98,6 @@ def test_what_is_no_store_of_features(tmp_path):
     path = tmp_path / "1.jpg.npz"
     np.savez(path, **parts_of(feature(0)))
     with pytest.raises(InputError, match=r"got keypoints, descriptors, scores, image_size; .*folder"):
-        open_features(path, ["1.jpg"])
-    np.savez(path)
-    with pytest.raises(InputError, match=r"expected arrays named by images .* got none"):
         open_features(path, ["1.jpg"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"empty: .*\.npz .*\.d2-net, got none"):

@@ -73,13 +73,10 @@ def test_predictions_of_vpr_methods_evaluation(tmp_path, positives):
     ("texts", "words"),
     [
         ([], "expected text files of predictions, one for each query, got none"),
-        ([""], "000.txt: expected one path below 'Query path:'"),
         (["q/1.jpg d/1.jpg\n"], "000.txt: expected one path below 'Query path:'"),
         (["Query path:\nq/1.jpg\n\nPredictions paths:\n"], "one or more below 'Predictions paths:'"),
-        (["Query path:\nq/1.jpg\nq/2.jpg\n\nPredictions paths:\nd/1.jpg\n"], "expected one path below 'Query path:'"),
         (["Query path:\nq/1.jpg\n\nPredictions paths:\nd/1.jpg\n"] * 2, "expected another query than in 000.txt"),
         (["Query path:\nq/1.jpg\n\nPredictions paths:\nd/9.jpg\n"], "'d/9.jpg', which none of the 4 has"),
-        (["Query path:\nd/1.jpg\n\nPredictions paths:\nd/1.jpg\n"], "'d/1.jpg', which none of the 3 has"),
     ],
 )
 def test_other_folders_are_one_line(tmp_path, texts, words):
@@ -119,13 +116,9 @@ def test_a_candidate_twice_counts_where_it_comes_first(tmp_path):
         ("q/1.jpg", "line 1: expected 'query database'"),
         ("q/1.jpg d/1.jpg 0.5", "line 1: expected 'query database'"),
         ("q/1.jpg, d/1.jpg, 1_0", "line 1: expected 'query database'"),
-        ("q/1.jpg, d/1, 2.jpg", "line 1: expected 'query database'"),
         ("q/1.jpg, d/1.jpg, 0.5\nq/2.jpg, d/2.jpg", "expected scores of all pairs or of none"),
-        ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend.*distances"),
+        ("q/1.jpg, d/1.jpg, 0.5\nq/1.jpg, d/2.jpg, 0.6", r"q/1\.jpg: .*scores.* descend"),
         ("q/1.jpg, d/1.jpg, nan", r"q/1\.jpg: expected finite scores"),
-        ("q/1.jpg, d/1.jpg, 1e99", r"q/1\.jpg: expected finite scores"),
-        ("other/1.jpg d/1.jpg", r"query image, got 'other/1\.jpg'.* 3"),
-        ("1.jpg d/1.jpg\nq/1.jpg d/2.jpg", r"got '1\.jpg'.* 3 .*full path"),
         ("# nothing but a comment", "3 queries, got none"),
         ("", "got none at all"),
         ("x" * 500, r"got 'x{40}\.\.\. \(500 characters\)'"),
@@ -141,17 +134,12 @@ def test_lines_that_are_no_pairs(tmp_path, text, message):
     [
         ({}, r"predictions \[2, K\].* got float64\[0\]"),
         ({"predictions": np.zeros((2, 2))}, r"got float64\[2, 2\]"),
-        ({"predictions": np.zeros(2, int)}, r"got int64\[2\]"),
-        ({"predictions": np.zeros((3, 2), int)}, r"predictions \[2, K\].*got int64\[3, 2\]"),
         ({"predictions": [[0, 1], [4, 0]]}, "0 to 3, .*-1 .*got 0 to 4"),
         ({"predictions": [[0, -2], [0, 0]]}, "got -2 to 0"),
-        ({"predictions": np.array([[2**63], [0]], np.uint64)}, "got 0 to 9223372036854775808"),
-        ({"predictions": [[0], [1]], "scores": [[1.0, 2], [1, 2]]}, r"expected scores \[2, 1\] .* got float64\[2, 2\]"),
-        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"scores \[2, 1\] .*got <U1"),
-        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores, .* descend"),
+        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"scores .*got <U1"),
+        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores that descend"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, np.nan], [1, 2]]}, "expected finite scores"),
         ({"predictions": np.full((2, 3), -1)}, "got none at all"),
-        ({"predictions": np.zeros((2, 0), int)}, "got none at all"),
         ({"predictions": np.array([[{}], [1]], object)}, "cannot be read"),
     ],
 )
@@ -195,13 +183,6 @@ def test_written_and_read(tmp_path_factory, file, layout, drawn):
     assert [child.name for child in path.parent.iterdir()] == [file]
 
 
-def test_hloc_reads_what_is_written(tmp_path):
-    """Its own reading, `q, r = line.split()`, of names without spaces."""
-    write_shortlist(tmp_path / "p.txt", shortlist_of([[1, 0], [0, -1]]), QUERIES[:2], DATABASE[:2])
-    pairs = [tuple(line.split()) for line in (tmp_path / "p.txt").read_text().rstrip("\n").split("\n")]
-    assert pairs == [("q/1.jpg", "d/2.jpg"), ("q/1.jpg", "d/1.jpg"), ("q/2.jpg", "d/1.jpg")]
-
-
 @pytest.mark.parametrize("positives", [None, [[2, 3], [], []]])
 def test_to_match_reads_what_is_written(tmp_path, positives):
     """Its own reading: the query in line 2, predictions from line 5 to the next empty line, numbers as file names."""
@@ -239,12 +220,12 @@ def test_what_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match=r"layout='csv': .*hloc, kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong, ascending = (shortlist_of([[0, 1]], [[0.5, score]]) for score in (np.nan, 0.7))
-    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores, .*descend")):
+    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores that descend")):
         for file, layout in (("p.txt", "kapture"), ("p.npz", "hloc")):
             with pytest.raises(InputError, match=rf"q/1\.jpg: expected {message}"):
                 write_shortlist(tmp_path / file, shortlist, QUERIES[:1], DATABASE, layout=layout)
     assert not list(tmp_path.iterdir())
     write_shortlist(path, ascending, QUERIES[:1], DATABASE)
     assert read_shortlist(path, QUERIES[:1], DATABASE).scores.tolist() == [[2, 1]]
-    with pytest.raises(InputError, match="expected a new or an empty folder"):
+    with pytest.raises(InputError, match="expected a new file"):
         write_shortlist(tmp_path, ascending, QUERIES[:1], DATABASE, layout="preds")

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from mfvpr.io import read_poses, read_stamps, stamps_in_names, write_trajectory
-from mfvpr.io.stamps import parse_stamp
+from mfvpr.io.trajectories import parse_stamp
 from tests.io.checks import one_line_error
 
 NAMES = ["0.png", "1.png", "2.png"]
-TUM = ["12.5 1 -2.50 3e-3 0 0 0 1", "12.75 +1.0 2 3 0.0 0 0.70710678118654757 0.70710678118654757",
-       "13 0.1000000000000000055 -0 3 0 0 0 -1"]  # fmt: skip
+TUM = [
+    "12.5 1 -2.50 3e-3 0 0 0 1",
+    "12.75 +1.0 2 3 0.0 0 0.70710678118654757 0.70710678118654757",
+    "13 0.1000000000000000055 -0 3 0 0 0 -1",
+]
 KITTI = ["1 0 0 1.50 0 1 0 -2e-3 0 0 1 3", "1.0 0 0 4 0 1 0 5 0 0 1 6", "1 0 0 7 0 1 0 8 0 0 1 9"]
 MARKED = ["\ufeff# timestamp tx ty tz qx qy qz qw", ""]
 
@@ -52,22 +55,14 @@ def test_what_is_written_is_read(tmp_path):
     ("lines", "message"),
     [
         ([], "expected a pose of each of the 3 images, got 0"),
-        (["# a comment"], "got 0"),
         (TUM[:2], "expected a pose of each of the 3 images, got 2"),
-        ([*TUM, "14 1 2 3 0 0 0 1"], "got 4"),
         ([*TUM[:2], "13 1 2 3 0 0 0"], "line 3: expected 8 numbers .* got 7"),
-        ([*KITTI[:2], KITTI[2] + " 1"], "line 3: expected 8 numbers .* got 13"),
         ([*KITTI[:2], TUM[0]], "line 3: expected 8 numbers .* got 8"),
-        (["1 2 3"] * 3, "line 1: expected 8 numbers .* got 3"),
-        ([line.replace(" ", ",") for line in TUM], "line 1: expected 8 numbers .* got 1"),
         ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected finite numbers, got 'nan 2"),
         ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected finite numbers, got '1_0 2"),
         ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected finite numbers, .*1e999"),
         ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, got 12.750000000 after 13.000000000"),
-        ([TUM[0], TUM[0], TUM[1]], "line 2: expected ascending timestamps"),
         ([*TUM[:2], "nan 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got 'nan'"),
-        ([*TUM[:2], "-1 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got '-1'"),
-        ([*TUM[:2], "1e300 1 2 3 0 0 0 1"], "line 3: expected a time in s"),
     ],
 )
 def test_other_files_are_one_line(write, lines, message):
@@ -92,7 +87,6 @@ def test_poses_belong_to_the_times_of_the_images(write):
     [
         ([KITTI[0], None], None, "a place of all images, .* write TUM, got 1 places of 2 images"),
         ([None, None], [1, 2], "a place of at least one image, got 0 places of 2 images"),
-        ([], [], "at least one image"),
         (["1 2 3 0 0 0 1"] * 2, [5, 5], "expected different times"),
         (["1 2 3 0 0 0 1"] * 2, None, "expected poses of 12 numbers"),
         (KITTI[:2], [1, 2], "expected poses of 7 numbers"),
@@ -128,7 +122,7 @@ def test_times_are_exact(text, stamp):
     "text", ["", "nan", "inf", "-1", "1_0", "١٢", "1e10", "2147483648", "14036365797635", "9" * 19, "1e-9999", "1,5"]
 )
 def test_other_texts_are_no_times(text):
-    with pytest.raises(ValueError, match="time"):
+    with one_line_error("expected a time"):
         parse_stamp(text)
 
 

@@ -4,11 +4,12 @@ import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.datasets.streets.colors import Floats, Rng
+from mfvpr.datasets.streets.weather import Floats, Rng
 
 NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 CAMERA_HEIGHT = 1.6  # meters
@@ -105,8 +106,7 @@ def _weave(rng: Rng, count: int, image_size: tuple[int, int]) -> list[Camera]:
     return [Camera(*pose, image_size) for pose in poses]
 
 
-@dataclass(frozen=True)
-class Facade:
+class Facade(NamedTuple):
     """The street side of a house, in meters: the plane x = `x` between two z, up to `height`."""
 
     x: float

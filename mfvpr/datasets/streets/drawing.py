@@ -11,12 +11,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import NEAR, SPACING, Camera, plan_drives, plan_return, write_ground_truth
-from mfvpr.datasets.streets.colors import Floats, Image
+from mfvpr.datasets.streets.camera import (
+    CAMERA_HEIGHT,
+    NEAR,
+    SPACING,
+    Camera,
+    plan_drives,
+    plan_return,
+    write_ground_truth,
+)
 from mfvpr.datasets.streets.objects import traffic
-from mfvpr.datasets.streets.scene import Scene, build_scene, sky_prop
+from mfvpr.datasets.streets.scene import Scene, build_scene
 from mfvpr.datasets.streets.sheets import Panel, Prop
-from mfvpr.datasets.streets.weather import WEATHERS, Weather, expose
+from mfvpr.datasets.streets.weather import WEATHERS, Floats, Image, Weather, expose
 from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
@@ -139,7 +146,9 @@ def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
     # Objects on the street are never behind a house, hence houses are painted first.
     layers = (scene.ground, scene.houses, (*scene.street, *traffic(cars, camera, rng)))
     near = ([prop for prop in layer if prop.z < camera.z + SIGHT] for layer in layers)
-    image = expose(paint(([sky_prop(scene.sky, camera)], *near), camera, weather), weather, rng)
+    z = camera.z + 4.0  # the sky is so far away that it moves along with the camera
+    sky = Panel(scene.sky, (camera.x - 8, -CAMERA_HEIGHT - 3.9, z), (16, 0, 0), (0, 4.0, 0))
+    image = expose(paint(([Prop(z, (sky,))], *near), camera, weather), weather, rng)
     path = drive.folder / f"{row:04d}.png"
     if not cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
         raise OSError(f"cannot write {path}")
@@ -167,7 +176,12 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
     frame = np.column_stack([panel.right, panel.down, panel.corner])
     homography = projection @ np.vstack([frame, (0, 0, 1)])
     outline = clip_outline(homography)
-    if outline is None or shows_back(outline):
+    if outline is None:
+        return
+    double_area = 0.0
+    for (x0, y0), (x1, y1) in pairwise([*outline.tolist(), outline[0].tolist()]):
+        double_area = double_area + x0 * y1 - y0 * x1
+    if double_area <= 1:  # corners run the wrong way around, or enclose less than half a px
         return
     low = np.maximum(np.floor(outline.min(0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(outline.max(0)).astype(int) + 2, canvas.shape[1::-1])
@@ -175,7 +189,16 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
     if width <= 0 or height <= 0:
         return
     depth = float(homography[2] @ (0.5, 0.5, 1))
-    texture = cv2.LUT(shrink(panel.texture(weather), np.ptp(outline, 0)), haze_table(weather, depth))
+    texture = panel.texture(weather)
+    rows, columns = texture.shape[:2]
+    across, down = np.ceil(np.ptp(outline, 0)).tolist()
+    size = (int(np.clip(across, 1, columns)), int(np.clip(down, 1, rows)))
+    if size != (columns, rows):  # no more texels than px, against aliasing
+        texture = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
+    share = 1 - np.exp(-((depth / weather.haze) ** 2))
+    levels = np.arange(256, dtype=np.float64)[:, None]
+    table = levels + share * (np.array((*weather.horizon, 0)) - levels) * (1, 1, 1, 0)
+    texture = cv2.LUT(texture, table.astype(np.uint8)[None])
     texels = np.diag([1 / texture.shape[1], 1 / texture.shape[0], 1])
     warp = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]]) @ homography @ texels
     patch = cv2.warpPerspective(texture, warp, (width, height), borderMode=cv2.BORDER_REPLICATE)
@@ -197,27 +220,3 @@ def clip_outline(homography: Floats) -> Floats | None:
         if (corner[2] > NEAR) != (following[2] > NEAR):
             outline.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
     return np.array([point[:2] / point[2] for point in outline]) if outline else None
-
-
-def shows_back(outline: Floats) -> bool:
-    """Whether the corners `[n, 2]` run the wrong way around, or enclose less than half a px."""
-    corners = outline.tolist()
-    double_area = 0.0
-    for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
-        double_area = double_area + x0 * y1 - y0 * x1
-    return double_area <= 1
-
-
-def haze_table(weather: Weather, depth: float) -> Image:
-    """Lookup table `[1, 256, 4]` that mixes the haze of `depth` meters of air into a color."""
-    share = 1 - np.exp(-((depth / weather.haze) ** 2))
-    levels = np.arange(256, dtype=np.float64)[:, None]
-    table = levels + share * (np.array((*weather.horizon, 0)) - levels) * (1, 1, 1, 0)
-    return table.astype(np.uint8)[None]
-
-
-def shrink(texture: Image, extent: Floats) -> Image:
-    """The texture with no more texels than its image has px, against aliasing; extent is (width, height) in px."""
-    rows, columns = texture.shape[:2]
-    size = (int(np.clip(np.ceil(extent[0]), 1, columns)), int(np.clip(np.ceil(extent[1]), 1, rows)))
-    return texture if size == (columns, rows) else cv2.resize(texture, size, interpolation=cv2.INTER_AREA)

@@ -1,16 +1,14 @@
 """Drawings of houses: windows, walls, shops, gable and roof."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.colors import ACCENTS, DARK, GLASS, ROOFS, TRIMS, WALLS, WARM, Color, Rng, pick, tone
 from mfvpr.datasets.streets.sheets import Sheet, blotches, draw_glyphs
+from mfvpr.datasets.streets.weather import ACCENTS, DARK, GLASS, TRIMS, WALLS, WARM, Color, Rng, pick, tone
 
 
-@dataclass(frozen=True)
-class Motif:
+class Motif(NamedTuple):
     """A window type, shared by many houses: size in meters, panes, ornaments."""
 
     width: float
@@ -47,12 +45,6 @@ def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: 
     for row in range(1, motif.rows):
         sheet.rect(left, y + h * row / motif.rows - 0.03, w, 0.06, trim)
     sheet.rect(left - 0.2, y + h + 0.08, w + 0.4, 0.12, tone(trim, 0.85), snow=240)
-    draw_ornament(sheet, rng, left, y, motif, trim, accent)
-
-
-def draw_ornament(sheet: Sheet, rng: Rng, left: float, y: float, motif: Motif, trim: Color, accent: Color) -> None:
-    """Shutters, lintel or railing of a window whose glass has its upper left corner at (left, y)."""
-    w, h = motif.width, motif.height
     if motif.ornament == "shutters":
         for x in (left - 0.6, left + w + 0.1):
             sheet.rect(x, y - 0.05, 0.5, h + 0.1, accent)
@@ -67,15 +59,6 @@ def draw_ornament(sheet: Sheet, rng: Rng, left: float, y: float, motif: Motif, t
     if rng.random() < 0.3:  # flowers on the sill
         for x in rng.uniform(left, left + w, 7):
             sheet.ellipse(x, y + h + 0.02, 0.1, 0.1, pick(rng, ((70, 110, 60), (190, 60, 70), (220, 160, 60))))
-
-
-def draw_poster(sheet: Sheet, rng: Rng, x: float, y: float) -> None:
-    """A poster with its upper left corner at (x, y)."""
-    w, h = rng.uniform(0.5, 1.0), rng.uniform(0.8, 1.3)
-    sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
-    for _ in range(4):
-        sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
-    draw_glyphs(sheet, rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
 
 
 def draw_wall(sheet: Sheet, rng: Rng) -> None:
@@ -103,7 +86,12 @@ def draw_damage(sheet: Sheet, rng: Rng) -> None:
         flake = np.stack([x + radii * np.cos(angles), y + 0.7 * radii * np.sin(angles)], 1)
         sheet.polygon(flake, pick(rng, ((150, 96, 80), (196, 186, 170), (110, 100, 96))))
     for _ in range(rng.integers(2, 6)):
-        draw_poster(sheet, rng, rng.uniform(0.2, sheet.width - 1.2), sheet.height - rng.uniform(2.0, 2.6))
+        x, y = rng.uniform(0.2, sheet.width - 1.2), sheet.height - rng.uniform(2.0, 2.6)
+        w, h = rng.uniform(0.5, 1.0), rng.uniform(0.8, 1.3)
+        sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
+        for _ in range(4):
+            sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
+        draw_glyphs(sheet, rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
     if rng.random() < 0.5:
         start = (rng.uniform(0.5, sheet.width - 1.5), sheet.height - 1.4)
         draw_glyphs(sheet, rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
@@ -124,19 +112,13 @@ def draw_shop(sheet: Sheet, rng: Rng, top: float, trim: Color, accent: Color) ->
             sheet.rect(x, top + 1.0, 0.4, 0.7, trim if stripe % 2 else accent, snow=150)
 
 
-@dataclass(frozen=True)
 class Design:
     """Design that several houses share: width in meters, floors above the ground floor, windows, use."""
 
-    width: float
-    floors: int
-    motif: Motif
-    shop: bool
-
-
-def make_design(rng: Rng) -> Design:
-    motif = MOTIFS[int(rng.integers(len(MOTIFS)))]
-    return Design(rng.uniform(6.0, 11.0), int(rng.integers(1, 4)), motif, bool(rng.random() < 0.5))
+    def __init__(self, rng: Rng) -> None:
+        self.motif = MOTIFS[int(rng.integers(len(MOTIFS)))]
+        self.width, self.floors = rng.uniform(6.0, 11.0), int(rng.integers(1, 4))
+        self.shop = bool(rng.random() < 0.5)
 
 
 def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
@@ -161,21 +143,4 @@ def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
         sheet.rect(middles[0] - 0.7, top + 0.7, 1.4, 2.9, trim)
         sheet.rect(middles[0] - 0.55, top + 0.85, 1.1, 2.75, accent)
     sheet.rect(0, 0, width, 0.3, tone(trim, 0.92), snow=120)
-    return sheet
-
-
-def draw_gable(rng: Rng, color: Color, depth: float, height: float, rise: float) -> Sheet:
-    """The side of a house under its pointed roof."""
-    sheet = Sheet(depth, height + rise, tone(color, 0.86), scale=16)
-    draw_wall(sheet, rng)
-    for corner in ([(0, 0), (depth / 2, 0), (0, rise)], [(depth, 0), (depth / 2, 0), (depth, rise)]):
-        cv2.fillPoly(sheet.day, [np.rint(np.array(corner) * sheet.scale).astype(np.int32)], (0, 0, 0, 0))
-    return sheet
-
-
-def draw_roof(rng: Rng, width: float, slope: float) -> Sheet:
-    sheet = Sheet(width, slope, pick(rng, ROOFS), scale=16)
-    sheet.settle_snow(np.clip(225 + 20 * blotches(rng, sheet.day.shape[:2], 12), 0, 250))
-    tiles = 1 - 0.18 * (np.arange(sheet.day.shape[0]) % 5 == 0)[:, None]
-    sheet.shade((tiles * (1 + 0.08 * blotches(rng, sheet.day.shape[:2], 4)))[..., None])
     return sheet

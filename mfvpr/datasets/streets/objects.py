@@ -1,25 +1,27 @@
 """Drawings of cars and their traffic, of the ground, trees, lamps, signs and hedges."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera
-from mfvpr.datasets.streets.colors import ACCENTS, CARS, Color, Image, Rng, pick, tone
-from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, blotches, draw_glyphs, move, texture
-from mfvpr.datasets.streets.weather import Weather
+from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, draw_glyphs, move, texture
+from mfvpr.datasets.streets.weather import ACCENTS, CARS, Color, Image, Rng, Weather, pick, tone
 
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
 TRAFFIC = (
-    (LANE, 7, 25, False), (-LANE, 5, 22, True), (-LANE, 25, 50, True),
-    (4.0, 5, 18, False), (4.0, 25, 50, False), (-4.0, 5, 18, True),
-)  # fmt: skip
+    (LANE, 7, 25, False),
+    (-LANE, 5, 22, True),
+    (-LANE, 25, 50, True),
+    (4.0, 5, 18, False),
+    (4.0, 25, 50, False),
+    (-4.0, 5, 18, True),
+)
 
 Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
 
 
-@dataclass(frozen=True)
-class Body:
+class Body(NamedTuple):
     """Shape of a car, in meters: heights of hood and roof; where glass and roof start, from the rear and the front."""
 
     length: float
@@ -115,56 +117,6 @@ def draw_end(body: Body, paint: Color, lights: Color, glow: Color) -> Sheet:
     return sheet
 
 
-def draw_ground(rng: Rng, half_width: float, length: float) -> Sheet:
-    """A strip of the street seen from above: y runs against the driving direction."""
-    sheet = Sheet(2 * half_width, length, (164, 158, 148), scale=24)
-    middle = half_width
-    for y in np.arange(0, length, 1.0):  # slabs of the sidewalk
-        sheet.rect(0, y, 2 * middle, 0.05, (136, 130, 122))
-    for x in np.arange(0, 2 * middle, 1.0):
-        sheet.rect(x, 0, 0.05, length, (136, 130, 122))
-    sheet.rect(middle - 4.4, 0, 8.8, length, (196, 192, 184))
-    sheet.rect(middle - 4.2, 0, 8.4, length, (98, 98, 102))
-    for _ in range(rng.integers(0, 3)):  # patches and manholes
-        x, y = rng.uniform((middle - 3.8, 0), (middle + 2, length - 2))
-        sheet.rect(x, y, rng.uniform(0.6, 1.8), rng.uniform(0.8, 2.0), tone((98, 98, 102), rng.uniform(0.75, 1.15)))
-        sheet.ellipse(middle + rng.uniform(-3, 3), y, 0.35, 0.35, (70, 68, 66))
-    for y in np.arange(0, length, 4.0):
-        sheet.rect(middle - 0.08, y, 0.16, 2.2, (222, 220, 210))
-    if rng.random() < 0.15:
-        for x in np.arange(-3.8, 3.8, 1.0):
-            sheet.rect(middle + x, length / 2 - 1.5, 0.5, 3.0, (226, 224, 216))
-    wear_ground(sheet, rng)
-    return sheet
-
-
-def wear_ground(sheet: Sheet, rng: Rng) -> None:
-    """Grain and stains on the strip, and snow that is thinner where wheels have passed."""
-    shape = sheet.day.shape[:2]
-    fade = np.sin(np.linspace(0, np.pi, shape[0]))[:, None]  # no stain may end at the edge of a strip
-    grain = 0.03 * rng.standard_normal(shape, np.float32)
-    sheet.shade((1 + grain + 0.05 * fade * blotches(rng, shape, 30))[..., None])
-    x = np.linspace(-sheet.width / 2, sheet.width / 2, shape[1])
-    ruts = sum(np.exp(-(((x - rut) / 0.24) ** 4)) for rut in (-2.7, -1.2, 1.2, 2.7))
-    sheet.settle_snow(np.clip(235 - 110 * ruts + 18 * fade * blotches(rng, shape, 10), 0, 250))
-
-
-def draw_tree(rng: Rng, width: float, height: float) -> Sheet:
-    """A tree in leaf: trunk, branches and a round crown of many dabs."""
-    sheet = Sheet(width, height, None)
-    middle, bark = width / 2, (88, 68, 54)
-    sheet.line([(middle, height), (middle + 0.1, 0.45 * height)], 0.28, bark)
-    for x in rng.uniform(0.25, 0.75, 5) * width:
-        sheet.line([(middle, 0.62 * height), (x, 0.25 * height)], 0.1, bark)
-    leaf = tone((92, 132, 62), rng.uniform(0.8, 1.1))
-    for angle, radius in zip(rng.uniform(0, 2 * np.pi, 700), np.sqrt(rng.random(700)), strict=True):
-        x, y = middle + radius * 0.42 * width * np.cos(angle), 0.34 * height * (1 + 0.85 * radius * np.sin(angle))
-        light = 1.15 - 0.5 * y / (0.68 * height) + rng.uniform(-0.1, 0.1)
-        size = rng.uniform(0.07, 0.2)
-        sheet.ellipse(x, y, size, 0.8 * size, tone(leaf, light), snow=int(rng.uniform(120, 220) * min(1.0, light)))
-    return sheet
-
-
 def draw_lamp() -> Sheet:
     sheet = Sheet(1.0, 5.2, None)
     sheet.rect(0.44, 0.6, 0.12, 4.6, (52, 58, 56))
@@ -187,12 +139,4 @@ def draw_sign(rng: Rng) -> Sheet:
     else:
         sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
     draw_glyphs(sheet, rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else (240, 238, 232))
-    return sheet
-
-
-def draw_hedge(rng: Rng, width: float, height: float) -> Sheet:
-    sheet = Sheet(width, height, None)
-    for x, y in rng.uniform((0.1, 0.15), (width - 0.1, height), (500, 2)):
-        light = 1.15 - 0.4 * y / height + rng.uniform(-0.2, 0.2)
-        sheet.ellipse(x, y, 0.17, 0.14, tone((80, 118, 60), light), snow=int(150 * light))
     return sheet

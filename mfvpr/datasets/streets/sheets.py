@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mfvpr.datasets.streets.colors import DARK, Color, Floats, Image, Rng, as_array, tone
-from mfvpr.datasets.streets.weather import Weather
+from mfvpr.datasets.streets.weather import DARK, Color, Floats, Image, Rng, Weather, as_array, tone
 
 Texture = Callable[[Weather], Image]  # colors and opacity (RGBA) in a weather
 
@@ -41,9 +40,9 @@ class Sheet:
 
     def polygon(self, points: ArrayLike, color: Color, glow: Color = DARK, snow: int = 0) -> None:
         """A filled polygon with corners `[n, 2]`."""
-        corners = np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)
-        cv2.fillPoly(self.day, [corners], (*color, 255), shift=4)
-        cv2.fillPoly(self.effects, [corners], (*glow, snow), shift=4)
+        corners = [np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)]
+        cv2.fillPoly(self.day, corners, (*color, 255), shift=4)
+        cv2.fillPoly(self.effects, corners, (*glow, snow), shift=4)
 
     def ellipse(
         self, x: float, y: float, rx: float, ry: float, color: Color, glow: Color = DARK, snow: int = 0

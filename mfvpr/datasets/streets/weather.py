@@ -1,11 +1,47 @@
-"""Hours and seasons: light and colors of the street, and the effects of lens, air and sensor on an image."""
+"""Colors of the street, its light by hour and season, and the effects of lens, air and sensor on an image."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from mfvpr.datasets.streets.colors import Color, Floats, Image, Rng
+Image = UInt8[np.ndarray, "_ _ _"]  # rows, columns, channels
+Floats = Float[np.ndarray, "..."]
+Color = tuple[int, int, int]  # RGB, 0..255
+Rng = np.random.Generator
+
+WALLS = (
+    (226, 205, 160),
+    (214, 170, 130),
+    (196, 120, 96),
+    (170, 184, 160),
+    (176, 188, 200),
+    (232, 224, 208),
+    (205, 150, 140),
+    (186, 160, 120),
+    (150, 92, 78),
+    (216, 190, 190),
+)
+TRIMS = ((245, 240, 230), (230, 222, 205), (120, 110, 104))
+ACCENTS = ((150, 48, 44), (38, 84, 124), (40, 96, 74), (196, 148, 48), (92, 60, 110), (48, 52, 60), (208, 96, 48))
+ROOFS = ((158, 82, 62), (132, 74, 62), (92, 92, 102), (112, 84, 76))
+CARS = ((186, 44, 40), (40, 72, 130), (228, 228, 226), (60, 64, 70), (150, 156, 160), (64, 104, 84), (214, 178, 70))
+GLASS, WARM, DARK = (62, 76, 92), (255, 196, 110), (0, 0, 0)
+
+
+def as_array(color: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
+    return np.array(color, np.float32)
+
+
+def pick(rng: Rng, colors: tuple[Color, ...]) -> Color:
+    return colors[int(rng.integers(len(colors)))]
+
+
+def tone(color: Color, gain: float) -> Color:
+    """The color, lighter or darker."""
+    red, green, blue = (min(255, int(c * gain)) for c in color)
+    return red, green, blue
 
 
 @dataclass(frozen=True)
@@ -34,7 +70,7 @@ class Weather:
     streaks: float = 0.0  # mean number of rain streaks per image
 
 
-# New weathers go to the end: the position in the table seeds the clouds (see `scene.sky_texture`).
+# New weathers go to the end: the position in the table seeds the clouds (see `scene.CLOUDS`).
 WEATHERS = {
     "day": Weather(
         ambient=(1.0, 1.0, 1.0), sun=1.0, zenith=(92, 148, 214), horizon=(214, 226, 234), haze=160.0, noise=1.0,
@@ -77,8 +113,11 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
     severity = min(rng.exponential() ** 3, 20.0) * image.shape[1] / 448
     if weather.motion:  # long exposures blur along the turn
         seen = cv2.blur(seen, (1 + int(weather.motion * severity), 1))
-    if weather.bloom:
-        seen = bloom(seen, weather.bloom)
+    if weather.bloom:  # a glow around bright lights, as from a lens
+        small = cv2.resize(seen, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        bright = np.maximum(small - 150, 0)
+        spread = 0.6 * cv2.GaussianBlur(bright, (0, 0), 2) + 0.9 * cv2.GaussianBlur(bright, (0, 0), 7)
+        seen = seen + weather.bloom * cv2.resize(spread, seen.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     defocus = weather.defocus + weather.drops * severity
     if weather.defocus_spread:
         defocus += weather.defocus_spread * rng.random()
@@ -90,14 +129,6 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
         seen = fall_rain(seen, int(rng.uniform(0.5, 1.5) * weather.streaks), rng)
     seen += weather.noise * rng.standard_normal(seen.shape, np.float32)
     return np.clip(seen, 0, 255).astype(np.uint8)
-
-
-def bloom(image: Floats, gain: float) -> Floats:
-    """The image with a glow around bright lights, as from a lens."""
-    small = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    bright = np.maximum(small - 150, 0)
-    spread = 0.6 * cv2.GaussianBlur(bright, (0, 0), 2) + 0.9 * cv2.GaussianBlur(bright, (0, 0), 7)
-    return image + gain * cv2.resize(spread, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def fall_snow(image: Floats, count: int, rng: Rng) -> Floats:

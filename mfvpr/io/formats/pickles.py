@@ -8,12 +8,13 @@ import pickle
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import PurePosixPath, PureWindowsPath
+from functools import partial
+from pathlib import PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
 
-from mfvpr.io.containers import shorten
+from mfvpr.io.containers import read_npy_header, shorten
 from mfvpr.utils.errors import InputError
 
 NUMPY_MAGIC = b"\x93NUMPY"
@@ -89,30 +90,26 @@ class PickledArray:
         self.content = array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def _reconstruct(array_class: Any, *_: Any) -> PickledArray:
-    return PickledArray()
+def _path_text(kind: type[PurePath], *parts: str) -> str:
+    return kind(*parts).as_posix()
 
 
 class ArrayUnpickler(DataUnpickler):
     """Unpickler of `PickledArray` among plain data; paths become text."""
 
     names: ClassVar = {
-        "numpy.core.multiarray._reconstruct": Function(_reconstruct),
-        "numpy._core.multiarray._reconstruct": Function(_reconstruct),
-        "numpy.ndarray": Function(_reconstruct),
+        "numpy.core.multiarray._reconstruct": Function(lambda *_: PickledArray()),
+        "numpy._core.multiarray._reconstruct": Function(lambda *_: PickledArray()),
+        "numpy.ndarray": Function(lambda *_: PickledArray()),
         "numpy.dtype": Function(lambda code, *_: _Type(code)),
         "_codecs.encode": Function(lambda text, *_: text),  # bytes in protocols that have none
         "__builtin__.bytes": Function(bytes),  # of an array without values
         "builtins.bytes": Function(bytes),
         **{
-            f"{module}.{name}": Function(lambda *parts: PurePosixPath(*parts).as_posix())
+            f"{module}.{prefix}{kind.__name__.removeprefix('Pure')}": Function(partial(_path_text, kind))
             for module in ("pathlib", "pathlib._local")
-            for name in ("PosixPath", "PurePosixPath")
-        },
-        **{
-            f"{module}.{name}": Function(lambda *parts: PureWindowsPath(*parts).as_posix())
-            for module in ("pathlib", "pathlib._local")
-            for name in ("WindowsPath", "PureWindowsPath")
+            for prefix in ("", "Pure")
+            for kind in (PurePosixPath, PureWindowsPath)
         },
     }
 
@@ -123,9 +120,7 @@ def read_objects(file: BinaryIO, expected: str) -> list[Any]:
     Raises:
         InputError: the file holds other content; any error if it is damaged.
     """
-    is_first = np.lib.format.read_magic(file) == (1, 0)
-    read = np.lib.format.read_array_header_1_0 if is_first else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
+    shape, _, dtype = read_npy_header(file)
     content = ArrayUnpickler(file).load() if dtype.hasobject else None
     if not isinstance(content, PickledArray) or not isinstance(content.content, list) or content.shape != shape:
         raise InputError(f"expected {expected}, got another object of {dtype} {[*shape]}; use the official file")

@@ -1,18 +1,24 @@
-"""Read folders with a file of matches for each pair: `.npz`, or `.torch` as vismatch writes them."""
+"""Read folders with a file of results for each pair (`.npz`, vismatch's `.torch`) or for each query (To-Match's).
+
+VPR-methods-evaluation writes a text file of predictions for each query. To-Match adds a `.torch` file beside it, with a
+result for each prediction. PyTorch is not needed.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from mfvpr.io.containers import reading, shorten
-from mfvpr.io.formats.pairs import FileMatches, Pair, PairReader, Size
+from mfvpr.io.containers import read_npz, reading, shorten
+from mfvpr.io.formats.pair_files import FileMatches, Pair, PairReader, Size
 from mfvpr.io.formats.pickles import ArrayUnpickler, PickledArray, open_torch_archive
-from mfvpr.io.npz import read_npz
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import printable
 
+QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
 _NAMES = ("img0_path", "img1_path")  # vismatch's
 _LAYOUTS = (("points0", "points1", "confidence"), ("matched_kpts0", "matched_kpts1", "matched_confidences"))
 _INLIERS = ("inlier_kpts0", "inlier_kpts1", "")
@@ -56,28 +62,90 @@ class ResultFiles(PairReader):
         return pair in self._files
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
-        for pair in pairs:
-            yield result_matches(self._files[pair], _read(self._files[pair]), self._verified)
+        for file in (self._files[pair] for pair in pairs):
+            result = read_npz(file, _PARTS) if file.suffix == ".npz" else _read_torch(file)
+            yield _matches_of(file, result, self._verified)
 
 
-def read_torch_result(path: Path, mend: str) -> Any:
+class PredictionPairs(PairReader):
+    """Reader of a folder of predictions and their results; matches are points in To-Match's resized images."""
+
+    by_number, in_image_files = False, False
+
+    def __init__(self, path: Path, verified: bool = False) -> None:
+        self.path, self._verified = path, verified
+        self._places: dict[Pair, tuple[Path, int]] = {}
+        for file in sorted(path.glob("*.torch")):
+            query, predictions = read_predictions(file.with_suffix(".txt"))
+            for position in range(len(_read_results(file, len(predictions)))):
+                self._places.setdefault((query, predictions[position]), (file, position))
+        self.images = tuple(dict.fromkeys(chain(*self._places)))
+
+    @staticmethod
+    def fits(folder: Path) -> bool:
+        """Whether a folder has results beside predictions."""
+        return any(file.with_suffix(".txt").exists() for file in folder.glob("*.torch"))
+
+    def __contains__(self, pair: Pair) -> bool:
+        return pair in self._places
+
+    def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
+        read_results = cache(_read_results)  # pairs of a query share a file
+        for file, position in (self._places[pair] for pair in pairs):
+            yield _matches_of(file, read_results(file)[position], self._verified)
+
+
+def read_predictions(path: Path) -> tuple[str, list[str]]:
+    """Paths of a query and its predictions. Positives are not read: the data set has its own ground truth."""
+    with reading(path, mend="expected a text file of predictions"):
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+    parts: dict[str, list[str]] = {heading: [] for heading in ("", QUERY, PREDICTIONS, POSITIVES)}
+    heading = ""
+    for line in filter(None, map(str.strip, text.split("\n"))):
+        if line in parts:
+            heading = line
+        else:
+            parts[heading].append(printable(line))
+    if parts[""] or len(parts[QUERY]) != 1 or not parts[PREDICTIONS]:
+        raise InputError(
+            f"{path}: expected one path below {QUERY!r}, and one or more below {PREDICTIONS!r}, as "
+            "VPR-methods-evaluation writes them"
+        )
+    return parts[QUERY][0], parts[PREDICTIONS]
+
+
+def read_num_inliers(path: Path, most: int) -> list[float]:
+    """Numbers of inliers of a query with its predictions, in their order; an InputError for more than `most`."""
+    counts: list[Any] = [result.get("num_inliers") for result in _read_results(path, most)]
+    if not counts or not all(type(count) is int and 0 <= count < 2**31 for count in counts):
+        raise InputError(f"{path}: expected num_inliers of each prediction, a whole number from 0")
+    return list(map(float, counts))
+
+
+def _read_results(path: Path, most: int | None = None) -> list[dict[Any, Any]]:
+    """A dictionary for each prediction, of at most `most`."""
+    results = _read_torch(path, list)
+    if not all(isinstance(result, dict) for result in results) or (most is not None and len(results) > most):
+        raise InputError(
+            f"{path}: expected a dictionary of To-Match for each prediction in the text file, at most "
+            f"{most}, got {len(results)} results; match the predictions of this run"
+        )
+    return results
+
+
+def _read_torch(path: Path, kind: type = dict) -> Any:
     """Content of a file of `torch.save` without tensors: plain data, and `PickledArray`."""
-    with reading(path, mend=mend), path.open("rb") as file, open_torch_archive(file) as archive:
-        return ArrayUnpickler(archive.pickle).load()
-
-
-def _read(file: Path) -> Parts:
-    if file.suffix == ".npz":
-        return read_npz(file, _PARTS)
-    result = read_torch_result(file, "is it a result of vismatch?")
-    if not isinstance(result, dict):
-        raise InputError(f"{file}: expected a dictionary of results, got {type(result).__name__}")
-    return result
+    with reading(path, mend="is it a result of vismatch or To-Match?"), path.open("rb") as file:
+        with open_torch_archive(file) as archive:
+            result = ArrayUnpickler(archive.pickle).load()
+        if not isinstance(result, kind):
+            raise InputError(f"expected a {kind.__name__} of results, got {type(result).__name__}")
+        return result
 
 
 def _names_inside(file: Path) -> Pair | None:
     """Names of the two images, if the file has them."""
-    parts = read_npz(file, _NAMES) if file.suffix == ".npz" else _read(file)
+    parts = read_npz(file, _NAMES) if file.suffix == ".npz" else _read_torch(file)
     names = [str(parts[name]) for name in _NAMES if name in parts]
     return (names[0], names[1]) if len(names) == 2 else None
 
@@ -88,14 +156,11 @@ def _names_of_file(file: Path, stems: Sequence[set[str]]) -> Pair | None:
     pairs = [("_".join(words[:cut]), "_".join(words[cut:])) for cut in range(1, len(words))]
     pairs = [pair for pair in pairs if pair[0] in stems[0] and pair[1] in stems[1]]
     if len(pairs) > 1:
-        raise InputError(
-            f"{file}: expected the stems of a query and a database image, got several ways to read; add the arrays "
-            f"{' and '.join(_NAMES)}"
-        )
+        raise InputError(f"{file}: expected one pair of images, got several ways to read; add {' and '.join(_NAMES)}")
     return pairs[0] if pairs else None
 
 
-def result_matches(file: Path, result: Parts, verified: bool) -> FileMatches:
+def _matches_of(file: Path, result: Parts, verified: bool) -> FileMatches:
     """Matches of a result, or its inliers if `verified`."""
     parts = {
         name: np.asarray(part.content if isinstance(part, PickledArray) else part)
@@ -114,23 +179,20 @@ def result_matches(file: Path, result: Parts, verified: bool) -> FileMatches:
     has_numbers = numbers.dtype.kind in "iu" and numbers.ndim == 1 and keypoints1.ndim == 2
     if not has_numbers or any(len(part) != len(numbers) for part in (keypoints0, confidence) if part is not None):
         raise InputError(
-            f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N] of integers, match_confidence [N], "
-            f"got {', '.join(f'{name} {part.dtype}{[*part.shape]}' for name, part in parts.items())}"
+            f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N] of integers, "
+            "match_confidence [N], got others"
         )
     if (numbers < -1).any() or (numbers >= len(keypoints1)).any():
         raise InputError(f"{file}: expected matches from -1 to {len(keypoints1) - 1}, got others")
     real = numbers >= 0
-    return FileMatches(
-        keypoints0[real], keypoints1[numbers[real]], None if confidence is None else confidence[real], sizes
-    )
+    confidence = None if confidence is None else confidence[real]
+    return FileMatches(keypoints0[real], keypoints1[numbers[real]], confidence, sizes)
 
 
 def _sizes(file: Path, parts: Parts) -> tuple[Size, Size] | None:
     names = (_SIZES[2], _SIZES[2]) if _SIZES[2] in parts else _SIZES[:2]
     if not {*names} & parts.keys():
         return None
-    try:
+    with reading(file, mend="expected image_size0 and image_size1 (width, height), or im_size, px"):
         size0, size1 = (np.broadcast_to(parts[name].astype(np.float64), 2).tolist() for name in names)
-    except (KeyError, OverflowError, TypeError, ValueError):
-        raise InputError(f"{file}: expected image_size0 and image_size1 (width, height), or im_size, px") from None
     return tuple(size0), tuple(size1)

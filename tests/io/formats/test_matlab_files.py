@@ -16,18 +16,24 @@ pytestmark = pytest.mark.thorough
 
 
 CONTENT = {
-    "net": {"layers": cell([{"w": cell([np.arange(6.0).reshape(2, 3), np.float32([[7]])])}, {"name": "relu"}]),
-            "note": "text", "empty": np.zeros((0, 0)), "flag": np.array([[True]])},
+    "net": {
+        "layers": cell([{"w": cell([np.arange(6.0).reshape(2, 3), np.float32([[7]])])}, {"name": "relu"}]),
+        "note": "text",
+        "empty": np.zeros((0, 0)),
+        "flag": np.array([[True]]),
+    },
     "other": np.int16([[1, -2]]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_arrays_have_their_path(tmp_path, packed):
     arrays = read_checkpoint(write_matlab(tmp_path / "a.mat", CONTENT, packed=packed))
     assert {path: array.tolist() for path, array in arrays.items() if path != "net.flag"} == {
-        "net.layers.0.w.0": [[0, 1, 2], [3, 4, 5]], "net.layers.0.w.1": [[7]], "other": [[1, -2]],
-    }  # fmt: skip
+        "net.layers.0.w.0": [[0, 1, 2], [3, 4, 5]],
+        "net.layers.0.w.1": [[7]],
+        "other": [[1, -2]],
+    }
     assert arrays["net.layers.0.w.1"].dtype == np.float32
 
 

@@ -1,0 +1,391 @@
+"""Data sets that others published, each read from the folders it is published in, and their numbers of images."""
+
+import csv
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
+from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions
+from mfvpr.datasets.positives import rows_within
+from mfvpr.datasets.truth_files import truth_from_file
+from mfvpr.io.checks import parse_number
+from mfvpr.io.containers import reading
+from mfvpr.io.formats.matlab_files import read_matlab
+from mfvpr.io.formats.pickles import read_objects
+from mfvpr.utils.errors import InputError
+
+SEASONS = ("fall", "spring", "summer", "winter")
+REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-reference, whose images are 6,954
+CONDITIONS = ("dawn", "dusk", "night", "night-rain", "overcast-winter", "rain", "snow")
+CITIES = ("cph", "sf")
+
+SSM_LAYOUT = """Reference/image0000.png (or .jpg), ...  the database, numbered from 0
+Live/image0000.png (or .jpg), ...       the queries, numbered from 0
+GroundTruth.csv                         Reference,Live and then a line per query: both numbers"""
+LAYOUT_27592 = """summer/images-00202.png, ...  the database (or another of dataset.seasons)
+winter/images-00202.png, ...  the queries: the same names
+nordland_imageNames_index.txt, nordland_imageNames_query.txt  Patch-NetVLAD's lists, where the folders hold more"""
+LAYOUT_3450 = """summer_images_test/section1/*.png, section2/*.png  the database (or another of dataset.seasons)
+winter_images_test/section1/*.png, section2/*.png  the queries: the same names"""
+LAYOUT_VPRBENCH = """ref/0000000.jpg, ...    the database, in winter
+query/0000000.jpg, ...  the queries, in summer: query i shows database image 10 i"""
+ROBOTCAR_LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
+                                     {", ".join(CONDITIONS)}
+robotcar_v2_train.txt                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
+PITTSBURGH_LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...
+datasets/pitts30k_{part}.mat                                 lists and positions; or, as GSV-Cities has them,
+pitts30k_{part}_dbImages.npy, _qImages.npy, _gt.npy (_gt_25m.npy)"""
+MSLS_LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
+train_val/cph/query, train_val/sf/database, train_val/sf/query  the same; or, as GSV-Cities has them,
+msls_val_dbImages.npy, msls_val_qImages.npy, msls_val_qIdx.npy, msls_val_pIdx.npy  instead of the tables"""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published data set."""
+
+    name: str  # of the choice `dataset=`
+    title: str
+    layout: str  # contents of its folder, in lines
+    database: int  # published number of database images
+    queries: Mapping[str, int]  # published numbers of queries, by sequence
+    read: Callable[..., Dataset]  # `read(folder, name)`, with the keyword `seasons` if it has seasons
+    source: str
+    folders: tuple[str, ...]  # possible names of its folder below a folder of data sets: its own, its archive's
+    seasons: tuple[str, str] | None = None  # default (database, queries) if seasons can be chosen
+
+
+def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
+    """The data set `name` of `PUBLISHED`, from its folder `root`; `seasons` of Nordland are (database, queries).
+
+        data = published_dataset("gardens_point", "DIR")  # DIR has Reference/, Live/ and GroundTruth.csv
+
+    An `InputError` says which files and images are missing, damaged, or of another layout.
+    """
+    if name not in PUBLISHED:
+        raise InputError(f"{name}: expected a published data set, of {', '.join(PUBLISHED)}")
+    entry, root = PUBLISHED[name], Path(root)
+    if not root.is_dir():
+        got = "a file" if root.exists() else "nothing"
+        raise InputError(f"{root}: expected the folder of {name}, got {got}; it is to be had at {entry.source}")
+    if seasons is not None and not (entry.seasons and len({*seasons}) == 2 and {*seasons} <= {*SEASONS}):
+        raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(SEASONS)}")
+    options = {} if entry.seasons is None else {"seasons": seasons or entry.seasons}
+    try:
+        return entry.read(root, name, **options)
+    except InputError as error:
+        raise InputError(f"{error} (layout: mfvpr data list {name})") from error
+
+
+def published_differences(dataset: Dataset) -> Iterator[str]:
+    """Differences from the published numbers of images, in words; none for data sets that are not published."""
+    entry = PUBLISHED.get(dataset.name)
+    if entry is None:
+        return
+    if len(dataset.database) != entry.database:
+        yield f"{len(dataset.database):,} database images where {entry.database:,} are published"
+    for sequence in dataset.sequences:
+        got, number = len(sequence.images), entry.queries.get(sequence.name)
+        if number is None:
+            yield f"queries in {sequence.name}, which is none of its sequences"
+        elif got != number:
+            yield f"{got:,} queries in {sequence.name} where {number:,} are published"
+
+
+# Ground truth in frames. Nordland (Suenderhauf et al., 2013) is a train journey in four seasons. Its variants are
+# different data sets.
+
+
+def ssm_vpr(root: Path, name: str) -> Dataset:
+    """A data set of SSM-VPR (Camara and Preucil, 2020), which the paper uses as well: two folders and a table."""
+    database, queries = image_folder(root / "Reference"), image_folder(root / "Live")
+    for images in (database, queries):
+        for row, image in enumerate(images.names):  # the table has the numbers at the ends of the names
+            digits = re.search(r"(\d+)$", PurePosixPath(image).stem)
+            if digits is None or int(digits[1]) != row:
+                raise InputError(f"{images.root}: expected images numbered from 0 without gaps, got {image}")
+    truth = truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
+    return _dataset(name, database, queries, truth)
+
+
+def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
+    """Patch-NetVLAD's and gmberton's variant: every frame but tunnels and stations; correct within 10 frames."""
+    folders = []
+    for season, side in zip(seasons, ("index", "query"), strict=True):
+        origin = root / f"nordland_imageNames_{side}.txt"
+        if origin.exists():  # its names begin with other folders
+            folders.append(listed_images(root / season, [PurePosixPath(line).name for line in _lines(origin)], origin))
+        else:
+            folders.append(image_folder(root / season))
+    return _frame_pairs(name, *folders)
+
+
+def nordland_3450(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
+    """The test part of Olid, Facil and Civera (2018); correct within 2 frames of the same section."""
+    return _frame_pairs(name, *(image_folder(root / f"{season}_images_test") for season in seasons))
+
+
+def _frame_pairs(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
+    """Data set of equal frames of two seasons; each folder of the database is a drive."""
+    stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in (database, queries)]
+    if stems[0] != stems[1]:
+        differing = next((stem for pair in zip(*stems, strict=False) for stem in pair if pair[0] != pair[1]), None)
+        got = f"{len(queries):,} and {len(database):,} frames" + (f", first {differing} alone" if differing else "")
+        raise InputError(f"{queries.root}: expected the frames of {database.root}, got {got}; get the whole data set")
+    folders = [stem.parent for stem in stems[0]]
+    starts = tuple(row for row in range(1, len(folders)) if folders[row] != folders[row - 1])
+    truth = FrameTruth(tuple((row,) for row in range(len(queries))), len(database), starts=starts)
+    return _dataset(name, database, queries, truth)
+
+
+def nordland_vprbench(root: Path, name: str) -> Dataset:
+    """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame."""
+    database, queries = image_folder(root / "ref"), image_folder(root / "query")
+    if 10 * (len(queries) - 1) >= len(database):
+        raise InputError(f"{root}: expected 10 database images per query, got {len(database)} for {len(queries)}")
+    truth = FrameTruth(tuple((10 * row,) for row in range(len(queries))), len(database))
+    return _dataset(name, database, queries, truth)
+
+
+def robotcar_seasons(root: Path, name: str) -> Dataset:
+    """Oxford RobotCar Seasons (Sattler et al., CVPR 2018), version 2, as in the paper.
+
+    Images are those of the rear camera with public positions: summer is the database, seven other conditions are the
+    queries, in the order of their timestamps. The database image with the nearest camera is correct, and frames around
+    it. Queries without a database image within five meters are left out.
+    """
+    path = root / "robotcar_v2_train.txt"
+    with reading(path, "a list", "expected lines of a name and the 16 numbers of a pose by rows, the last 0 0 0 1"):
+        lines = [line.split() for line in _lines(path)]
+        poses = np.array([words[1:] for words in lines], np.float64).reshape(len(lines), 4, 4)
+        if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
+            raise ValueError("numbers that are no pose")
+    centers: dict[str, np.ndarray] = {}
+    for (image, *_), center in zip(lines, poses[:, :3, 3], strict=True):
+        image = PurePosixPath(image).with_suffix(".jpg").as_posix()
+        if not np.array_equal(centers.setdefault(image, center), center):
+            raise InputError(f"{path}: expected one pose of {image}, got another; get the file again")
+    sides = {}
+    for condition in (REFERENCE, *CONDITIONS):
+        names = sorted(image for image in centers if image.startswith(f"{condition}/rear/"))
+        if not names:
+            raise InputError(f"{path}: expected poses of {condition}/rear, got none; use the file of the data set")
+        sides[condition] = names, np.array([centers[image] for image in names])
+    database, places = sides.pop(REFERENCE)
+    sequences = []
+    for condition, (names, positions) in sides.items():
+        distances = np.linalg.norm(positions[:, None] - places, axis=-1)
+        near = np.flatnonzero(distances.min(axis=1) <= 5.0).tolist()
+        truth = FrameTruth(tuple((int(distances[query].argmin()),) for query in near), len(database))
+        queries = listed_images(root / "images", [names[query] for query in near], path)
+        sequences.append(QuerySequence(condition, queries, truth))
+    return Dataset(name, listed_images(root / "images", database, path), tuple(sequences))
+
+
+# Ground truth by position, or by the lists of GSV-Cities.
+
+
+def pitts30k(root: Path, name: str) -> Dataset:
+    """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016).
+
+    Database images are correct within a radius of the query, or within the lists' 25 m.
+    """
+    structures = [path for path in (root / f"datasets/{name}.mat", root / f"{name}.mat") if path.exists()]
+    if structures:
+        with (
+            reading(structures[0], mend=f"expected the structure dbStruct of {name}"),
+            structures[0].open("rb") as file,
+        ):
+            arrays = read_matlab(file, text=True)
+            names, positions = [], []
+            for images, xy in (("dbImageFns", "utmDb"), ("qImageFns", "utmQ")):
+                cells = [path for path in arrays if path.startswith(f"dbStruct.{images}.")]  # in order
+                names.append([str(arrays[path]) for path in cells])
+                positions.append(arrays[f"dbStruct.{xy}"].T.astype(np.float64))
+                require_positions(xy, positions[-1], len(cells))
+        database = listed_images(root, names[0], structures[0])
+        queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], structures[0])
+        return _dataset(name, database, queries, RadiusTruth(positions[1], positions[0]))
+    lists = [root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "gt_25m", "gt")]
+    database, queries, *truths = [path if path.exists() else None for path in lists]
+    truth = truths[0] or truths[1]
+    if database is None or queries is None or truth is None:
+        raise InputError(
+            f"{root}: expected datasets/{name}.mat, or {name}_dbImages.npy, {name}_qImages.npy and {name}_gt.npy, "
+            "found neither; get the whole data set"
+        )
+    return _dataset_of_lists(root, name, database, queries, truth)
+
+
+def msls_val(root: Path, name: str) -> Dataset:
+    """The validation part of Mapillary Street-Level Sequences (Warburg et al., CVPR 2020), without panoramas.
+
+    Queries have a database image within 25 m, as in its own code.
+    """
+    lists = [root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
+    if any(path.exists() for path in lists):
+        return _dataset_of_lists(root, name, *lists)
+    sides = []
+    for side in ("database", "query"):
+        names, positions = [], []
+        for folder in (root / "train_val" / city / side for city in CITIES):
+            raw, processed, tasks = (
+                _table(folder / f"{each}.csv") for each in ("raw", "postprocessed", "subtask_index")
+            )
+            if not raw.keys() == processed.keys() == tasks.keys():
+                raise InputError(f"{folder}: expected the same keys in raw, postprocessed and subtask_index.csv")
+            with reading(folder / "postprocessed.csv", mend="expected pano, all (True or False), easting, northing"):
+                for key, line in processed.items():
+                    if _FLAGS[tasks[key]["all"].lower()] and not _FLAGS[raw[key]["pano"].lower()]:
+                        names.append(f"train_val/{folder.parent.name}/{side}/images/{key}.jpg")
+                        positions.append([parse_number(line["easting"]), parse_number(line["northing"])])
+        xy = np.array(positions, np.float64).reshape(-1, 2)
+        require_positions(f"{root}: {side}", xy, len(names))
+        sides.append((names, xy))
+    (database, database_xy), (queries, query_xy) = sides
+    rows = [row for row, near in enumerate(rows_within(query_xy, database_xy, 25.0)) if len(near)]
+    images = listed_images(root, database, root / "train_val")
+    return _dataset(
+        name,
+        images,
+        listed_images(root, [queries[row] for row in rows], root / "train_val"),
+        RadiusTruth(query_xy[rows], database_xy),
+    )
+
+
+_FLAGS = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
+
+
+def _table(path: Path) -> dict[str, dict[str, str]]:
+    """Lines of a table by key."""
+    with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    table = {line.get("key", ""): line for line in lines}
+    if len(table) < len(lines):
+        raise InputError(f"{path}: expected a different key in every line, got {len(table)} in {len(lines)} lines")
+    return table
+
+
+def _dataset_of_lists(
+    root: Path, name: str, database_list: Path, query_list: Path, truth_list: Path, selection_list: Path | None = None
+) -> Dataset:
+    """Data set from the lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
+
+    `selection_list` has the rows of `query_list` that are queries; None = all.
+    """
+    database = listed_images(root, read_names(database_list), database_list)
+    names, rows = read_names(query_list), read_rows(truth_list, len(database))
+    if selection_list is not None:
+        names = [names[row] for selection in read_rows(selection_list, len(names)) for row in selection]
+    if len(rows) != len(names):
+        raise InputError(f"{truth_list}: expected rows of {len(names)} queries, got {len(rows)}")
+    truth = FrameTruth(tuple(rows), len(database), widened=False)
+    return _dataset(name, database, listed_images(root, names, query_list), truth)
+
+
+def _dataset(name: str, database: ImageFolder, queries: ImageFolder, truth: Truth) -> Dataset:
+    return Dataset(name, database, (QuerySequence(name, queries, truth),))
+
+
+def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder:
+    """The images below `root` with the names of a list; `origin` is the list, for messages."""
+    names = tuple(names)
+    if not names or len({*names}) < len(names):
+        raise InputError(f"{origin}: expected every image once, got {len(names) - len({*names})} twice of {len(names)}")
+    for name in names:
+        if name.startswith("/") or ".." in name.split("/"):
+            raise InputError(f"{origin}: expected names below {root}, got {name}")
+    missing = [name for name in names if not (root / name).is_file()]
+    if missing:
+        got = f"{len(missing):,} of the {len(names):,} images of {origin.name} are missing, the first is {missing[0]}"
+        raise InputError(f"{root}: {got}; get the whole data set")
+    return ImageFolder(root, names)
+
+
+def read_names(path: Path) -> list[str]:
+    """Read names from an `.npy` file of text."""
+    with reading(path, "a list", "expected an array of NumPy"), path.open("rb") as file:
+        names = np.lib.format.read_array(file, allow_pickle=False)
+    if names.ndim != 1 or names.dtype.kind != "U":
+        raise InputError(f"{path}: expected a list of names, got {names.dtype} {list(names.shape)}")
+    return names.tolist()
+
+
+def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
+    """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`."""
+    with reading(path, "a list", "expected lists of rows"), path.open("rb") as file:
+        is_pickle = b"'|O'" in file.read(128)
+        file.seek(0)
+        if is_pickle:
+            lists = [getattr(rows, "content", rows) for rows in read_objects(file, "lists of rows")]
+        else:
+            lists = np.lib.format.read_array(file, allow_pickle=False)
+        per_query = [np.asarray(rows).reshape(-1) for rows in lists]
+    for query, rows in enumerate(per_query):
+        if rows.size and rows.dtype.kind not in "iu":
+            raise InputError(f"{path}: expected lists of rows, got {rows.dtype}")
+        if rows.size and not 0 <= rows.min() <= rows.max() < num_database:
+            expected = f"rows from 0 to {num_database - 1}"
+            raise InputError(f"{path}: query {query}: expected {expected}, got {rows.min()} to {rows.max()}")
+    return [tuple(rows.tolist()) for rows in per_query]
+
+
+def _lines(path: Path) -> list[str]:
+    """Lines that are not empty, without the spaces around them."""
+    with reading(path, "a list"):
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+    return [stripped for line in text.splitlines() if (stripped := line.strip())]
+
+
+_SSM_VPR = (
+    ("berlin_a100", "Berlin A100: a motorway from two cars", 85, 81, "BerlinA100_RAS2020"),
+    ("berlin_halenseestrasse", "Berlin Halenseestrasse: a road and its bicycle lane", 67, 157, "Halen_RAS2020"),
+    ("berlin_kudamm", "Berlin Kudamm: a busy street from a bus and a bicycle", 201, 222, "Kudamm_RAS2020"),
+    ("gardens_point", "Gardens Point: a campus by day and at night", 200, 200, "Gardens_point_RAS2020"),
+    ("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
+)
+PUBLISHED = {
+    **{
+        name: Published(
+            name, f"{title}, as SSM-VPR has it", SSM_LAYOUT, database, {name: queries}, ssm_vpr,
+            "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", (name, archive),
+        )
+        for name, title, database, queries, archive in _SSM_VPR
+    },
+    "nordland_27592": Published(
+        "nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)", LAYOUT_27592, 27_592,
+        {"nordland_27592": 27_592}, nordland_27592, "https://github.com/QVPR/Patch-NetVLAD",
+        ("nordland_27592", "nordland"), ("summer", "winter"),
+    ),
+    "nordland_3450": Published(
+        "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", LAYOUT_3450, 3450,
+        {"nordland_3450": 3450}, nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
+        ("nordland_3450",), ("summer", "winter"),
+    ),
+    "nordland_vprbench": Published(
+        "nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", LAYOUT_VPRBENCH, 27_592,
+        {"nordland_vprbench": 2760}, nordland_vprbench, "https://github.com/MubarizZaffar/VPR-Bench",
+        ("nordland_vprbench",),
+    ),
+    "robotcar_seasons": Published(
+        "robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
+        ROBOTCAR_LAYOUT, 220, dict(zip(CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True)),
+        robotcar_seasons, "https://www.visuallocalization.net/datasets/", ("robotcar_seasons", "RobotCar-Seasons"),
+    ),
+    **{
+        f"pitts30k_{part}": Published(
+            f"pitts30k_{part}", f"Pittsburgh30k, {part} part", PITTSBURGH_LAYOUT.format(part=part), 10_000,
+            {f"pitts30k_{part}": queries}, pitts30k, "on request from its authors: https://github.com/Relja/netvlad",
+            (f"pitts30k_{part}", "pitts30k"),
+        )
+        for part, queries in (("val", 7608), ("test", 6816))
+    },
+    "msls_val": Published(
+        "msls_val", "Mapillary Street-Level Sequences, validation part", MSLS_LAYOUT, 18_871, {"msls_val": 740},
+        msls_val, "https://www.mapillary.com/dataset/places", ("msls_val", "msls"),
+    ),
+}  # fmt: skip
