@@ -28,7 +28,7 @@ def imported_packages(package):
 def test_core_imports_helpers_of_arrays_and_errors_alone():
     modules = {name for path in (ROOT / "core").rglob("*.py") for name in imported_modules(path)}
     ours = {name for name in modules if name.startswith("mfvpr.") and not name.startswith("mfvpr.core.")}
-    assert ours == {"mfvpr.utils.errors", "mfvpr.utils.numerics"}
+    assert ours == {"mfvpr.utils.errors", "mfvpr.utils.fields", "mfvpr.utils.numerics"}
     others = {name.split(".")[0] for name in modules - ours} - {"mfvpr"}
     assert others - sys.stdlib_module_names == {"jax", "jaxtyping", "lazy_loader", "numpy"}
 

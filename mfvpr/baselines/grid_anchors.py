@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from mfvpr.core.parameters import check_plain, choice, flag, integer
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import FLAG, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import masked
 
 LARGEST = 2**24  # float32 holds all integers up to it
@@ -38,13 +38,15 @@ class GridAnchors:
             up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
     """
 
-    side: int = integer(40, "cells per side", "as the features have", bounds=(1, 74), swept=False)
-    patch: int | None = integer(None, "cells", "odd; None = 3/4 of the side", bounds=(1, 73))
-    wrap: bool = flag(True, "flat numbers are compared, as published")
-    outside: str = choice("unequal", "zero", note="beyond the grid, of the CPU and of the GPU path")
+    side: int = setting(40, whole(1, 74), "as the features have", unit="cells per side", swept=False, static=True)
+    patch: int | None = setting(None, whole(1, 73) | None, "odd; None = 3/4 of the side", unit="cells", static=True)
+    wrap: bool = setting(True, FLAG, "flat numbers are compared, as published", static=True)
+    outside: str = setting(
+        "unequal", one_of("unequal", "zero"), "beyond the grid, of the CPU and of the GPU path", static=True
+    )
 
     def __post_init__(self) -> None:
-        check_plain(self)
+        check_fields(self)
         if self.side < 1 or not 1 <= self.size <= self.side or self.size % 2 == 0:
             raise InputError(
                 f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd patch up to it"

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.baselines import planes
 from mfvpr.baselines.rapid import query_features
-from mfvpr.core.parameters import check_plain, choice, flag, integer, number
 from mfvpr.core.shifts import require_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
+from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, number, one_of, setting, whole
 from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
 
 _MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
@@ -55,16 +55,16 @@ class Homography:
         seed: of the samples.
     """
 
-    threshold: float | Array = number(24.0, "px")
-    max_iterations: float | Array = number(2000.0, "samples", "at most", bounds=(1.0, 1e6))
-    confidence: float | Array = number(0.995, "", "that a sample was all inliers", bounds=(1e-6, 0.999999))
-    measure: str = choice("inliers", "msac")
-    refit: bool = flag(False, "count again after least squares")
-    few: str = choice("count", "zero", note="less than 4 matches")
-    per_feature: bool = flag(False)
-    seed: int = integer(0, "", "of the samples", bounds=(0, 2**31 - 1), swept=False)
+    threshold: float | Array = setting(24.0, POSITIVE, unit="px")
+    max_iterations: float | Array = setting(2000.0, number(1.0, 1000000.0), "at most", unit="samples")
+    confidence: float | Array = setting(0.995, number(1e-06, 0.999999), "that a sample was all inliers")
+    measure: str = setting("inliers", one_of("inliers", "msac"), static=True)
+    refit: bool = setting(False, FLAG, "count again after least squares", static=True)
+    few: str = setting("count", one_of("count", "zero"), "less than 4 matches", static=True)
+    per_feature: bool = setting(False, FLAG, static=True)
+    seed: int = setting(0, whole(0, 2**31 - 1), "of the samples", swept=False, static=True)
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

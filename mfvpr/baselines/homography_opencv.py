@@ -6,9 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.core.parameters import check_bounds, check_plain, choice, number
+from mfvpr.core.parameters import check_bounds
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import POSITIVE, check_fields, number, one_of, setting
 from mfvpr.utils.numerics import available_cpus, is_concrete
 
 
@@ -31,13 +32,13 @@ class OpenCvHomography:
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD).
     """
 
-    threshold: float | Array = number(24.0, "px")
-    max_iterations: float | Array = number(2000.0, "samples", "at most", bounds=(1.0, 1e6))
-    confidence: float | Array = number(0.995, "", "that a sample was all inliers", bounds=(1e-6, 0.999999))
-    estimator: str = choice("ransac", "magsac")
-    few: str = choice("count", "zero", note="less than 4 matches")
+    threshold: float | Array = setting(24.0, POSITIVE, unit="px")
+    max_iterations: float | Array = setting(2000.0, number(1.0, 1000000.0), "at most", unit="samples")
+    confidence: float | Array = setting(0.995, number(1e-06, 0.999999), "that a sample was all inliers")
+    estimator: str = setting("ransac", one_of("ransac", "magsac"), static=True)
+    few: str = setting("count", one_of("count", "zero"), "less than 4 matches", static=True)
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
         """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""

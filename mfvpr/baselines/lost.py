@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.core.parameters import check_plain, choice, flag
 from mfvpr.core.shifts import image_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
+from mfvpr.utils.fields import FLAG, check_fields, one_of, setting
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, safe_sqrt, where_finite
 
 _Values = Float[Array, " slots"]
@@ -36,10 +36,10 @@ class LostScore:
         mirrored: count the query's x from the right, W - 1 - x, for images with opposite viewing directions.
     """
 
-    form: str = choice("weighted", "unweighted", "described")
-    mirrored: bool = flag(False, "views from opposite directions")
+    form: str = setting("weighted", one_of("weighted", "unweighted", "described"), static=True)
+    mirrored: bool = setting(False, FLAG, "views from opposite directions", static=True)
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

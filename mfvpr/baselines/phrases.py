@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.core.parameters import check_plain, choice, integer, number
 from mfvpr.core.shifts import match_shifts
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
+from mfvpr.utils.fields import POSITIVE, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import masked, positive, where_finite
 
 MAX_LENGTH = 8  # the number of phrases of 100,000 matches still fits into float32
@@ -30,14 +30,11 @@ class VisualPhrases:
         align: `zero_center` centers a cell on shift 0; `zero_edge` puts an edge there. Edges belong to the upper cell.
     """
 
-    length: int = integer(2, "matches of a phrase", bounds=(1, MAX_LENGTH))
-    cell_size: float | Array = number(15.0, "px")
-    align: str = choice("zero_center", "zero_edge")
+    length: int = setting(2, whole(1, MAX_LENGTH), unit="matches of a phrase", static=True)
+    cell_size: float | Array = setting(15.0, POSITIVE, unit="px")
+    align: str = setting("zero_center", one_of("zero_center", "zero_edge"), static=True)
 
-    def __post_init__(self) -> None:
-        check_plain(self)
-        if not 1 <= self.length <= MAX_LENGTH:
-            raise ValueError(f"VisualPhrases(length={self.length}): expected from 1 to {MAX_LENGTH} matches")
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.core.parameters import check_plain, choice, flag, numbers
 from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, list_of, one_of, setting
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_finite
 
 
@@ -31,11 +31,13 @@ class RapidSpatialScore:
             a query's candidates stays the same; scores of scales with different numbers of patches become comparable.
     """
 
-    reach: str = choice("image_size", "largest_coordinate", "largest_shift")
-    size: tuple[float, float] | None = numbers(None, 2, "[x, y] px", "None = what reach says")
-    per_feature: bool = flag(False)
+    reach: str = setting("image_size", one_of("image_size", "largest_coordinate", "largest_shift"), static=True)
+    size: tuple[float, float] | None = setting(
+        None, list_of(POSITIVE, 2) | None, "None = what reach says", unit="[x, y] px", swept=False
+    )
+    per_feature: bool = setting(False, FLAG, static=True)
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32; an InputError if `per_feature` is set and the matches have no `count0`."""

@@ -7,7 +7,7 @@
 
 Read first: programs (the command `mfvpr`), schema (settings of the programs), command_line (Hydra), systems
 (`load_system`), sweeps (`mfvpr.sweep`). Settings become systems in `mfvpr.systems`; they become the inputs of a job in
-inputs, with notes about them, and its parts in build, truth and confidences. Jobs share run_folder, axes, console.
+inputs, with notes about them. Jobs share run_folder, confidences, console.
 """
 
 import lazy_loader

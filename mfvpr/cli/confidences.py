@@ -81,22 +81,19 @@ def other_settings(
     return names + ["candidates"] * (origin.get("candidates") != candidates)
 
 
-def _query_fingerprints(by_side: Any) -> set[str]:
+def _query_fingerprints(by_side: Mapping[str, str] | None) -> set[str]:
     """Fingerprints of the folders with queries; a database may be that of many runs."""
-    sides = by_side.items() if isinstance(by_side, Mapping) else ()
-    return {folder for side, folder in sides if side != "database" and isinstance(folder, str)}
+    return {folder for side, folder in (by_side or {}).items() if side != "database"}
 
 
-def _settings_of(names: Collection[str], settings: Any) -> dict[str, Any]:
+def _settings_of(names: Collection[str], settings: Mapping[str, Any] | None) -> dict[str, Any]:
     """The settings that scores depend on; files of match weights are compared by content, not by name."""
-    scorers = settings.get("scorer") if isinstance(settings, Mapping) else None
-    if not isinstance(scorers, Mapping) or not isinstance(scorers.get("method", ""), str):
-        return {}
-    parts = {name: values for name, values in assembly.by_scorer(scorers).items() if name in names}
+    scorers = assembly.by_scorer((settings or {}).get("scorer", {}))
+    parts = {name: values for name, values in scorers.items() if name in names}
     for name, values in parts.items():
-        if isinstance(values, Mapping) and "weight_content" in values:
+        if "weight_content" in values:
             parts[name] = {**values, "weight": None}
-    return {**settings, "scorer": parts}
+    return {**(settings or {}), "scorer": parts}
 
 
 def scoring_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

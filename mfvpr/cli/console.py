@@ -30,8 +30,6 @@ def one_line() -> Iterator[None]:
     """Exit with 2 and one line for wrong input, with 130 for Ctrl-C, 141 for a closed stdout; a bug is a traceback."""
     try:
         yield
-    except SystemExit:  # before Hydra's errors, whose import is slow
-        raise
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process ends, whatever comes
         print("\ninterrupted; what was finished is kept", file=sys.stderr)
@@ -39,24 +37,18 @@ def one_line() -> Iterator[None]:
     except BrokenPipeError:  # as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
-    except _hydra_errors() as error:
-        refuse(explain(error))
     except InputError as error:
-        refuse(str(error))
-    except ValueError as error:
-        if not str(error).startswith("Config group override"):  # Hydra's, of GROUP=null
-            raise
         refuse(str(error))
     except OSError as error:
         refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except Exception as error:
+        from hydra.errors import HydraException  # here: its import is slow, and Ctrl-C must be handled before
+        from omegaconf.errors import OmegaConfBaseException
 
-
-def _hydra_errors() -> tuple[type[Exception], ...]:
-    """Hydra's errors; its import is slow, and Ctrl-C must be handled before."""
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    return HydraException, OmegaConfBaseException
+        is_group = str(error).startswith("Config group override")  # Hydra's ValueError, of GROUP=null
+        if not is_group and not isinstance(error, HydraException | OmegaConfBaseException):
+            raise
+        refuse(explain(error))
 
 
 def explain(error: Exception) -> str:
@@ -64,8 +56,9 @@ def explain(error: Exception) -> str:
     text = " ".join((str(error) or str(error.__cause__)).split())
     for rest in (" Config search path", " See https", " To append to your config", " object_type="):
         text = text.partition(rest)[0]
-    if new := _new_name(text):
-        return f"{text.removesuffix('.')}; its name is {new} now"
+    for old, new in _OTHER_NAMES.items():
+        if f"'{old}'" in text:
+            return f"{text.removesuffix('.')}; its name is {new} now"
     if text.startswith("Could not override"):
         return f"{text.removesuffix('.')}: there is no such setting here; --help lists all"
     if text.startswith("Missing mandatory value"):
@@ -79,11 +72,6 @@ def refuse(reason: str) -> NoReturn:
     """Print one line on stderr and exit with code 2."""
     print("error:", *reason.encode(errors="backslashreplace").decode().splitlines(), file=sys.stderr)
     sys.exit(2)
-
-
-def _new_name(text: str) -> str | None:
-    """The name of a setting now, if an error is about one that had another name."""
-    return next((new for old, new in _OTHER_NAMES.items() if f"'{old}'" in text), None)
 
 
 def track(label: str) -> "Track":

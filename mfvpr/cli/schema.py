@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -336,7 +336,7 @@ def axes() -> dict[str, Setting]:
     known = {name: each[-1] for name, each in sorted(owners.items(), key=lambda item: len(item[1]) > 1)}
     known["c"] = Setting(None, NOT_NEGATIVE | "auto")
     known["max_distance"] = choices_of("matching")["neighbors"]["max_distance"]  # of sweeps alone
-    return {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in known.items()}
+    return _lists(known)
 
 
 def register() -> None:
@@ -368,8 +368,13 @@ def register() -> None:
 def _axes_of(scorer: Mapping[str, Any]) -> dict[str, Setting]:
     """The axes of all scorers, with the allowed values of the chosen one."""
     own = choices_of("scorer").get(scorer.get("method", ""), {})
-    own = {name: Setting(None, list_of(each.rule) | None, each.note) for name, each in own.items()}
+    own = _lists(own)
     return {name: own.get(name, each) for name, each in axes().items()}
+
+
+def _lists(known: Mapping[str, Setting]) -> dict[str, Setting]:
+    """Settings that are lists of values of others."""
+    return {name: replace(each, default=None, rule=list_of(each.rule) | None) for name, each in known.items()}
 
 
 def _data_set_schema(settings: Mapping[str, Any]) -> dict[str, Setting]:
@@ -405,6 +410,8 @@ def _lines(known: Mapping[str, Any], settings: Mapping[str, Any], indent: str = 
             yield f"{indent}{name}:"
             yield from _lines(about if isinstance(about, Mapping) else {}, value, f"{indent}  ")
         else:
-            words = [about.note.replace("None", "null"), about.rule.expected] if isinstance(about, Setting) else []
+            words = ""
+            if isinstance(about, Setting):
+                words = "; ".join(filter(None, [about.unit, about.note.replace("None", "null"), about.rule.expected]))
             shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else value
-            yield f"{indent}{name}: {shown}" + f"  # {'; '.join(filter(None, words))}" * bool(words)
+            yield f"{indent}{name}: {shown}" + f"  # {words}" * bool(words)

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.core.parameters import check_plain, choice, flag, number
 from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
+from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, one_of, setting
 from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 
 
@@ -37,11 +37,13 @@ class AggregatedScore:
     """
 
     weight: Weight = weight_field("dmf")
-    mean: str = choice("unweighted", "weighted", "median")
-    clamp: bool = flag(False)
-    temperature: float | Array | None = number(None, "px", "above 0 is smooth; None = the paper's", learned=True)
+    mean: str = setting("unweighted", one_of("unweighted", "weighted", "median"), static=True)
+    clamp: bool = setting(False, FLAG, static=True)
+    temperature: float | Array | None = setting(
+        None, POSITIVE | None, "above 0 is smooth; None = the paper's", unit="px", learned=True
+    )
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""
@@ -76,9 +78,9 @@ class MatchCount:
         single: score of a pair with exactly one match: `count` it, or `zero`, as SelaVPR's code does by accident.
     """
 
-    single: str = choice("count", "zero", note="a pair with one match")
+    single: str = setting("count", one_of("count", "zero"), "a pair with one match", static=True)
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.core.parameters import check_plain, choice, flag, integer, number
 from mfvpr.core.shifts import image_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
+from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 
 MAX_BINS = 215  # per side: numbers of pairs of cells then fit into 32 bits
@@ -57,20 +57,20 @@ class AnchorPoints:
     below it at 0.1 and 43 % at 0.3.
     """
 
-    num_bins: int = integer(15, "cells per side", bounds=(1, 32))  # the soft form's memory
-    window: float | Array = number(10.0, "cells")
-    tolerance: float | Array = number(3.0, "cells", learned=True)
+    num_bins: int = setting(15, whole(1, 32), unit="cells per side", static=True)  # the soft form's memory
+    window: float | Array = setting(10.0, POSITIVE, unit="cells")
+    tolerance: float | Array = setting(3.0, POSITIVE, unit="cells", learned=True)
     weight: Weight = weight_field("fs")
-    window_mode: str = choice("half_floor", "asymmetric", "odd_down", "radius")
-    first: str = choice("query", "candidate")
-    include_self: bool = flag(True)
-    cell_weight: str = choice("winner_sum", "cell_sum", "ones")
-    temperature: float | Array | None = number(
-        None, note="above 0 is smooth; None = the paper's", learned=True, start=0.03
+    window_mode: str = setting("half_floor", one_of("half_floor", "asymmetric", "odd_down", "radius"), static=True)
+    first: str = setting("query", one_of("query", "candidate"), static=True)
+    include_self: bool = setting(True, FLAG, static=True)
+    cell_weight: str = setting("winner_sum", one_of("winner_sum", "cell_sum", "ones"), static=True)
+    temperature: float | Array | None = setting(
+        None, POSITIVE | None, "above 0 is smooth; None = the paper's", learned=True, start=0.03
     )
 
     def __post_init__(self) -> None:
-        check_plain(self)
+        check_fields(self)
         if not 0 < self.num_bins <= MAX_BINS:
             raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
 

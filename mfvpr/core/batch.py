@@ -285,6 +285,6 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
     parameters = parameters_of(scorer) if is_dataclass(scorer) else {}
-    if isinstance(points, np.ndarray) and name in parameters and not parameters[name].choices:
-        parameters[name].check(name, points)
+    if isinstance(points, np.ndarray) and name in parameters:
+        parameters[name].check_numbers(name, points)
     return points

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.core.parameters import SCORE, check_plain, choice, flag, integer, number, numbers
+from mfvpr.core.parameters import SCORE
 from mfvpr.core.shifts import image_sizes, match_shifts, require_sizes
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import Weight, match_weights, weight_field
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, POSITIVE, check_fields, list_of, one_of, setting, whole
 from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt
 
 MAX_BINS = 1024  # per axis: the histograms of 50 pairs then take 200 MB
@@ -77,24 +78,37 @@ class HistogramOfShifts:
             not above 0 scores NaN.
     """
 
-    bin_size: float | Array = number(15.0, "px")
-    sigma: float | Array = number(22.5, "px", learned=True)
+    bin_size: float | Array = setting(15.0, POSITIVE, unit="px")
+    sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)
     weight: Weight = weight_field("fs")
-    truncate: float | Array = number(math.inf, "sigmas", "vote only within so many; None = for all bins")
-    shift_range: tuple[float, float] | None = numbers(
-        None, 2, "[x, y] px", "None = all possible shifts", bounds=(0.0, 1e12)
+    truncate: float | Array = setting(
+        math.inf,
+        POSITIVE | None,
+        "vote only within so many; None = for all bins",
+        unit="sigmas",
+        none=math.inf,
     )
-    align: str = choice("min_edge", "zero_center", "zero_edge")
-    sigma_is_variance: bool = flag(False)
-    direction: str = choice("candidate_minus_query", "query_minus_candidate")
-    max_bins: int | None = integer(
-        None, "capacity per axis", "None = what the image size needs", bounds=(1, MAX_BINS), swept=False
+    shift_range: tuple[float, float] | None = setting(
+        None, list_of(NOT_NEGATIVE, 2) | None, "None = all possible shifts", unit="[x, y] px", swept=False
     )
-    temperature: float | Array | None = number(
-        None, SCORE, "above 0 is smooth; None = the paper's", learned=True, start=0.1
+    align: str = setting("min_edge", one_of("min_edge", "zero_center", "zero_edge"), static=True)
+    sigma_is_variance: bool = setting(False, FLAG, static=True)
+    direction: str = setting(
+        "candidate_minus_query", one_of("candidate_minus_query", "query_minus_candidate"), static=True
+    )
+    max_bins: int | None = setting(
+        None,
+        whole(1, MAX_BINS) | None,
+        "None = what the image size needs",
+        unit="capacity per axis",
+        swept=False,
+        static=True,
+    )
+    temperature: float | Array | None = setting(
+        None, POSITIVE | None, "above 0 is smooth; None = the paper's", unit=SCORE, learned=True, start=0.1
     )
 
-    __post_init__ = check_plain
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""

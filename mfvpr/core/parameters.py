@@ -1,13 +1,12 @@
 """Parameters of scorers: declared at the field, from which settings, sweeps and learning follow; by dotted name.
 
-sigma: float | Array = number(22.5, "px", learned=True)     # a field of a scorer
+sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)  # a field of a scorer
 parameters_of(HistogramOfShifts)["sigma"].unit              # "px"
 with_parameters(scorer, {"inner.sigma": 10.0})              # a field of a part
 """
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import jax
@@ -17,101 +16,20 @@ from jax.tree_util import GetAttrKey
 from jaxtyping import Num
 
 from mfvpr.core.types import Array
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import Setting
 
-POSITIVE = (1e-6, 1e12)  # beyond these bounds float32 silently overflows or underflows
 SCORE = "units of the score"
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """Declaration of one field in plain values: numbers, words, flags, lists, None."""
-
-    default: Any
-    unit: str = ""
-    note: str = ""
-    choices: tuple[Any, ...] = ()  # all allowed values; empty = numbers within `bounds`
-    bounds: tuple[float, float] = POSITIVE
-    whole: bool = False  # numbers are integers
-    length: int = 0  # of a list of numbers; 0 = one number
-    none: float | None = None  # field value for None, which is allowed if it is the default
-    swept: bool = True  # offered as an axis of a sweep
-    learned: bool = False  # a gradient may change the field
-    start: float = 1.0  # of learning if the value is None; for the unit `SCORE` in units of the scores' spread
-
-    def value(self, plain: Any) -> Any:
-        """Field value of a plain value; the words of a weight stand for themselves."""
-        if plain is None:
-            return self.none
-        return tuple(map(float, plain)) if self.length else plain
-
-    def check(self, name: str, value: Any) -> None:
-        """Raise an InputError if a concrete number, or one of several, is out of bounds."""
-        values, (low, high) = np.ravel(np.asarray(value, float)), self.bounds
-        if not ((values >= low) & (values <= high) | (values == self.none)).all():
-            raise InputError(f"{name}={value}: expected numbers from {low:g} to {high:g}")
+def parameters_of(method: Any) -> dict[str, Setting]:
+    """Declared fields of a class, or of an instance, by name."""
+    return {f.name: f.metadata["setting"] for f in fields(method) if "setting" in f.metadata}
 
 
-def declare(default: Any, parameter: Parameter, *, static: bool = False) -> Any:
-    """A field of a value with a default and its declaration."""
-    return field(default=default, metadata={"static": static, "parameter": parameter})
-
-
-def number(
-    default: float | None, unit: str = "", note: str = "", *, bounds: tuple[float, float] = POSITIVE, **more: Any
-) -> Any:
-    """Declare a number; None is allowed if the default is None, or infinite (None = infinite)."""
-    plain, none = (None, math.inf) if default == math.inf else (default, None)
-    return declare(default, Parameter(plain, unit, note, bounds=bounds, none=none, **more))
-
-
-def numbers(
-    default: Sequence[float] | None, length: int, unit: str = "", note: str = "", *, bounds: tuple = POSITIVE
-) -> Any:
-    """Declare a tuple of `length` numbers, None is allowed if it is the default."""
-    plain = None if default is None else list(default)
-    return declare(default, Parameter(plain, unit, note, bounds=bounds, length=length, swept=False))
-
-
-def integer(default: int | None, unit: str = "", note: str = "", *, bounds: tuple[int, int], swept: bool = True) -> Any:
-    """Declare a static integer, such as a capacity; None is allowed if it is the default."""
-    return declare(default, Parameter(default, unit, note, bounds=bounds, whole=True, swept=swept), static=True)
-
-
-def choice(default: str, *alternatives: str, note: str = "") -> Any:
-    """Declare a static word, one of `default` and the alternatives."""
-    return declare(default, Parameter(default, note=note, choices=(default, *alternatives)), static=True)
-
-
-def flag(default: bool, note: str = "") -> Any:
-    """Declare a static boolean."""
-    return declare(default, Parameter(default, note=note, choices=(True, False)), static=True)
-
-
-def parameters_of(method: Any) -> dict[str, Parameter]:
-    """Parameters of a class, or of an instance, by name of the field."""
-    return {f.name: f.metadata["parameter"] for f in fields(method) if "parameter" in f.metadata}
-
-
-def check_plain(method: Any) -> None:
-    """Raise an InputError for a word that is not one of the choices, for no weight, or a Python float out of bounds."""
-    for f in fields(method):
-        choices, value = getattr(f.metadata.get("parameter"), "choices", ()), getattr(method, f.name)
-        is_weight = callable(f.default)  # its choices are words of settings
-        if choices and not (callable(value) if is_weight else value in choices):
-            expected = "a weight such as RatioWeight()" if is_weight else f"one of {', '.join(map(str, choices))}"
-            raise InputError(f"{type(method).__name__}({f.name}={value!r}): expected {expected}")
-    check_bounds(method, all_arrays=False)
-
-
-def check_bounds(method: Any, *, all_arrays: bool = True) -> None:
-    """Raise an InputError if a field holds a number out of bounds; no number may be traced if `all_arrays` count."""
+def check_bounds(method: Any) -> None:
+    """Raise an InputError if a field holds a number out of bounds; none may be traced."""
     for name, parameter in parameters_of(method).items():
-        value = getattr(method, name)
-        parts = value if isinstance(value, tuple) else (value,)
-        is_plain = not parameter.whole and all(isinstance(part, int | float) for part in parts)
-        if not parameter.choices and value is not None and (is_plain or all_arrays):
-            parameter.check(name, value)
+        parameter.check_numbers(name, getattr(method, name))
 
 
 def numbers_by_name(scorer: Any) -> dict[str, Any]:

@@ -1,15 +1,15 @@
 """Match weights (paper, section IV-B): functions of one pair's Matches that return one weight w_k per slot."""
 
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Num
 
-from mfvpr.core.parameters import Parameter, declare
 from mfvpr.core.types import INDICES, Array, Matches, per_match, value
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import Setting, one_of
 from mfvpr.utils.numerics import as_float, at_least_single, masked
 
 
@@ -105,7 +105,8 @@ WEIGHTS: dict[str, Weight] = {
 
 def weight_field(word: str) -> Any:
     """Declare a field that holds a weight, by default the one of a word."""
-    return declare(WEIGHTS[word], Parameter(word, choices=tuple(WEIGHTS)))
+    about = Setting(word, one_of(*WEIGHTS))
+    return field(default=WEIGHTS[word], metadata={"setting": about})
 
 
 def match_weights(weight: Weight, matches: Matches) -> Float[jax.Array, " slots"]:

@@ -3,12 +3,11 @@
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.core.parameters import POSITIVE
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation.rankings import FRAMES, RETRIEVAL, Ranked
 from mfvpr.evaluation.sequences import DriveFilter
@@ -22,6 +21,7 @@ from mfvpr.evaluation.shortlist_scores import (
     retrieval_scores,
 )
 from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE
 
 
 @dataclass(frozen=True)
@@ -56,16 +56,14 @@ class Fusion:
         known = ", ".join(scorers) or "there are none"
         if main not in scorers:
             raise InputError(f"fused: expected names of scorers ({known}), got {main}")
-        if self.c not in (None, "zscore") and not _between(self.c, 0, POSITIVE[1]):
-            raise InputError(f"c={self.c!r}: expected a number from 0 to {POSITIVE[1]:g}, 'zscore', or None")
+        if self.c not in (None, "zscore") and not NOT_NEGATIVE.holds(self.c):
+            raise InputError(f"c={self.c!r}: expected {NOT_NEGATIVE.expected}, 'zscore', or None")
         if self.weights and self.c != "zscore":
             raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
         for name, weight in self.weights.items():
             if name not in {RETRIEVAL, *scorers}:
                 raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it as well")
-            if not _between(weight, *POSITIVE):
-                bounds = f"{POSITIVE[0]:g} to {POSITIVE[1]:g}"
-                raise InputError(f"weights: expected numbers from {bounds}, got {name}={weight!r}")
+            POSITIVE.check(f"weights.{name}", weight)
 
     def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
         """Combined scores, from scores by name of the scorer."""
@@ -195,7 +193,3 @@ def rank_by_scores(
         ranked = (np.take_along_axis(values, order, axis=1) for values in (candidates.indices, known[score.name]))
         rankings[score.name] = Ranked(*ranked)
     return rankings
-
-
-def _between(value: Any, low: float, high: float) -> bool:
-    return isinstance(value, int | float | np.number) and bool(low <= value <= high)

@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from mfvpr.datasets.ground_truth import Unit
 from mfvpr.datasets.positives import Positives, stack_positives
@@ -121,13 +120,15 @@ def _traversal_order(shown: Positives) -> np.ndarray:
     """Position `[N]` of each image in a traversal of its connected part of the map from an end."""
     queries, size = len(shown), len(shown) + shown.num_database
     pairs = np.repeat(np.arange(queries), shown.counts), queries + shown.rows
-    graph = coo_array((np.ones(2 * len(pairs[0])), (np.append(*pairs), np.append(*pairs[::-1]))), shape=(size, size))
+    graph = scipy.sparse.coo_array(
+        (np.ones(2 * len(pairs[0])), (np.append(*pairs), np.append(*pairs[::-1]))), shape=(size, size)
+    )
     graph = graph.tocsr()
-    _, part = connected_components(graph, directed=False)
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rank, visited = np.zeros(size, int), 0
     for start in np.unique(part[pairs[1]], return_index=True)[1]:
-        end = breadth_first_order(graph, pairs[1][start], return_predecessors=False)[-1]
-        order = breadth_first_order(graph, end, return_predecessors=False)
+        end = scipy.sparse.csgraph.breadth_first_order(graph, pairs[1][start], return_predecessors=False)[-1]
+        order = scipy.sparse.csgraph.breadth_first_order(graph, end, return_predecessors=False)
         rank[order] = np.arange(visited, visited + len(order))
         visited += len(order)
     return rank[queries:]

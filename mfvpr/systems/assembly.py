@@ -248,14 +248,10 @@ def _scorer(name: str, values: Mapping[str, Any]) -> Scorer:
     """A scorer from plain values by field: a weight is a word, null is no limit, a list a tuple of numbers."""
     scorer = SCORERS[values["method"]]
     parameters = parameters_of(scorer)
-    fields: dict[str, Any] = {}
-    for field, plain in without(values, "method").items():
-        if field == "weight":
-            fields[field] = named_weight(plain)
-        elif plain is None:
-            fields[field] = parameters[field].none
-        else:
-            fields[field] = tuple(map(float, plain)) if parameters[field].length else plain
+    fields: dict[str, Any] = {
+        name: named_weight(plain) if name == "weight" else parameters[name].value(plain)
+        for name, plain in without(values, "method").items()
+    }
     with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
         return scorer(**fields)
 

@@ -3,9 +3,8 @@
 A choice that is named in a file is looked up here; nothing else can be made.
 """
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -13,8 +12,6 @@ from typing import Any, Literal
 from mfvpr import features
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.core.parameters import Parameter, parameters_of
-from mfvpr.core.weights import WEIGHTS
 from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
 from mfvpr.io.checks import Lengths
@@ -35,7 +32,6 @@ from mfvpr.utils.fields import (
     check_values,
     group,
     list_of,
-    number,
     one_of,
     or_list,
     setting,
@@ -152,27 +148,13 @@ def _matching() -> dict[str, dict[str, Any]]:
 
 
 def _scorer(scorer: type) -> dict[str, Setting]:
-    """Settings of a scorer from its parameters."""
-    known = parameters_of(scorer)
-    return {each.name: _parameter(each.name, known[each.name], each.default) for each in fields(scorer)
-            if each.name in known}  # fmt: skip
-
-
-def _parameter(name: str, parameter: Parameter, default: Any) -> Setting:
-    if name == "weight":
+    """Settings of a scorer from its fields; a match weight may also be one that is named, or a file."""
+    known = settings_of(scorer)
+    if "weight" in known:
         files = text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
-        word = next(word for word, weight in WEIGHTS.items() if weight == default)
-        return Setting(word, one_of(*NAMED_WEIGHTS) | files, "a list: a scorer of each")
-    if parameter.choices:
-        rule = one_of(*parameter.choices)
-    else:
-        low, high = parameter.bounds
-        rule = whole(int(low), int(high)) if parameter.whole else number(low, high)
-    rule = list_of(rule, parameter.length) if parameter.length else rule
-    plain = None if default is None or default == math.inf else default
-    plain = [*plain] if isinstance(plain, tuple) else plain
-    rule = rule | None if plain is None else rule
-    return Setting(plain, rule, "; ".join(filter(None, (parameter.unit, parameter.note))))
+        rule, note = one_of(*NAMED_WEIGHTS) | files, "a list: a scorer of each"
+        known["weight"] = replace(known["weight"], rule=rule, note=note)
+    return known
 
 
 @cache

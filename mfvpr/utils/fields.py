@@ -1,18 +1,18 @@
 """Settings: fields of frozen dataclasses with a default, the allowed values, and a sentence.
 
-    @dataclass(frozen=True)
-    class Sift:
-        max_keypoints: int | None = setting(800, whole(1, 20_000) | None, "the highest scores are kept; null = all")
+    @value
+    class HistogramOfShifts:
+        sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)
+        max_bins: int | None = setting(None, whole(1, 1024) | None, "null = what the image size needs", static=True)
 
-        def __post_init__(self) -> None:
-            check_fields(self)
+        __post_init__ = check_fields
 
-Programs make their settings, and what `--help` says about them, from these fields.
+Programs make their settings, what `--help` says about them, and the axes of sweeps and learning from these fields.
 """
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar, get_args
 
 import numpy as np
@@ -31,12 +31,14 @@ class Rule:
 
     holds: Callable[[Any], bool]
     expected: str
+    bounds: tuple[float, float] | None = None  # of numbers
+    is_whole: bool = False  # numbers are integers
 
     def __or__(self, other: Any) -> "Rule":
         if not isinstance(other, Rule):
             other = one_of(other)
         words = f"{self.expected}, or {other.expected.removeprefix('one of ')}"
-        return Rule(lambda value: self.holds(value) or other.holds(value), words)
+        return replace(self, holds=lambda value: self.holds(value) or other.holds(value), expected=words)
 
     def check(self, name: str, value: Any) -> None:
         """Raise an InputError for a value that is not allowed."""
@@ -75,7 +77,7 @@ def number(low: float, high: float) -> Rule:
         is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
         return is_number and bool(low <= value <= high)
 
-    return Rule(holds, f"a number from {low:g} to {high:g}")
+    return Rule(holds, f"a number from {low:g} to {high:g}", (low, high))
 
 
 def whole(low: int, high: int) -> Rule:
@@ -84,7 +86,7 @@ def whole(low: int, high: int) -> Rule:
     def holds(value: Any) -> bool:
         return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
 
-    return Rule(holds, f"a whole number from {low} to {high}")
+    return Rule(holds, f"a whole number from {low} to {high}", (low, high), is_whole=True)
 
 
 def list_of(rule: Rule, length: int = 0) -> Rule:
@@ -94,7 +96,7 @@ def list_of(rule: Rule, length: int = 0) -> Rule:
         has_length = isinstance(value, list | tuple) and (len(value) == length if length else bool(value))
         return has_length and all(map(rule.holds, value))
 
-    return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}")
+    return Rule(holds, f"a list of {length or 'one or more'}, each {rule.expected}", rule.bounds)
 
 
 def or_list(rule: Rule) -> Rule:
@@ -121,26 +123,49 @@ class Setting:
     default: Any
     rule: Rule
     note: str = ""
+    unit: str = ""
+    swept: bool = True  # a field of a scorer is offered as an axis of sweeps
+    learned: bool = False  # a gradient may change the field
+    start: float = 1.0  # of learning if the value is None
+    none: float | None = None  # value of the field for None
+
+    def value(self, plain: Any) -> Any:
+        """Field value of a plain value; the words of a weight stand for themselves."""
+        if plain is None:
+            return self.none
+        return tuple(map(float, plain)) if isinstance(plain, list) else plain
+
+    def check_numbers(self, name: str, value: Any) -> None:
+        """Raise an InputError for a concrete number, or one in an array, that is out of bounds."""
+        if self.rule.bounds is not None and value is not None:
+            values, (low, high) = np.ravel(np.asarray(value, float)), self.rule.bounds
+            if not ((values >= low) & (values <= high) | (values == self.none)).all():
+                raise InputError(f"{name}={value}: expected {self.rule.expected}")
 
 
-def setting(default: Any, rule: Rule, note: str = "", **metadata: Any) -> Any:
-    """Declare a field as a setting; a function is called for the default. `metadata` are those of other readers."""
-    metadata[_KEY] = rule, note
+def setting(default: Any, rule: Rule, note: str = "", *, static: bool = False, recipe: bool = True, **more: Any) -> Any:
+    """Declare a field as a setting; a function is called for the default.
+
+    `static` fields of a scorer are no leaves. Fields without `recipe` change no result. `more` are attributes of
+    `Setting`.
+    """
+    plain = None if default == more.get("none") else default
+    plain = [*default] if isinstance(default, tuple) else plain
+    metadata = {_KEY: Setting(plain, rule, note, **more), "static": static, "recipe": recipe}
     if callable(default):
         return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
-def settings_of(owner: type) -> dict[str, Setting | dict[str, Any]]:
+def settings_of(owner: type) -> dict[str, Any]:
     """The settings of a dataclass by field; a field that is a dataclass itself is a group of settings."""
     known: dict[str, Any] = {}
     for each in fields(owner):
-        default = each.default if each.default_factory is MISSING else each.default_factory()
         if _KEY in each.metadata:
-            rule, note = each.metadata[_KEY]
-            known[each.name] = Setting([*default] if isinstance(default, tuple) else default, rule, note)
-        elif is_dataclass(default):
-            known[each.name] = settings_of(type(default))
+            about = each.metadata[_KEY]
+            known[each.name] = replace(about, default=about.default()) if callable(about.default) else about
+        elif is_dataclass(each.default):
+            known[each.name] = settings_of(type(each.default))
     return known
 
 
@@ -192,6 +217,10 @@ def check_values(known: Mapping[str, Setting], values: Mapping[str, Any], prefix
 def check_fields(owner: Any) -> None:
     """Raise an InputError for a field whose value its rule does not allow; arrays are not looked at."""
     for each in fields(owner):
-        value = getattr(owner, each.name)
-        if _KEY in each.metadata and isinstance(value, bool | int | float | str | list | tuple | Mapping | None):
-            each.metadata[_KEY][0].check(each.name, value)
+        value, about = getattr(owner, each.name), each.metadata.get(_KEY)
+        if about is not None and callable(each.default) and not callable(value):  # words are for the command line
+            raise InputError(f"{each.name}={value!r}: expected a weight such as RatioWeight()")
+        parts = value if isinstance(value, list | tuple) else (value,)
+        is_plain = all(isinstance(part, bool | int | float | str | list | Mapping | None) for part in parts)
+        if about is not None and is_plain and (about.none is None or value != about.none):
+            about.rule.check(each.name, value)

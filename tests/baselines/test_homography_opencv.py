@@ -71,7 +71,7 @@ def test_jax_cannot_look_into_it(trace):
     ("field", "number"), [("threshold", 0.0), ("threshold", np.nan), ("confidence", 1.0), ("max_iterations", 0.0)]
 )
 def test_numbers_that_opencv_would_replace_raise(field, number):
-    with pytest.raises(InputError, match=f"{field}=.*: expected numbers"):
+    with pytest.raises(InputError, match=f"{field}=.*: expected a number"):
         score_candidates(OpenCvHomography(**{field: number}), BATCH)
 
 

@@ -1,7 +1,6 @@
 """mfvpr convert: files of other programs from an evaluation and from localized images."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -151,32 +150,3 @@ def test_files_that_exist_are_not_overwritten(convert, settings, tmp_path, layou
     assert stderr.startswith(f"error: {tmp_path}/out: expected a new")
     assert stderr.count("\n") == 1
     assert (tmp_path / "out").read_text() == before
-
-
-def test_one_file_of_times_is_of_one_sequence(convert, settings, tmp_path):
-    shutil.copytree(settings.out, tmp_path / "run")
-    about = json.loads((tmp_path / "run" / "run.json").read_text())
-    queries = Path(about["settings"]["dataset"]["queries"])
-    shutil.copytree(queries, tmp_path / "second")
-    single = about["settings"]["dataset"]
-    about["settings"]["dataset"] = {
-        name: value for name, value in single.items() if name not in ("database_labels", "query_labels")
-    } | {"queries": [str(queries), str(tmp_path / "second")], "ground_truth": "order", "index_file": None}
-    (tmp_path / "run" / "run.json").write_text(json.dumps(about))
-    (tmp_path / "times").write_text("".join(f"{row}.5\n" for row in range(24)))
-    _, _, stderr = convert(tmp_path / "run", "shifts", "--times", tmp_path / "times", code=2)
-    assert "--times: expected one query sequence, got 2" in stderr
-
-
-def test_other_sources_are_one_line(convert, settings, tmp_path):
-    for source, words in ((tmp_path, "run.json: expected a file, got nothing"),
-                          (tmp_path / "none", "none: expected the run folder of mfvpr evaluate for --layout hloc"),
-                          (tmp_path / "copy", "expected a run of mfvpr evaluate, got one of Python")):  # fmt: skip
-        if source.name == "copy":
-            shutil.copytree(settings.out, source)
-            about = json.loads((source / "run.json").read_text())
-            del about["settings"]["recall"]
-            (source / "run.json").write_text(json.dumps(about))
-        _, _, stderr = convert(source, "hloc", code=2)
-        assert words in stderr
-        assert stderr.count("\n") == 1

@@ -33,20 +33,6 @@ def test_images_that_cannot_be_read_are_counted(program, tmp_path):
     assert "2 images cannot be read" in stderr
 
 
-def test_other_sequences_under_a_published_name(program, tmp_path):
-    put(tmp_path, "db/1.png", "q1/1.png", "q2/1.png")
-    folders = [f"database={tmp_path}/db", f"queries=[{tmp_path}/q1,{tmp_path}/q2]", "ground_truth=none"]
-    sheet = ("--sheet", tmp_path / "sheet.png")
-    _, stderr = program("check", "sequences", "name=robotcar_seasons", *folders, *sheet, code=2)
-    assert "queries in q2, which is none of its sequences" in stderr
-
-
-def test_a_layout_is_told(program):
-    stdout, _ = program("list", "gardens_point", "msls_val")
-    assert "GroundTruth.csv" in stdout
-    assert "train_val/cph/database/images" in stdout
-
-
 def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(4)), *(f"Live/image{i:04d}.png" for i in range(2)))
     (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n3,1\n")

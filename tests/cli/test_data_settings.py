@@ -120,19 +120,6 @@ def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
     assert "warning: the largest value" not in stderr
 
 
-@pytest.mark.parametrize(("largest", "words"), [
-    (1023, "dark; dataset.bits=10"), (1024, ""), (4095, ""), (4096, "cut off; dataset.bits=13"),
-])  # fmt: skip
-def test_a_range_of_16_bit_images_that_does_not_fit_is_told(tmp_path, capsys, largest, words):
-    (tmp_path / "database").mkdir()
-    Image.fromarray(np.full((120, 160), largest, np.uint16)).save(tmp_path / "database" / "0.png")
-    settings = settings_of(*QUICK, *same(tmp_path, "dataset.ground_truth=order", "dataset.bits=12"))
-    prepare(settings, Stopwatch())
-    stderr = capsys.readouterr().err
-    assert words in stderr
-    assert ("the largest value of all 16-bit images" in stderr) == bool(words)
-
-
 @pytest.mark.parametrize("value", ["", None, "elsewhere"])
 def test_an_empty_cache_variable_is_none(value, monkeypatch, succeed):
     """Or features would be kept in the root of the file system."""

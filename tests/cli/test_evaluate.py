@@ -43,14 +43,6 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
         settings_of(f"{group}={choice}", *needs, config=config)
 
 
-@pytest.mark.parametrize("features", ["sift", "aliked"])
-def test_features_of_a_named_system_may_be_replaced(features):
-    settings = settings_of("system=ssm_hist", f"features={features}")
-    assert (settings.features["name"], settings.retrieval["name"]) == (features, "ssm")
-    assert settings.features["image_size"] == [336, 336]
-    assert (settings.candidates, settings.scorer["method"]) == (50, "histogram")
-
-
 @pytest.mark.parametrize(("arguments", "words"), [
     (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
     (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),

@@ -7,16 +7,10 @@ import pytest
 from mfvpr import HistogramOfShifts, RatioWeight
 from mfvpr.cli import evaluation, sweeping
 from mfvpr.systems import assembly
-from tests.programs import csv_rows, settings_of, small
+from tests.programs import settings_of, small
 
 FUSED = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={retrieval: 0.5, anchor: 1}")
 SYSTEM = "histogram + anchor + retrieval"
-
-
-def ranked(out, name):
-    """Database images of every query and the scores, best first."""
-    lines = csv_rows(out / "predictions" / f"{name}.csv")
-    return [(line["query"], line["database"], float(line["score"])) for line in lines]
 
 
 @pytest.mark.slow
@@ -40,12 +34,6 @@ def test_a_run_ranks_by_what_is_fused(root, tmp_path):
     decided = out / "predictions" / "histogram_anchor_retrieval.csv"
     assert (out / "predictions.csv").read_bytes() == decided.read_bytes()
     assert f"\n{SYSTEM}," in (out / "table.csv").read_text()
-
-
-def test_weights_choose_what_is_fused():
-    [fusion] = assembly.rankings(settings_of(*FUSED))["fused"].values()
-    assert (fusion.c, fusion.weights) == ("zscore", {"retrieval": 0.5, "anchor": 1})
-    assert fusion.system("histogram") == SYSTEM
 
 
 @pytest.mark.parametrize(("arguments", "features", "side"), [([], "aliked", 320), (["features=sift"], "sift", 336)])

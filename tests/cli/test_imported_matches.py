@@ -71,24 +71,6 @@ def test_changed_keypoints_are_read_again(street, tools, folder, tmp_path, monke
     assert scores[0] != scores[1]
 
 
-def test_any_retrieval_chooses_the_pairs(street, tools, tmp_path, monkeypatch, capsys):
-    typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=count", "figures=0", "retrieval=vlad",
-                          "retrieval.num_words=4", "cache=null", f"out={tmp_path}/out")  # fmt: skip
-    typed_here = [setting for setting in typed_here if not setting.startswith(("retrieval=pairs", "retrieval.queries"))]
-    code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
-    assert code == 0, stderr
-    assert "2 candidates (vlad), imported matches;" in stdout
-
-
-def test_swapped_folders_are_noticed(street, tools, tmp_path, monkeypatch, capsys):
-    typed_here = [*settings(street, f"matching.matches={tools}/kapture", f"out={tmp_path}/out"),
-                  f"dataset.database={street}/queries", f"dataset.queries={street}/database"]  # fmt: skip
-    typed_here = [setting for place, setting in enumerate(typed_here) if place not in (1, 2)]
-    code, _, stderr = typed(monkeypatch, capsys, "evaluate", *typed_here)
-    assert code == 2
-    assert "exchange dataset.database and dataset.queries" in stderr.splitlines()[-1]
-
-
 def test_a_sweep_of_imported_matches(street, tools, tmp_path, monkeypatch, capsys):
     typed_here = settings(street, f"matching.matches={tools}/kapture", "scorer=histogram", "grid.sigma=[10,20]",
                           f"cache={tmp_path}/cache", f"out={tmp_path}/out")  # fmt: skip

@@ -48,12 +48,6 @@ def test_a_joint_table_has_a_line_per_job_and_system(root, tmp_path, monkeypatch
         ]
 
 
-def test_weights_of_every_score_are_one_command(root, tmp_path, monkeypatch, succeed):
-    monkeypatch.chdir(tmp_path)
-    stdout, _ = succeed("sweep", "-m", *small(root), "experiment=weight", "grid.weight=[fs,unit]")
-    assert [f"settings of the {name} score" in stdout for name in ("sum", "anchor", "histogram")] == [True] * 3
-
-
 def test_jobs_in_several_processes(root, tmp_path):
     jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"cache={tmp_path}/store", SIGMA)
     done = run("-m", *small(root), *jobs, program="sweep", cwd=tmp_path)

@@ -4,23 +4,17 @@ import itertools
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mfvpr.cli import console, evaluation, run_folder
 from mfvpr.datasets import AllowedTruth, Positives, read_image
-from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.report import runs
@@ -153,7 +147,7 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
     assert content["command"].startswith("mfvpr evaluate dataset=folder dataset.database=")
     assert content["command"].endswith(" scorer=count figures=0 'out=a b'")
     expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
-    assert content["settings"] == {name: value for name, value in expected.items() if name != "compiled"}
+    assert content["settings"] == expected | {"cluster": {}}
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert content["commit"] == head.stdout.strip()
     assert {"mfvpr", "jax", "python"} <= content["versions"].keys()
@@ -258,46 +252,6 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["results.json"]
 
 
-def test_a_claimed_folder_goes_with_its_parents_when_the_run_fails(tmp_path):
-    def interrupted():
-        with runs.claim_run_folder(tmp_path / "a" / "b" / "out") as folder, runs.writing(folder) as new:
-            (new / "half").write_text("written")
-            raise KeyboardInterrupt
-
-    (tmp_path / "a").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert list(tmp_path.rglob("*")) == [tmp_path / "a"]
-
-
-def test_a_folder_with_results_is_complete(tmp_path):
-    def write():
-        with runs.writing(tmp_path) as new:
-            (new / "results.json").write_text("written")
-            (new / "table.csv").write_text("written")
-
-    (tmp_path / "table.csv").mkdir()  # so the file of this name cannot appear
-    with pytest.raises(IsADirectoryError):
-        write()
-    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
-
-
-def test_run_folders_of_one_second_differ(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: datetime(2030, 1, 2, 3, 4, 5)))
-    together = threading.Barrier(8, timeout=30)
-
-    def claim(_):
-        together.wait()
-        with runs.claim_run_folder(runs.new_run_folder(tmp_path, "street"), numbered=True) as folder:
-            together.wait()
-            return folder.name
-
-    with ThreadPoolExecutor(8) as threads:
-        names = sorted(threads.map(claim, range(8)))
-    assert names == ["2030-01-02_03-04-05", *(f"2030-01-02_03-04-05-{number}" for number in range(2, 9))]
-    assert list(tmp_path.rglob("*-*")) == []
-
-
 # --- what goes wrong at the end ----------------------------------------------------------------------------------
 
 
@@ -342,13 +296,6 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
     assert not [path for path in (tmp_path / "out").rglob(".*")]
 
 
-def test_a_page_that_cannot_be_made_costs_a_warning(tmp_path, capsys):
-    run_folder.report_page(tmp_path)
-    stdout, stderr = capsys.readouterr()
-    assert stdout == ""
-    assert stderr.startswith(f"warning: {tmp_path}: no page was made of it (")
-
-
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
     monkeypatch.setattr(
         "mfvpr.report.query_figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
@@ -359,27 +306,6 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     assert stderr.splitlines()[-1].startswith("interrupted")
     names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
-
-
-def test_names_that_are_no_utf8_cost_nothing(root, tmp_path, succeed):
-    """Names of images, of their folder, and of the run folder."""
-    street = streets_folder(root, num_frames=QUERIES, image_size=(160, 120))
-    place = tmp_path / os.fsdecode(b"data\xff")
-    for side in ("database", "queries"):
-        (place / side).mkdir(parents=True)
-        for path in sorted((street / side).iterdir())[:6]:
-            shutil.copy(path, place / side / os.fsdecode(b"\xfe" + path.name.encode()))
-    out = tmp_path / os.fsdecode(b"out\xff")
-    arguments = [f"dataset.database='{place}/database'", f"dataset.queries='{place}/queries'", f"out='{out}'",
-                 "figures=2", "dataset.ground_truth=order", "dataset.index_file=null", "scorer=histogram"]  # fmt: skip
-    stdout, stderr = succeed("evaluate", *small(root), *arguments)
-    assert stdout.endswith("out\\udcff/report.html\n")
-    assert "warning" not in stderr
-    assert len(list((out / "figures").glob("*_0*.png"))) == 2
-    assert b"\xfe0000.png,1,\xfe000" in (out / "predictions.csv").read_bytes()
-    run = json.loads((out / "run.json").read_text(encoding="utf-8"))
-    assert run["settings"]["out"] == str(out)
-    json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
 # --- progress ----------------------------------------------------------------------------------------------------
@@ -413,15 +339,3 @@ def test_progress_without_a_terminal_is_a_line_per_ten_seconds(monkeypatch, caps
     count(monkeypatch, "features", [])
     count(monkeypatch, "features", [0.01] * 199)  # of less than two seconds
     assert capsys.readouterr().err == ""
-
-
-def test_progress_in_a_terminal_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    count(monkeypatch, "matching", [1.0] * 4)
-    lines = [
-        "matching              50 %  2 of 4  2 s, about 2 s left",
-        "matching              75 %  3 of 4  3 s, about 1 s left",
-    ]
-    assert capsys.readouterr().err == "".join(f"\r\x1b[K{line}" for line in [*lines, ""])
-    console.tell("warning: a line of its own")
-    assert capsys.readouterr().err == "\r\x1b[Kwarning: a line of its own\n"

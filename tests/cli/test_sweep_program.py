@@ -8,7 +8,6 @@ import time
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mfvpr.cli import evaluation, sweeping
 from tests.programs import CANDIDATES, QUERIES, ROOT, job_of, settings_of, small
@@ -101,34 +100,6 @@ def test_the_best_setting_is_chosen_and_told(swept):
     assert f"along the path p = {content['report'][1]['path_test']['p_value']:.2g}" in text
 
 
-def test_heat_maps_are_pictures(swept):
-    figures = swept[0] / "figures"
-    assert {path.name for path in figures.iterdir()} == {"sigma_weight.png", "sigma_c.png", "weight_c.png"}
-    for path in figures.iterdir():
-        picture = np.asarray(Image.open(path).convert("RGB"))
-        assert min(picture.shape[:2]) > 200
-        assert picture.std() > 30
-        assert np.any(np.all(np.abs(picture.astype(int) - (232, 72, 44)) < 8, axis=-1))  # the best is framed
-
-
-def test_a_sweep_has_a_page(swept, succeed, tmp_path):
-    stdout, _ = succeed("report", swept[0], "--out", tmp_path / "page.html")
-    assert stdout == f"report: {tmp_path}/page.html\n"
-    page = (tmp_path / "page.html").read_text()
-    assert page.count('<img src="data:image/png') == 3
-    assert "Recall at 1 in %, with 95 % intervals in brackets:" in page
-    assert page.count("<tr>") > len(swept[1]["settings"])
-
-
-def test_without_a_store(root, sweep, tmp_path):
-    """Nor with many ties, by another rule: most pairs have no matches."""
-    common = ("cache=null", "matching.max_distance=0.3", "ties=index")
-    _, expected = evaluated(root, tmp_path / "evaluated", "scorer=histogram", "scorer.sigma=10", *common)
-    content = sweep(tmp_path / "swept", "grid.sigma=[10]", *common)
-    for tolerance, recall in recall_of(content, sigma=10).items():
-        assert recall == pytest.approx(expected["histogram", tolerance], abs=1e-6)
-
-
 def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
     content = sweep(tmp_path / "final", "grid.sigma=[10]", "final=combined", "fusion.c=100")
     explicit = sweep(tmp_path / "given", "grid.sigma=[10]", "grid.c=[0,100]", "fusion.c=100")
@@ -144,16 +115,6 @@ def test_other_scores_and_their_axes(sweep, swept, tmp_path):
     hard, nearly, washed_out = (entry["recall_at"] for entry in soft)
     assert hard == nearly != washed_out
     assert "none" in (tmp_path / "soft" / "table.csv").read_text()
-
-
-@pytest.mark.parametrize(("experiment", "changes", "count"), [
-    ("anchor", ("scorer.num_bins=8", "grid.num_bins=[8]", "grid.window=[4,6]", "grid.tolerance=[2,3]"), 5),
-    ("combined", ("grid.c=[0,1,auto]",), 3),
-])  # fmt: skip
-def test_experiments_of_conf_run(sweep, swept, tmp_path, experiment, changes, count):
-    content = sweep(tmp_path / "out", f"experiment={experiment}", *changes, pictures=True)
-    assert len(content["settings"]) == count
-    assert (tmp_path / "out" / "figures").is_dir()
 
 
 @pytest.mark.slow

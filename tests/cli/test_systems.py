@@ -2,7 +2,6 @@
 
 import json
 import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.choices import CONF
 from mfvpr.utils.fingerprints import recipe_of
-from tests.programs import CANDIDATES, composed, csv_rows, output_of, settings_of, small
+from tests.programs import CANDIDATES, composed, csv_rows, settings_of, small
 
 FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
 SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CANDIDATES}
@@ -42,29 +41,10 @@ def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch
 
 
 @pytest.mark.slow
-def test_programs_say_once_that_steering_takes_sift(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
-    for more, notes in (((), 1), (("features=sift",), 0)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("default")
-            output_of(monkeypatch, capsys, "evaluate", "system=steering", "candidates=0", *more, code=2)
-        assert sum("system=steering uses SIFT" in str(warning.message) for warning in caught) == notes
-
-
-@pytest.mark.slow
 def test_a_run_records_the_size_that_the_images_decide(tmp_path):
     settings = settings_of(*small(tmp_path), "features.image_size=19200", f"out={tmp_path}/run", "figures=0")
     evaluation.evaluate(settings)
     assert json.loads((tmp_path / "run/run.json").read_text())["settings"]["features"]["image_size"] == [160, 120]
-
-
-@pytest.mark.parametrize(("size", "words"), [
-    ("auto", "expected a list of 2"),
-    (336, "expected a list of 2"),
-])  # fmt: skip
-def test_image_sizes_that_are_none(size, words):
-    with pytest.raises(InputError, match=f"^features.image_size={size}: {words}"):
-        load_system("selavpr_msls", features={"image_size": size})
 
 
 @pytest.mark.parametrize(("name", "settings", "words"), [

@@ -123,7 +123,7 @@ def test_integers_and_double_precision_mode_are_welcome(scorer):
     ],
 )
 def test_misspelled_choices_raise(scorer, field, word):
-    with pytest.raises(ValueError, match=rf"{scorer.__name__}\({field}='{word}'\): expected one of"):
+    with pytest.raises(ValueError, match=rf"^{field}={word}: expected one of"):
         scorer(**{field: word})
 
 
@@ -141,7 +141,7 @@ def test_misspelled_choices_raise(scorer, field, word):
     ],
 )
 def test_python_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
-    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected numbers from"):
+    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected a"):
         scorer(**values)
     scorer(**jax.tree.map(jnp.asarray, values))
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
-from scipy.io import loadmat
+import scipy  # its subpackages are imported at their first use
 
 _NUMBERS = "fiu"
 
@@ -15,7 +15,9 @@ def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
     Reads versions 4 to 7.2. If `text`, lines of text are read as well, as arrays of one string. SciPy's errors are
     raised if the file is damaged.
     """
-    variables = {name: value for name, value in loadmat(file, mat_dtype=True).items() if not name.startswith("__")}
+    variables = {
+        name: value for name, value in scipy.io.loadmat(file, mat_dtype=True).items() if not name.startswith("__")
+    }
     arrays = dict(pair for name, value in variables.items() for pair in _arrays(name, value))
     return {path: array for path, array in arrays.items() if text or array.dtype.kind in _NUMBERS}
 

@@ -178,7 +178,7 @@ def suggest_setting(trial: "optuna.Trial", axes: Axes) -> dict[str, Any]:
         numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
         if len(numbers) < len(values) or len(values) == 1:
             setting[name] = trial.suggest_categorical(name, values)
-        elif name in axes.parameters and axes.parameters[name].whole:
+        elif name in axes.parameters and axes.parameters[name].rule.is_whole:
             setting[name] = trial.suggest_int(name, min(values), max(values))
         else:
             setting[name] = trial.suggest_float(name, min(values), max(values))

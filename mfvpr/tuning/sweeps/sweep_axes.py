@@ -16,6 +16,7 @@ from mfvpr.core.scorer import Scorer
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import Setting as Declared
 
 MAX_DISTANCE = "max_distance"
 CAPACITY = ("bin_size", "align")  # parameters that determine the number of bins
@@ -66,7 +67,7 @@ class Axes:
                     parameters.check_bounds(parameters.with_parameters(scorer, setting))
 
     @property
-    def parameters(self) -> Mapping[str, parameters.Parameter]:
+    def parameters(self) -> Mapping[str, Declared]:
         """Declared parameters of the scorer."""
         return parameters.parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
 

@@ -314,7 +314,7 @@ def all_nan(matches):
 
 def test_scores_that_no_ranking_can_use_are_refused(data):
     """They would leave the order of the retrieval, and win where that is good."""
-    with pytest.raises(InputError, match=r"sigma=0\.0: expected numbers"):
+    with pytest.raises(InputError, match=r"sigma=0\.0: expected a number"):
         sweeps.Axes(mfvpr.HistogramOfShifts(), {"sigma": [0.0, 10.0]})
     with pytest.raises(InputError, match="NaN or infinite"):
         sweeps.rank_settings(all_nan, [{"max_distance": 1.0}], *data)
