@@ -34,7 +34,7 @@ class AnchorPoints:
     weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side, from 1 to 215 (else a ValueError). Memory grows with the square of the number of
+        num_bins: cells per side, from 1 to 215. Memory grows with the square of the number of
             cells, or of matches if there are fewer; that of the soft form with the fourth power of num_bins.
         window: width of N, the square window around an anchor, cells.
         tolerance: t, distance of two displacements from which on they do not agree, cells.
@@ -57,7 +57,7 @@ class AnchorPoints:
     below it at 0.1 and 43 % at 0.3.
     """
 
-    num_bins: int = setting(15, whole(1, 32), unit="cells per side", static=True)  # the soft form's memory
+    num_bins: int = setting(15, whole(1, MAX_BINS), unit="cells per side", static=True)
     window: float | Array = setting(10.0, POSITIVE, unit="cells")
     tolerance: float | Array = setting(3.0, POSITIVE, unit="cells", learned=True)
     weight: Weight = weight_field("fs")
@@ -69,10 +69,7 @@ class AnchorPoints:
         None, POSITIVE | None, "above 0 is smooth; None = the paper's", learned=True, start=0.03
     )
 
-    def __post_init__(self) -> None:
-        check_fields(self)
-        if not 0 < self.num_bins <= MAX_BINS:
-            raise ValueError(f"AnchorPoints(num_bins={self.num_bins}): expected from 1 to {MAX_BINS} cells per side")
+    __post_init__ = check_fields
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32."""

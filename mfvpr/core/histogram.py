@@ -25,7 +25,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, POSITIVE, check_fields, list_of, one_of, setting, whole
 from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt
 
-MAX_BINS = 1024  # per axis: the histograms of 50 pairs then take 200 MB
+MAX_BINS = 1024  # per axis unless `max_bins` is larger: the histograms of 50 pairs then take 200 MB
 PAIRS_AT_ONCE = 8  # on a CPU, divided by the weightings: few and long operations that still stay in the cache
 CHUNK = 2**29  # bytes of the votes and bins that exist at the same time on an accelerator
 _NEAR = 32.0  # temperatures; e^32 is far from overflow
@@ -98,7 +98,7 @@ class HistogramOfShifts:
     )
     max_bins: int | None = setting(
         None,
-        whole(1, MAX_BINS) | None,
+        whole(1, 2**14) | None,
         "None = what the image size needs",
         unit="capacity per axis",
         swept=False,
