@@ -7,7 +7,7 @@ declares the fields of its class. `aggregate` holds the shortest scores; read it
 also stand in one file each, from the equation to the result. `batch` scores all candidates of a query, and grids, with
 `vmap` and `lax.map` around the function of one pair. `ranking` and `metrics` sort the scores and count the hits.
 
-A function is compiled where it says `@compiled`, which is `jax.jit` that keeps its programs: one for each shape of the
+A function is compiled where it says `@compiled`, which is `jit` that keeps its programs: one for each shape of the
 arrays, static field, class of a scorer, and capacity of bins (a multiple of 8, from the sizes of images and bins).
 Other numbers in a scorer compile nothing. A score of one pair, `scorer(matches)`, runs operation by operation.
 

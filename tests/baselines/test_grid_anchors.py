@@ -109,7 +109,7 @@ def test_matches_without_indices_and_impossible_grids_raise():
     with pytest.raises(InputError, match="expected matches that know their keypoints"):
         GridAnchors(3)(pair)
     for options, line in (
-        ({"side": 0}, "a side from 1"),
+        ({"side": 0}, "side=0: expected a whole number from 1"),
         ({"side": 9, "patch": 4}, "an odd patch"),
         ({"side": 9, "patch": 11}, "patch up to it"),
         ({"side": 75}, "2\\^24"),

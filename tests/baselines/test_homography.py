@@ -49,6 +49,7 @@ def misses(matrix, matches):
     return np.linalg.norm(ransac_oracle.mapped(matrix, matches.points1[real]) - matches.points0[real], axis=1)
 
 
+@pytest.mark.first_case
 @pytest.mark.optimized
 @pytest.mark.parametrize(("count", "share"), [(5, 0.9), (8, 0.6), (40, 0.3), (120, 0.1), (120, 0.5), (300, 0.9)])
 @pytest.mark.parametrize("threshold", [8.0, 24.0])
@@ -139,6 +140,7 @@ def test_msac_prefers_the_closer_of_two_models_with_as_many_inliers():
     assert float(estimates[1].score) >= quality_of_inliers - 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_as_many_inliers_as_opencv():
     pairs = [plane_points(seed, 200, 0.4, noise=1.0) for seed in range(30)]

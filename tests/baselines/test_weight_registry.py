@@ -118,23 +118,3 @@ def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):
         code, stdout, stderr = run("evaluate", "scorer=histogram", f"scorer.weight={tmp_path}/{name}")
         assert (code, stdout, stderr.count("\n")) == (2, "", 1)
         assert words in stderr
-
-
-@pytest.mark.parametrize(
-    "provenance",
-    [
-        {"data_sets": ["a", "b"]},
-        {"data_sets": 5},
-        {"data_fingerprint": ["x"]},
-        {"data_fingerprint": {"database": ["x"]}},
-        {"settings": None},
-        {"settings": {"features": "sift"}},
-        {"data_sets": [{"data_fingerprint": {"query": None}}]},
-    ],
-)
-def test_any_provenance_is_allowed(run, file, tmp_path, provenance):
-    write_weight(file, WEIGHT, provenance)
-    code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / "out"))
-    assert code == 0, stderr
-    assert "other features (unknown instead of sift" in stderr
-    assert "other matching (unknown instead of neighbors" in stderr

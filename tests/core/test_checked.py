@@ -118,6 +118,7 @@ def test_checked_products_have_the_bits_of_numpy(dimensions):
     np.testing.assert_allclose(expected, np.einsum("nd,nd->n", rows0.astype(float), rows1), atol=1e-4)
 
 
+@pytest.mark.first_case
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("with_ratio", [False, True])
 def test_neighbors_are_those_of_checked_products(kind, with_ratio):
@@ -154,6 +155,7 @@ def test_neighbors_of_bfloat16_alone_are_wrong(kind):
     assert wrong > 0
 
 
+@pytest.mark.slow
 def test_the_bound_holds_and_is_needed(monkeypatch):
     """With no room for rounding, neighbors are wrong."""
     monkeypatch.setattr(checked, "_norm", lambda rows: jnp.full(len(rows), 1e-6))
@@ -192,6 +194,7 @@ def features_of(rows):
     return mfvpr.Features.of(np.zeros((len(rows), 2), np.float32), np.asarray(rows, np.float32), image_size=(9, 9))
 
 
+@pytest.mark.slow
 def test_sums_are_checked_where_bfloat16_loses_nothing():
     """All products of a query are exactly equal, so only the order of sums tells the candidates apart."""
     rng = np.random.default_rng(0)
@@ -338,6 +341,7 @@ def test_other_devices_than_a_cpu_take_float32(monkeypatch):
     assert products == {"cpu": True, "cuda": False}
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_float32():
     query, candidate = make_pair("random")
 

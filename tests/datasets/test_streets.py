@@ -59,6 +59,7 @@ def check_other_drawings(draw, folder, num_frames, tmp_path):
     assert all(first[name] != other[name] for name in first)
 
 
+@pytest.mark.slow
 def test_a_seed_decides_all_bytes_of_the_street(streets, tmp_path):
     check_other_drawings(draw_streets, streets, FRAMES, tmp_path)
 

@@ -65,6 +65,7 @@ def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     assert outputs["scores"][-1] == 0  # without matches
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_a_program_has_the_bits_of_the_jitted_function():
     for method in (HISTOGRAM, make_system({"count": mfvpr.MatchCount(), "histogram": HISTOGRAM}, final="histogram")):
@@ -92,6 +93,7 @@ def test_a_system_matches_and_scores_by_all_scorers_the_deciding_one_first():
     np.testing.assert_allclose(outputs["shift"][0], [16, 12], atol=3)  # 5 % of the image
 
 
+@pytest.mark.slow
 def test_padding_does_not_matter_and_a_loop_gives_the_same():
     scorers = {"histogram": HISTOGRAM, "anchor": mfvpr.AnchorPoints()}
     program = make_program(make_system(scorers), SHAPES, with_shift=True)

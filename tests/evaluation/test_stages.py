@@ -57,6 +57,7 @@ def open_store(folder, num_queries=10):
     return MatchStore(folder / "store", {"name": "street"}, num_queries)
 
 
+@pytest.mark.slow
 def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candidates, matches, tmp_path, monkeypatch):
     first, store = stages.match(features[1], features[0], candidates, store=open_store(tmp_path)), open_store(tmp_path)
     runtime = mfvpr.Runtime(progress=lambda label: lambda *_: pytest.fail("again"))

@@ -16,6 +16,7 @@ def test_numbers_of_a_row_are_those_of_the_pairs():
     assert shifts.row([*zip(*parts, strict=True)]) == ["20.0", "67", "67", "100", "60"]
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_drive_further_beside_the_lane_has_more_parallax(tmp_path, monkeypatch):
     monkeypatch.setattr(shifts, "FRAMES", 4)
