@@ -172,7 +172,7 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     files = {"results.json", "run.json", "table.md", "table.csv", "table.tex", "predictions.csv", "failures.csv"}
     assert files <= {path.name for path in folder.iterdir()}
     figures = [*(folder / "figures").iterdir()]
-    kinds = {"correct", "incorrect", "precision", "reliability", "rerank"}
+    kinds = {"correct", "incorrect", "reliability"}
     assert {path.stem.split("_")[0] for path in figures} == kinds
     for path in figures:
         image = np.asarray(Image.open(path).convert("L"))
