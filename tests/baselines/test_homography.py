@@ -49,7 +49,7 @@ def misses(matrix, matches):
     return np.linalg.norm(ransac_oracle.mapped(matrix, matches.points1[real]) - matches.points0[real], axis=1)
 
 
-@pytest.mark.first_case
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.parametrize(("count", "share"), [(5, 0.9), (8, 0.6), (40, 0.3), (120, 0.1), (120, 0.5), (300, 0.9)])
 @pytest.mark.parametrize("threshold", [8.0, 24.0])

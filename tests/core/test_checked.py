@@ -250,7 +250,7 @@ def assert_as_in_float32(query, candidate, monkeypatch):
             np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
 
 
-@pytest.mark.first_case
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
 def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
     query, candidate = make_pair(kind, counts=(2, 3) if kind == "few" else (140, 180))

@@ -79,6 +79,7 @@ def test_with_real_weights_everything_is_as_in_the_public_code(golden, case):
     assert_golden(golden, case, *jax.tree.map(lambda field: field[0], results))
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_with_random_weights_too_and_images_of_a_batch_do_not_mix(drawn, golden):
     image = picture(DRAWN, IMAGES)

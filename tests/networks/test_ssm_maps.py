@@ -34,6 +34,7 @@ def assert_same_map(dense, name, golden):
     np.testing.assert_allclose(samples(np.asarray(dense)), golden[name], rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 @pytest.mark.parametrize("case", [case for case in CASES if case.width == 224], ids=str)
 def test_both_maps_are_the_public_codes(case, golden):
