@@ -14,6 +14,7 @@ from mfvpr.report.run_files import matched_content
 from mfvpr.systems import assembly
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions
+from mfvpr.tuning.sweeps.setting_rankings import forget_rankings
 from mfvpr.tuning.sweeps.setting_search import require_optuna
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.errors import InputError
@@ -67,6 +68,7 @@ def sweep(settings: Sweep) -> None:
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results),
             figures=sweeps.sweep_figures(outcome),
         )
+        forget_rankings(axes.scorer, options)
 
 
 def axes_of(settings: Sweep | Learn) -> Axes:

@@ -325,6 +325,8 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         else:
             lists = np.lib.format.read_array(file, allow_pickle=False)
         per_query = [np.asarray(rows).reshape(-1) for rows in lists]
+        if num_database > 2 and all(len(rows) == num_database and set(rows) <= {0, 1} for rows in per_query):
+            raise InputError(f"{path}: expected the rows of each query's database images, got flags")
     for query, rows in enumerate(per_query):
         if rows.size and rows.dtype.kind not in "iu":
             raise InputError(f"{path}: expected lists of rows, got {rows.dtype}")

@@ -39,27 +39,33 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     foreign = dict.fromkeys(foreign)
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
-    prefix = _NO_PREFIX if any(matched) else None
+    is_exact = any(matched)
+    prefix = _NO_PREFIX if is_exact else None
     for spellings in (lambda name: [name], _stems):
         spelled = defaultdict(list)  # free names by the last part of each of their spellings
         for name in foreign.keys() - set(matched):
             for spelling in spellings(printable(name)):
                 spelled[PurePosixPath(spelling).name].append((name, spelling))
         found: dict[Prefix, list[tuple[int, str]]] = defaultdict(list)  # rows and names
+        others: dict[int, str] = {}  # of another prefix than the names before
         for row in (row for row, match in enumerate(matched) if match is None):
             ours = spellings(printable(names[row]))[0]
             for name, theirs in spelled[PurePosixPath(ours).name]:
-                if (each := _prefix(ours, theirs)) is not None and prefix in (None, each):
+                each = _prefix(ours, theirs)
+                if each is not None and prefix in (None, each):
                     found[each].append((row, name))
+                elif each is not None and not is_exact:
+                    others[row] = name
         pairs = [pair for each in found.values() for pair in dict.fromkeys(each)]
+        others = {row: name for row, name in others.items() if row not in dict(pairs)}
         for position in (0, 1):
             counts = Counter(pair[position] for pair in pairs)
             several = [pair for pair in sorted(pairs) if counts[pair[position]] > 1]
             if several:
                 got = " and ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in several[:2])
                 raise InputError(f"{path}: expected one name for each image, got {got}; {_FULL_NAMES}")
-        if len(found) > 1:
-            firsts = [each[0] for each in found.values()][:2]
+        if len(found) > 1 or others:
+            firsts = [*others.items(), *(each[0] for each in found.values())][:2]
             got = " but ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in firsts)
             raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {got}; give it")
         for row, name in pairs:

@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from mfvpr.datasets.published import CONDITIONS, REFERENCE, published_dataset, published_differences
+from mfvpr.datasets.published import CONDITIONS, REFERENCE, published_dataset, published_differences, read_rows
 from mfvpr.utils import InputError
 from tests.builders import fill
 from tests.io.checks import one_line_error
@@ -458,3 +458,11 @@ def test_numbers_of_images_are_compared_with_the_published(ssm):
     put(ssm, *(f"Reference/image{i:04d}.png" for i in range(85)), *(f"Live/image{i:05d}.jpg" for i in range(81)))
     (ssm / "GroundTruth.csv").write_text("Reference,Live\n" + "".join(f"0,{i}\n" for i in range(81)))
     assert list(published_differences(published_dataset("berlin_a100", ssm))) == []
+
+
+def test_flags_are_not_taken_for_rows(tmp_path):
+    np.save(tmp_path / "gt.npy", np.eye(5, 6, dtype=int))
+    with pytest.raises(InputError, match="got flags"):
+        read_rows(tmp_path / "gt.npy", 6)
+    np.save(tmp_path / "rows.npy", np.array([[0, 1], [1, 2]]))
+    assert read_rows(tmp_path / "rows.npy", 6) == [(0, 1), (1, 2)]

@@ -7,7 +7,9 @@ in a file, and only settings that are missing are ranked.
 
 import itertools
 import math
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -204,14 +206,25 @@ def _files(
     if options.folder is None:
         return None, []
     try:
-        of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
-        recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
         recipes = [recipe_of(setting) for setting in settings]
+        return _open_files(scorer, options.folder, options), recipes
     except (TypeError, InputError) as error:
         options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
         return None, []
+
+
+def _open_files(scorer: Any, folder: Path, options: SweepOptions) -> CacheFiles[np.ndarray]:
+    of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
+    recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), recipes
+    return CacheFiles(folder, "sweep", recipe, pack, unpack, compress=True)
+
+
+def forget_rankings(scorer: Any, options: SweepOptions) -> None:
+    """Remove the rankings that a sweep kept in its folder: when it is finished, changed code may rank otherwise."""
+    if options.folder is not None:
+        with suppress(TypeError, InputError):  # without a recipe, nothing was kept
+            shutil.rmtree(_open_files(scorer, options.folder, options).folder, ignore_errors=True)
 
 
 def _digest(match_set: MatchSet | Scales, queries: range, candidates: Shortlist, views: Sequence[np.ndarray]) -> str:
