@@ -251,9 +251,9 @@ def check_candidates(matches: Matches) -> None:
 
 
 def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
-    """Raise a ValueError if a number of the scorer has the name of an axis with another meaning."""
+    """Raise an InputError if a number of the scorer has the name of an axis with another meaning."""
     for name in {*names} & {*numbers_by_name(scorer)} & {*reserved}:
-        raise ValueError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
+        raise InputError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")
 
 
 def _product(values: Mapping[str, Array], names: Sequence[str]) -> dict[str, Array]:

@@ -5,7 +5,6 @@ block by block (some settings, some queries): this bounds the memory. With a fol
 in a file, and only settings that are missing are ranked.
 """
 
-import itertools
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core import ranking
-from mfvpr.core.batch import WEIGHTINGS, refuse_own_names, score_settings
+from mfvpr.core.batch import score_settings
 from mfvpr.core.scorer import check_host
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.datasets.datasets import Dataset
@@ -136,7 +135,6 @@ def rank_settings(
         InputError: a setting that cannot be scored, or the folder cannot be used.
     """
     check_host(scorer)
-    refuse_own_names(scorer, {*itertools.chain(*settings)}, reserved=(*WEIGHTINGS, FUSION))
     views = [candidates.mask] if views is None else views
     num_queries, at_once = len(candidates.mask), min(options.settings_per_block or SETTINGS_PER_BLOCK, len(settings))
     size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)

@@ -12,6 +12,7 @@ import numpy as np
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.core import parameters
+from mfvpr.core.batch import WEIGHTINGS, refuse_own_names
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting, grid
@@ -46,6 +47,7 @@ class Axes:
 
     def __post_init__(self) -> None:
         scorer = self.scorer
+        refuse_own_names(scorer, self.values, reserved=(*WEIGHTINGS, FUSION))
         known = sorted({*parameters.numbers_by_name(scorer), *parameters.static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}

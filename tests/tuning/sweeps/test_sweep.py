@@ -15,6 +15,7 @@ from mfvpr.evaluation import shortlist_scores
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.tuning import sweeps
+from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.setting_groups import group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -282,7 +283,7 @@ def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
 
 
-def test_a_number_named_as_retrievals_share_is_refused(data):
+def test_a_number_named_as_retrievals_share_is_refused():
     @mfvpr.value
     class Score:
         c: float = 1.0
@@ -291,7 +292,7 @@ def test_a_number_named_as_retrievals_share_is_refused(data):
             return self.c * mfvpr.MatchCount()(matches)
 
     with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
-        rank(Score(), [{"c": 0.5}], *data)
+        Axes(Score(), {"c": [0.5]})
 
 
 @pytest.mark.parametrize(
