@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from mfvpr import datasets
 from mfvpr.cli import console, notes
@@ -25,6 +25,7 @@ from mfvpr.utils import Runtime, Stopwatch
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
+Job = TypeVar("Job", bound=Common)
 _FILES = ("index_file", "query_labels", "database_labels")
 _WORDS = {
     "order": "file order",
@@ -69,7 +70,7 @@ class Inputs:
         return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
 
 
-def with_image_size(settings: Any) -> Any:
+def with_image_size(settings: Job) -> Job:
     """The settings with the image size that `features.image_size=auto`, or a number of pixels, leaves to the images."""
     if isinstance(settings.features["image_size"], list | None):
         return settings

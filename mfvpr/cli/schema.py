@@ -367,9 +367,8 @@ def register() -> None:
 
 def _axes_of(scorer: Mapping[str, Any]) -> dict[str, Setting]:
     """The axes of all scorers, with the allowed values of the chosen one."""
-    own = choices_of("scorer").get(scorer.get("method", ""), {})
-    own = _lists(own)
-    return {name: own.get(name, each) for name, each in axes().items()}
+    of_scorer = _lists(choices_of("scorer").get(scorer.get("method", ""), {}))
+    return {name: of_scorer.get(name, each) for name, each in axes().items()}
 
 
 def _lists(known: Mapping[str, Setting]) -> dict[str, Setting]:

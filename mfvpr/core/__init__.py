@@ -2,10 +2,11 @@
 
 `types` holds the values: Features of an image become Matches of a pair. `nearest` and `matching` find the matches;
 `checked` finds the same ones faster with products of bfloat16, and can be deleted. `weights` and `shifts` are what
-scores see of a match. `scorer` states the contract of a score, a function of the matches of one pair, and `parameters`
-declares the fields of its class. `aggregate` holds the shortest scores; read it before `histogram` and `anchor`, which
-also stand in one file each, from the equation to the result. `batch` scores all candidates of a query, and grids, with
-`vmap` and `lax.map` around the function of one pair. `ranking` and `metrics` sort the scores and count the hits.
+scores see of a match. `scorer` states the contract of a score, a function of the matches of one pair. The class of a
+score declares its fields with `setting` of `mfvpr.utils.fields`; `parameters` reads and replaces them by name.
+`aggregate` holds the shortest scores; read it before `histogram` and `anchor`, which also stand in one file each, from
+the equation to the result. `batch` scores all candidates of a query, and grids, with `vmap` and `lax.map` around the
+function of one pair. `ranking` and `metrics` sort the scores and count the hits.
 
 A function is compiled where it says `@compiled`, which is `jit` that keeps its programs: one for each shape of the
 arrays, static field, class of a scorer, and capacity of bins (a multiple of 8, from the sizes of images and bins).

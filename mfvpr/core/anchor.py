@@ -34,8 +34,8 @@ class AnchorPoints:
     weights it counts exact agreements, as SSM-VPR does.
 
     Attributes:
-        num_bins: cells per side, from 1 to 215. Memory grows with the square of the number of
-            cells, or of matches if there are fewer; that of the soft form with the fourth power of num_bins.
+        num_bins: cells per side, from 1 to 215. Memory grows with the square of the number of cells, or of matches if
+            there are fewer; that of the soft form with the fourth power of num_bins.
         window: width of N, the square window around an anchor, cells.
         tolerance: t, distance of two displacements from which on they do not agree, cells.
         weight: match weight, FS by default as in the paper.

@@ -98,7 +98,7 @@ class HistogramOfShifts:
     )
     max_bins: int | None = setting(
         None,
-        whole(1, 2**14) | None,
+        whole(1, 2**14) | None,  # 2^14 x 2^14 bins are 1 GB
         "None = what the image size needs",
         unit="capacity per axis",
         swept=False,

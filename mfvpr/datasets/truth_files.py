@@ -78,8 +78,8 @@ def truth_from_file(
                 raise InputError(f"{path}: pair {line}: expected {expected}, got {shorten(text)!r}")
             places.append(table[text])
         rows.setdefault(places[0], []).extend(places[1:])
-    found = require_all(path, query_names, [rows.get(row) for row in range(len(query_names))], _LINES)
-    return FrameTruth(tuple(map(tuple, found)), len(database_names), widened)
+    places_by_query = require_all(path, query_names, [rows.get(row) for row in range(len(query_names))], _LINES)
+    return FrameTruth(tuple(map(tuple, places_by_query)), len(database_names), widened)
 
 
 def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -1,8 +1,7 @@
 """Confidence: the probability that the top prediction is correct, from how its score stands out among the others.
 
-It is fitted on predictions that are known to be correct or incorrect.
-
-Differences are in units of the spread of a query's scores, so that a model can be used for other images.
+A model is fitted on predictions that are known to be correct or incorrect. Differences are in units of the spread of a
+query's scores, so that it can be used for other images.
 """
 
 import json

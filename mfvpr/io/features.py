@@ -106,10 +106,12 @@ class ImportedFeatures:
                 f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}; has the file changed since it was "
                 "opened?"
             )
-        given = None if self._sizes is None else self._sizes[row]
-        size = as_float32(f"{where}: image_size", np.asarray(parts.get("image_size", given)), "fiu").reshape(-1)
-        if size.shape != (2,) or not (size > 0).all() or (given is not None and (size != given).any()):
-            expected = "(width, height) in pixels" if given is None else f"{given.tolist()} as it was given"
+        argument = None if self._sizes is None else self._sizes[row]
+        size = as_float32(f"{where}: image_size", np.asarray(parts.get("image_size", argument)), "fiu").reshape(-1)
+        if size.shape != (2,) or not (size > 0).all() or (argument is not None and (size != argument).any()):
+            expected = (
+                "(width, height) in pixels" if argument is None else f"the argument image_size={argument.tolist()}"
+            )
             raise InputError(f"{where}: image_size: expected {expected}, got {size.tolist()}")
         require_inside(where, keypoints, size)
         return Features(

@@ -158,8 +158,8 @@ class ImportedMatches:
     def _size(self, side: int, row: int, stored: Size | None) -> Size:
         """Size of the image that points are in; an InputError if nobody knows it."""
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
-            given = list(self._image_size)
-            raise InputError(f"{self.path}: expected the image_size that was given, {given}, got {list(stored)}")
+            expected = f"the argument image_size={list(self._image_size)}"
+            raise InputError(f"{self.path}: expected {expected}, got {list(stored)}")
         size_of = self._sides[side].size if self._reader.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
         if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):

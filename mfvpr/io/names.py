@@ -46,31 +46,31 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         for name in foreign.keys() - set(matched):
             for spelling in spellings(printable(name)):
                 spelled[PurePosixPath(spelling).name].append((name, spelling))
-        found: dict[Prefix, list[tuple[int, str]]] = defaultdict(list)  # rows and names
-        others: dict[int, str] = {}  # of another prefix than the names before
+        pairs_by_prefix: dict[Prefix, list[tuple[int, str]]] = defaultdict(list)  # rows and names
+        contradictions: dict[int, str] = {}  # of another prefix than the names before
         for row in (row for row, match in enumerate(matched) if match is None):
             ours = spellings(printable(names[row]))[0]
             for name, theirs in spelled[PurePosixPath(ours).name]:
                 each = _prefix(ours, theirs)
                 if each is not None and prefix in (None, each):
-                    found[each].append((row, name))
+                    pairs_by_prefix[each].append((row, name))
                 elif each is not None and not is_exact:
-                    others[row] = name
-        pairs = [pair for each in found.values() for pair in dict.fromkeys(each)]
-        others = {row: name for row, name in others.items() if row not in dict(pairs)}
+                    contradictions[row] = name
+        pairs = [pair for each in pairs_by_prefix.values() for pair in dict.fromkeys(each)]
+        contradictions = {row: name for row, name in contradictions.items() if row not in dict(pairs)}
         for position in (0, 1):
             counts = Counter(pair[position] for pair in pairs)
             several = [pair for pair in sorted(pairs) if counts[pair[position]] > 1]
             if several:
                 got = " and ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in several[:2])
                 raise InputError(f"{path}: expected one name for each image, got {got}; {_FULL_NAMES}")
-        if len(found) > 1 or others:
-            firsts = [*others.items(), *(each[0] for each in found.values())][:2]
+        if len(pairs_by_prefix) > 1 or contradictions:
+            firsts = [*contradictions.items(), *(each[0] for each in pairs_by_prefix.values())][:2]
             got = " but ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in firsts)
             raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {got}; give it")
         for row, name in pairs:
             matched[row] = name
-        prefix = next(iter(found), prefix)
+        prefix = next(iter(pairs_by_prefix), prefix)
     return matched
 
 

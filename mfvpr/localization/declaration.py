@@ -27,8 +27,8 @@ def read_declaration(folder: Path) -> dict[str, Any]:
     content = MapFile(Path(folder)).part("system")
     if content is None:
         fix = "Make one with `mfvpr map build` or `Map.create`"
-        own = "open a map of a system of your own with `Map(folder, system)`"
-        raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {own}.")
+        open_map = "open a map of a system of your own with `Map(folder, system)`"
+        raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {open_map}.")
     settings = json.loads(content)
     try:
         from_values(SystemSettings, settings)

@@ -4,7 +4,7 @@ import itertools
 import json
 import shutil
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -37,7 +37,7 @@ from mfvpr.utils.progress import Track, no_progress
 from mfvpr.utils.runtime import Runtime
 
 _LEARNING = ".learning"  # the folder of features that a vocabulary is being learned from
-_AT_ONCE = 64  # images that are described without a cache
+_AT_ONCE = 16  # images that are described without a cache
 _SAMPLE = 32  # images whose strength is measured; a sample has up to twice as many
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -178,13 +178,16 @@ class MapImages:
         with self._file.lock(), self._learning(images, cache, track) as cache:
             place_of, before = dict(zip(images.names, places, strict=True)), len(self)
             missing = [name for name in images.names if name not in self._row_of_name]
-            names = iter(missing if cache is not None else track(missing, len(missing)))
-            while part := tuple(itertools.islice(names, _AT_ONCE if cache is None else len(missing))):
+            ticks = iter(track(missing, len(missing)) if cache is None else missing)  # a cache shows its own progress
+            step = _AT_ONCE if cache is None else max(1, len(missing))
+            for start in range(0, len(missing), step):
+                part = tuple(missing[start : start + step])
                 folder = replace(images, names=part)
                 for batch in self.describing.folder(folder, FeatureCache() if cache is None else cache):
                     rows = ((part[row], vector) for row, (_, vector) in batch.items())
                     entries = [Entry(name, place_of[name], vector) for name, vector in rows]
                     self._add(entries, [features for features, _ in batch.values()])
+                    deque(itertools.islice(ticks, len(batch)), maxlen=0)
             return len(self) - before
 
     @exclusive

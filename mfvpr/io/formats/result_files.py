@@ -127,8 +127,8 @@ def _read_results(path: Path, most: int | None = None) -> list[dict[Any, Any]]:
     results = _read_torch(path, list)
     if not all(isinstance(result, dict) for result in results) or (most is not None and len(results) > most):
         raise InputError(
-            f"{path}: expected a dictionary of To-Match for each prediction in the text file, at most "
-            f"{most}, got {len(results)} results; match the predictions of this run"
+            f"{path}: expected a dictionary of To-Match for each prediction in the text file, got "
+            f"{len(results)} results; match the predictions of this run"
         )
     return results
 
