@@ -2,8 +2,8 @@
 
 Winograd's F(4, 3) (Lavin & Gray, CVPR 2016) along the rows: four rows of the result come from six rows of the input by
 six convolutions with 1 x 3 kernels, instead of twelve. The rounding errors of VGG16 grow by half, and differ between
-the four rows: equal neighborhoods give results that differ in the last bits. `uniform=True` takes the direct method, in
-which they are equal. On other processors, the library of the device chooses a method.
+the four rows: equal neighborhoods give results that differ in the last bits. `uniform=True` avoids this by the direct
+method. On other processors, the library of the device chooses a method.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from functools import partial
 import jax.numpy as jnp
 from flax import nnx
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array
 
@@ -45,32 +45,30 @@ _OUTPUT = (
 class Conv3x3(nnx.Module):
     """3 x 3 convolution that keeps the size: `kernel` `[3, 3, C, D]`, `bias` `[D]` or none; zeros outside.
 
-    `dilation` is the distance between the kernel's columns and rows. If `uniform`, equal neighborhoods give equal bits,
-    which takes 1.5 times as long on a CPU.
+    `dilation` is the distance between the kernel's columns and rows.
     """
 
     def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        *,
-        dilation: int = 1,
-        use_bias: bool = True,
-        uniform: bool = False,
-        precision: str,
-        rngs: nnx.Rngs,
+        self, inputs: int, outputs: int, *, dilation: int = 1, use_bias: bool = True, precision: str, rngs: nnx.Rngs
     ) -> None:
         initial = nnx.initializers.he_normal()
         self.kernel = nnx.Param(initial(rngs.params(), (3, 3, inputs, outputs), jnp.float32))
         self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32)) if use_bias else None
         self.dilation = dilation
-        self.uniform = uniform or inputs < _WIDE
         self.precision = precision
 
-    def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
+    def __call__(
+        self, x: Float[Array, "batch height width inputs"], uniform: bool | Bool[Array, ""] = False
+    ) -> Float[Array, "batch height width outputs"]:
+        """Convolve a map; if `uniform`, equal neighborhoods give equal bits, which takes 1.5 times as long."""
         kernel, options = self.kernel[...], {"dilation": self.dilation, "precision": self.precision}
         direct, on_cpu = partial(_convolve, above=self.dilation, **options), partial(winograd, **options)
-        product = direct(x, kernel) if self.uniform else lax.platform_dependent(x, kernel, cpu=on_cpu, default=direct)
+
+        def fast(x: Array, kernel: Array) -> Array:
+            return lax.cond(uniform, direct, on_cpu, x, kernel)
+
+        is_wide = x.shape[-1] >= _WIDE
+        product = lax.platform_dependent(x, kernel, cpu=fast, default=direct) if is_wide else direct(x, kernel)
         return product if self.bias is None else product + self.bias[...][None, None, None]
 
 

@@ -23,26 +23,47 @@ from mfvpr.networks.vgg import Vgg16
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
+_FIELD = (-10, 11)  # receptive field (92 x 92 px) of a position, in cells of 4 x 4 px relative to its own
 _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 
 
 class D2Net(nnx.Module):
     """VGG16 to `conv4_3`. The third pooling only smooths, so the stride stays 4, and block 4 is dilated instead.
 
-    The published network ends with a ReLU (`relu`). Its convolutions are uniform: the map of a white sky is constant,
-    and rounding creates no peaks there.
+    The published network ends with a ReLU (`relu`).
     """
 
     def __init__(self, *, relu: bool = True, precision: str = "highest", rngs: nnx.Rngs) -> None:
         pools = ("max", "max", "average")
-        options = {"pools": pools, "dilations": (1, 1, 1, 2), "uniform": True}
-        self.vgg = Vgg16("conv4_3", precision=precision, rngs=rngs, **options)
+        self.vgg = Vgg16("conv4_3", pools=pools, dilations=(1, 1, 1, 2), precision=precision, rngs=rngs)
         self.relu = relu
 
     def __call__(self, images: Images) -> Float[Array, "batch height//4-1 width//4-1 512"]:
         """Dense maps of preprocessed images."""
-        dense = self.vgg(images)
+        dense = self.vgg(images, uniform=_repeats(images))
         return nnx.relu(dense) if self.relu else dense
+
+
+def _repeats(images: Images) -> Bool[Array, ""]:
+    """Whether two neighbors in a map of any image have equal receptive fields, as in a white sky.
+
+    The map is constant there, but rounding can create peaks. Pixels outside the images count as equal.
+    """
+    batch, height, width, _ = images.shape
+    rows, columns = -(-height // STRIDE), -(-width // STRIDE)
+    before, after = _FIELD
+    repeats = jnp.zeros((), bool)
+    for equal in (images[:, STRIDE:] == images[:, :-STRIDE], images[:, :, STRIDE:] == images[:, :, :-STRIDE]):
+        same = jnp.all(equal, axis=-1)
+        missing = (STRIDE * rows - same.shape[1], STRIDE * columns - same.shape[2])
+        same = jnp.pad(same, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=True)
+        same = jnp.all(same.reshape(batch, rows, STRIDE, columns, STRIDE), axis=(2, 4))
+        for axis in (1, 2):
+            padding = [(-before, after) if axis == other else (0, 0) for other in range(3)]
+            window = [after - before + 1 if axis == other else 1 for other in range(3)]
+            same = lax.reduce_window(same, True, lax.bitwise_and, window, (1, 1, 1), padding)
+        repeats |= jnp.any(same)
+    return repeats
 
 
 class Detections(NamedTuple):

@@ -1,10 +1,10 @@
 """VGG16 (Simonyan & Zisserman, ICLR 2015) up to a named convolution: a backbone of several networks."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array
 from mfvpr.networks.convolution import Conv3x3
@@ -31,7 +31,6 @@ class Vgg16(nnx.Module):
             "max_ceil" also pools an odd last row or column; "average" smooths the map (2 x 2, stride 1, no padding:
             one row and one column fewer).
         dilations: of the convolutions of block 1, 2, ...
-        uniform: see `Conv3x3`.
     """
 
     def __init__(
@@ -40,26 +39,27 @@ class Vgg16(nnx.Module):
         *,
         pools: tuple[Pool, ...] = ("max", "max", "max", "max"),
         dilations: tuple[int, ...] = (1, 1, 1, 1, 1),
-        uniform: bool = False,
         precision: str = "highest",
         rngs: nnx.Rngs,
     ) -> None:
         names = tuple(LAYERS)
         self.layers = names[: names.index(last) + 1]
         self.pools = pools
-        options: dict[str, Any] = {"uniform": uniform, "precision": precision, "rngs": rngs}
         inputs = 3
         for name in self.layers:
-            setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilations[_block(name) - 1], **options))
+            dilation = dilations[_block(name) - 1]
+            setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilation, precision=precision, rngs=rngs))
             inputs = LAYERS[name]
 
-    def __call__(self, images: Images, layer: str | None = None) -> Float[Array, "batch rows columns channels"]:
-        """Map before the ReLU of a layer, by default the last; later layers do not run."""
+    def __call__(
+        self, images: Images, layer: str | None = None, *, uniform: bool | Bool[Array, ""] = False
+    ) -> Float[Array, "batch rows columns channels"]:
+        """Map before the ReLU of a layer, by default the last; later layers do not run. `uniform` as in `Conv3x3`."""
         x = images
         for name in self.layers[: self.layers.index(layer or self.layers[-1]) + 1]:
             if name != self.layers[0]:
                 x = _POOLS[self.pools[_block(name) - 2]](x) if name.endswith("_1") else nnx.relu(x)
-            x = getattr(self, name)(x)
+            x = getattr(self, name)(x, uniform)
         return x
 
 

@@ -124,7 +124,7 @@ def plain(model) -> D2NetFeatures:
 @pytest.mark.first_case
 @pytest.mark.parametrize("case", PLAIN, ids=str)
 def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, golden, case):
-    """Convolutions that round by position would make peaks of what is level, and lose those at its rim."""
+    """Fast convolutions that round by position would make peaks of what is level, and lose those at its rim."""
     (features,) = local(plain(case.image[None]))
     assert_golden(features, golden, case, 1e-2, 1e-4)
     assert len(features.scores) > 10
@@ -132,14 +132,20 @@ def test_plain_areas_have_the_keypoints_of_the_public_code_and_no_more(plain, go
 
 @pytest.mark.optimized
 def test_neighbors_that_see_the_same_pixels_have_the_same_bits(model):
-    """A position sees 92 x 92 px."""
-    wide, tall = texture(160, 128), texture(160, 128)
+    """A position sees 92 x 92 px; elsewhere the fast convolutions are at work."""
+    image = texture(160, 128)
+    wide, tall = image.copy(), image.copy()
     wide[2:94, 30:126] = 200
     tall[30:126, 2:94] = 200
-    maps = compile_network(model, lambda model, images: model(images))
-    wide, tall = (maps(preprocess(image[None], "caffe")) for image in (wide, tall))
+    maps = compile_network(model, lambda model, images: (model(images), nnx.relu(model.vgg(images, uniform=True))))
+    (usual, wide, tall), (uniform, *_) = zip(
+        *(maps(preprocess(image[None], "caffe")) for image in (image, wide, tall)), strict=True
+    )
     np.testing.assert_array_equal(wide[0, 11, 18], wide[0, 11, 19])
     np.testing.assert_array_equal(tall[0, 18, 11], tall[0, 19, 11])
+    if jax.default_backend() == "cpu":
+        assert not np.array_equal(usual, uniform)
+    np.testing.assert_allclose(usual, uniform, atol=1e-5 * uniform.max())
 
 
 @pytest.mark.parametrize(("seed", "offset"), [*((seed, 0) for seed in range(6)), (0, -4)])
