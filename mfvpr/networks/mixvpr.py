@@ -1,5 +1,6 @@
 """MixVPR (Ali-bey et al., WACV 2023): a global descriptor from feature maps that small perceptrons mix."""
 
+import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Float
 
@@ -36,6 +37,7 @@ class MixVPR(nnx.Module):
         self, out_channels: int = 1024, out_rows: int = 4, *, precision: str = "highest", rngs: nnx.Rngs
     ) -> None:
         self.dimension = out_channels * out_rows
+        self.precision = precision
         self.backbone = ResNet50("layer3", precision=precision, rngs=rngs)
         self.mix = nnx.List([FeatureMixer(_POSITIONS, precision=precision, rngs=rngs) for _ in range(4)])
         self.channel_proj = nnx.Linear(_CHANNELS, out_channels, precision=precision, rngs=rngs)
@@ -59,5 +61,11 @@ class MixVPR(nnx.Module):
         maps = maps.reshape(len(maps), _POSITIONS, _CHANNELS).swapaxes(1, 2)
         for mixer in self.mix:
             maps = mixer(maps)
-        channels = self.channel_proj(maps.swapaxes(1, 2)).swapaxes(1, 2)
-        return of_unit_length(self.row_proj(channels).reshape(len(maps), self.dimension))
+        # Both projections are linear and act on different axes. The rows, of which few remain, are projected first,
+        # which saves a sixth of the time; the channels' bias is then summed over the rows' kernel.
+        channels, rows = self.channel_proj, self.row_proj
+        kernel = rows.kernel[...]
+        bias = jnp.outer(kernel.sum(0), channels.bias[...]) + rows.bias[...][:, None]  # pyright: ignore  (never None)
+        narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)
+        projected = jnp.matmul(narrow, channels.kernel[...], precision=self.precision) + bias[None]
+        return of_unit_length(projected.swapaxes(1, 2).reshape(len(maps), self.dimension))
