@@ -30,7 +30,7 @@ SUPERGLUE = {"keypoints0": POINTS, "keypoints1": POINTS, "matches": [0, -1, 2]}
         ({"points0": POINTS, "points1": np.array([None] * 3)}, "cannot be read"),
         ({"points0": POINTS, "points1": POINTS, "im_size": "large"}, "im_size"),
         ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
-        ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "was given"),
+        ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "the argument image_size="),
         ({"points0": 3.0, "points1": 3.0, "confidence": 1.0}, r"points \(x, y\)"),
         (SUPERGLUE | {"match_confidence": [0.5, 0.5]}, r"match_confidence \[N\]"),
         (SUPERGLUE | {"matches": [0, 1]}, r"matches \[N\]"),

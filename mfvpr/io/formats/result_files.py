@@ -125,11 +125,11 @@ def read_num_inliers(path: Path, most: int) -> list[float]:
 def _read_results(path: Path, most: int | None = None) -> list[dict[Any, Any]]:
     """A dictionary for each prediction, of at most `most`."""
     results = _read_torch(path, list)
-    if not all(isinstance(result, dict) for result in results) or (most is not None and len(results) > most):
-        raise InputError(
-            f"{path}: expected a dictionary of To-Match for each prediction in the text file, got "
-            f"{len(results)} results; match the predictions of this run"
-        )
+    if not all(isinstance(result, dict) for result in results):
+        raise InputError(f"{path}: expected a dictionary of To-Match for each prediction, got others")
+    if most is not None and len(results) > most:
+        got = f"{len(results)} results; match the predictions of this run"
+        raise InputError(f"{path}: expected a result for each prediction in the text file, at most {most}, got {got}")
     return results
 
 
