@@ -39,16 +39,16 @@ def one_line() -> Iterator[None]:
         sys.exit(141)
     except InputError as error:
         refuse(str(error))
-    except OSError as error:
-        refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
     except Exception as error:
         from hydra.errors import HydraException  # here: its import is slow, and Ctrl-C must be handled before
         from omegaconf.errors import OmegaConfBaseException
 
         is_group = str(error).startswith("Config group override")  # Hydra's ValueError, of GROUP=null
-        if not is_group and not isinstance(error, HydraException | OmegaConfBaseException):
-            raise
-        refuse(explain(error))
+        if is_group or isinstance(error, HydraException | OmegaConfBaseException):  # some are an OSError as well
+            refuse(explain(error))
+        if isinstance(error, OSError):
+            refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
+        raise
 
 
 def explain(error: Exception) -> str:

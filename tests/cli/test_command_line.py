@@ -50,7 +50,7 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
 
 @pytest.mark.parametrize(("program", "arguments", "words"), [
     ("evaluate", ["experiment=histogram"], "Could not override 'experiment'"),
-    ("sweep", ["system=mix_hist_5"], "Could not find 'system/mix_hist_5'"),
+    ("sweep", ["system=mix_hist_5"], "error: In 'sweep': Could not find 'system/mix_hist_5'"),
     ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
     ("sweep", ["fusion.c=zscore", "final=combined", "grid.sigma=[3]"], "fusion.c=zscore: expected a number or auto"),
     ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
