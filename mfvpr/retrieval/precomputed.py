@@ -13,10 +13,9 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.image_reading import Interpolation, read_size
 from mfvpr.features.extractor import Scale
-from mfvpr.io.checks import Lengths
 from mfvpr.io.containers import FileEntry
-from mfvpr.io.descriptors import read_with_entries as read_descriptors
-from mfvpr.io.features import ImportedFeatures, open_features
+from mfvpr.io.features import ImportedFeatures, Lengths, open_features
+from mfvpr.io.features import read_descriptors_with_entries as read_descriptors
 from mfvpr.io.matches import Images, ImportedMatches, content_paths, open_matches
 from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.io.containers import read_npz, reading, shorten
-from mfvpr.io.formats.pair_files import FileMatches, Pair, PairReader, Size
-from mfvpr.io.formats.pickles import ArrayUnpickler, PickledArray, open_torch_archive
+from mfvpr.io.object_files import ArrayUnpickler, open_torch_archive
+from mfvpr.io.pair_files import FileMatches, Pair, PairReader
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable
 
@@ -39,30 +39,30 @@ class ResultFiles(PairReader):
     by_number, in_image_files = False, False
 
     def __init__(self, path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> None:
-        self.path, self._verified = path, verified
+        self._verified = verified
         files = sorted(file for file in path.iterdir() if file.suffix in (".npz", ".torch"))
         stems = [{PurePosixPath(name).stem for name in side} for side in names]
-        pairs = {file: _names_inside(file) for file in files}
-        self.sided = not all(pairs.values())
-        if self.sided and any(pairs.values()):
+        places: dict[Pair, Path] = {}
+        has_names = set()  # whether files name their images
+        for file in files:
+            parts = read_npz(file, _NAMES) if file.suffix == ".npz" else _read_torch(file)
+            inside = [str(parts[name]) for name in _NAMES if name in parts]
+            has_names.add(len(inside) == 2)
+            pair = (inside[0], inside[1]) if len(inside) == 2 else _names_of_file(file, stems)
+            if pair is not None and places.setdefault(pair, file) != file:
+                raise InputError(f"{file}: expected another pair than in {places[pair].name}; remove either")
+        if len(has_names) == 2:
             raise InputError(f"{path}: expected {' and '.join(_NAMES)} in all files or in none, got both")
-        self._files: dict[Pair, Path] = {}
-        for file, inside in pairs.items():
-            pair = inside or _names_of_file(file, stems)
-            if pair is not None and self._files.setdefault(pair, file) != file:
-                raise InputError(f"{file}: expected another pair than in {self._files[pair].name}; remove either")
-        if not self._files:
+        if not places:
             raise InputError(
                 f"{path}: expected a file .npz or .torch for each pair of images, got {len(files)} files of other "
                 "images; give the file matches*.h5, the database, or the folder of matches"
             )
-        self.images = tuple(dict.fromkeys(chain(*self._files)))
-
-    def __contains__(self, pair: Pair) -> bool:
-        return pair in self._files
+        self.sided = has_names == {False}
+        super().__init__(path, places)
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
-        for file in (self._files[pair] for pair in pairs):
+        for file in (self.places[pair] for pair in pairs):
             result = read_npz(file, _PARTS) if file.suffix == ".npz" else _read_torch(file)
             yield _matches_of(file, result, self._verified)
 
@@ -73,25 +73,22 @@ class PredictionPairs(PairReader):
     by_number, in_image_files = False, False
 
     def __init__(self, path: Path, verified: bool = False) -> None:
-        self.path, self._verified = path, verified
-        self._places: dict[Pair, tuple[Path, int]] = {}
+        self._verified = verified
+        places: dict[Pair, tuple[Path, int]] = {}
         for file in sorted(path.glob("*.torch")):
             query, predictions = read_predictions(file.with_suffix(".txt"))
             for position in range(len(_read_results(file, len(predictions)))):
-                self._places.setdefault((query, predictions[position]), (file, position))
-        self.images = tuple(dict.fromkeys(chain(*self._places)))
+                places.setdefault((query, predictions[position]), (file, position))
+        super().__init__(path, places)
 
     @staticmethod
     def fits(folder: Path) -> bool:
         """Whether a folder has results beside predictions."""
         return any(file.with_suffix(".txt").exists() for file in folder.glob("*.torch"))
 
-    def __contains__(self, pair: Pair) -> bool:
-        return pair in self._places
-
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
         read_results = cache(_read_results)  # pairs of a query share a file
-        for file, position in (self._places[pair] for pair in pairs):
+        for file, position in (self.places[pair] for pair in pairs):
             yield _matches_of(file, read_results(file)[position], self._verified)
 
 
@@ -134,20 +131,13 @@ def _read_results(path: Path, most: int | None = None) -> list[dict[Any, Any]]:
 
 
 def _read_torch(path: Path, kind: type = dict) -> Any:
-    """Content of a file of `torch.save` without tensors: plain data, and `PickledArray`."""
+    """Content of a file of `torch.save` without tensors: plain data and arrays."""
     with reading(path, mend="is it a result of vismatch or To-Match?"), path.open("rb") as file:
         with open_torch_archive(file) as archive:
             result = ArrayUnpickler(archive.pickle).load()
         if not isinstance(result, kind):
             raise InputError(f"expected a {kind.__name__} of results, got {type(result).__name__}")
         return result
-
-
-def _names_inside(file: Path) -> Pair | None:
-    """Names of the two images, if the file has them."""
-    parts = read_npz(file, _NAMES) if file.suffix == ".npz" else _read_torch(file)
-    names = [str(parts[name]) for name in _NAMES if name in parts]
-    return (names[0], names[1]) if len(names) == 2 else None
 
 
 def _names_of_file(file: Path, stems: Sequence[set[str]]) -> Pair | None:
@@ -162,12 +152,12 @@ def _names_of_file(file: Path, stems: Sequence[set[str]]) -> Pair | None:
 
 def _matches_of(file: Path, result: Parts, verified: bool) -> FileMatches:
     """Matches of a result, or its inliers if `verified`."""
-    parts = {
-        name: np.asarray(part.content if isinstance(part, PickledArray) else part)
-        for name, part in result.items()
-        if name in _PARTS and part is not None
-    }
-    sizes = _sizes(file, parts)
+    parts = {name: np.asarray(part) for name, part in result.items() if name in _PARTS and part is not None}
+    sizes, size_names = None, ("im_size", "im_size") if "im_size" in parts else _SIZES[:2]
+    if {*size_names} & parts.keys():
+        with reading(file, mend="expected image_size0 and image_size1 (width, height), or im_size, px"):
+            size0, size1 = (np.broadcast_to(parts[name].astype(np.float64), 2).tolist() for name in size_names)
+            sizes = (size0[0], size0[1]), (size1[0], size1[1])
     for first, second, confidence in (_INLIERS,) if verified else _LAYOUTS:
         if first in parts and second in parts:
             return FileMatches(parts[first], parts[second], parts.get(confidence), sizes)
@@ -187,12 +177,3 @@ def _matches_of(file: Path, result: Parts, verified: bool) -> FileMatches:
     real = numbers >= 0
     confidence = None if confidence is None else confidence[real]
     return FileMatches(keypoints0[real], keypoints1[numbers[real]], confidence, sizes)
-
-
-def _sizes(file: Path, parts: Parts) -> tuple[Size, Size] | None:
-    names = (_SIZES[2], _SIZES[2]) if _SIZES[2] in parts else _SIZES[:2]
-    if not {*names} & parts.keys():
-        return None
-    with reading(file, mend="expected image_size0 and image_size1 (width, height), or im_size, px"):
-        size0, size1 = (np.broadcast_to(parts[name].astype(np.float64), 2).tolist() for name in names)
-    return tuple(size0), tuple(size1)

@@ -1,10 +1,11 @@
 """Files with matches of image pairs: hloc's HDF5, COLMAP's databases, kapture's folders."""
 
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -30,32 +31,26 @@ class FileMatches(NamedTuple):
     confidence: Num[np.ndarray, " matches"] | None = None
     sizes: tuple[Size, Size] | None = None
 
-    def exchanged(self) -> "FileMatches":
-        """Matches of the same images in the other order."""
-        sizes = None if self.sizes is None else (self.sizes[1], self.sizes[0])
-        return FileMatches(self.second, self.first, self.confidence, sizes)
-
 
 class PairReader:
     """Base class of readers of matches; a pair of names has an order.
 
     Attributes:
         path: file or folder, for messages.
+        places: where the matches of each pair are; they may be none.
         images: their names in the file.
         by_number: whether matches are numbers of keypoints.
         sided: whether the first name of a pair is always the query's, so that a name may also be a database image's.
         in_image_files: whether points without sizes are in the px of the image files.
     """
 
-    path: Path
-    images: tuple[str, ...]
-    by_number: bool
+    by_number: bool = True
     sided: bool = False
     in_image_files: ClassVar[bool] = True
 
-    def __contains__(self, pair: Pair) -> bool:
-        """Whether the file has the matches of a pair in this order; they may be none."""
-        raise NotImplementedError
+    def __init__(self, path: Path, places: Mapping[Pair, Any]) -> None:
+        self.path, self.places = path, places
+        self.images = tuple(dict.fromkeys(chain(*places)))
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
         """Matches of pairs that the file contains."""
@@ -81,25 +76,21 @@ class HlocPairs(PairReader):
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._file = path, H5File(path)
-        groups = [group for group in self._file.images if group.count("/") == 1]
-        [arrays] = self._file.shapes(groups[:1], ()) if groups else [{}]
-        if not {"matches0", "keypoints0"} & {*arrays}:
+        self._file = H5File(path)
+        groups = [group for group in self._file.entries if group.count("/") == 1]
+        [arrays] = self._file.shapes(groups[:1], (), ("matches0", "keypoints0")) if groups else [{}]
+        if not arrays:
             raise InputError(
                 f"{path}: expected groups IMAGE/IMAGE of matches, as hloc writes them since 2021, got others; give "
                 "matches*.h5, not feats*.h5, or match again"
             )
         self.by_number = "keypoints0" not in arrays
-        self._groups = {tuple(map(self.spelling, group.split("/"))): group for group in groups}
-        if len(self._groups) < len(groups):
+        super().__init__(path, {tuple(map(self.spelling, group.split("/"))): group for group in groups})
+        if len(self.places) < len(groups):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
-        self.images = tuple(dict.fromkeys(name for pair in self._groups for name in pair))
-
-    def __contains__(self, pair: Pair) -> bool:
-        return pair in self._groups
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
-        groups = [self._groups[pair] for pair in pairs]
+        groups = [self.places[pair] for pair in pairs]
         parts = ("matches0", "matching_scores0") if self.by_number else ("keypoints0", "keypoints1", "scores")
         for group, arrays in zip(groups, self._file.arrays(groups, parts), strict=True):
             where, score = f"{self.path}: {shorten(group)}", arrays.get(parts[-1])
@@ -126,50 +117,41 @@ class HlocPairs(PairReader):
 class ColmapPairs(PairReader):
     """Reader of COLMAP's SQLite table `matches`, or of `two_view_geometries` if `verified`; it changes nothing."""
 
-    by_number = True
     _MOST_IMAGES = 2**31 - 1  # the number of a pair is this times the number of the first image plus the other
 
     def __init__(self, path: Path, verified: bool = False) -> None:
         self.path = path
         self._table = "two_view_geometries" if verified else "matches"
         with self._open() as database:
-            images = "SELECT name, image_id, width, height FROM images JOIN cameras USING (camera_id)"
-            rows = database.execute(images).fetchall()
-            self._pairs = {row[0] for row in database.execute(f"SELECT pair_id FROM {self._table}")}
-        self._numbers = {name: number for name, number, *_ in rows}
-        self._sizes: dict[str, Size] = {name: (width, height) for name, _, width, height in rows}
-        self.images = tuple(self._numbers)
-
-    def __contains__(self, pair: Pair) -> bool:
-        return self._pair_id(pair) in self._pairs
+            images = "SELECT image_id, name, width, height FROM images JOIN cameras USING (camera_id)"
+            self._images = {name: (number, (width, height)) for number, name, width, height in database.execute(images)}
+            names = {number: name for name, (number, _) in self._images.items()}
+            places = {}
+            for (number,) in database.execute(f"SELECT pair_id FROM {self._table}"):
+                first, second = divmod(number, self._MOST_IMAGES)
+                places[names[first], names[second]] = number
+        super().__init__(path, places)
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
         for pair in pairs:
-            numbers = self._matrix(self._table, "pair_id", self._pair_id(pair), "<u4").astype(np.int64)
+            numbers = self._matrix(self._table, "pair_id", self.places[pair], "<u4").astype(np.int64)
             yield FileMatches(numbers[:, 0], numbers[:, 1])
 
     def keypoints(self, image: str) -> Float[np.ndarray, "keypoints 2"]:
-        points = self._matrix("keypoints", "image_id", self._numbers[image], "<f4")[:, :2]
+        points = self._matrix("keypoints", "image_id", self._images[image][0], "<f4")[:, :2]
         return points - np.float32(0.5)  # the center of COLMAP's first pixel, px
 
     def image_size(self, image: str) -> Size:
-        return self._sizes[image]
-
-    def _pair_id(self, pair: Pair) -> int:
-        first, second = (self._numbers[name] for name in pair)
-        return self._MOST_IMAGES * first + second
+        return self._images[image][1]
 
     def _matrix(self, table: str, column: str, number: int, dtype: str) -> Num[np.ndarray, "rows columns"]:
         """The matrix of a row `(rows, cols, data)` of a table, of 2 or more columns; without a row, it is empty."""
         query = f"SELECT rows, cols, data FROM {table} WHERE {column} = ?"
         with self._open() as database:
             rows, columns, content = database.execute(query, (number,)).fetchone() or (0, 2, b"")
-            if not rows:
-                return np.zeros((0, 2), dtype)
-            matrix = np.frombuffer(content, dtype).reshape(rows, columns)
-            if columns < 2:
+            if rows and columns < 2:
                 raise InputError(f"expected 2 or more columns in {table}, got {columns}")
-            return matrix
+            return np.frombuffer(content, dtype).reshape(rows, columns) if rows else np.zeros((0, 2), dtype)
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -194,25 +176,27 @@ class KapturePairs(PairReader):
     pixel centers are at whole numbers from extractors such as R2D2, and at half pixels if kapture has them from COLMAP.
     """
 
-    by_number = True
-    _MATCHES, _SEPARATOR, _SUFFIX = Path("reconstruction/matches"), ".overlapping/", ".matches"
+    _MATCHES = Path("reconstruction/matches")
     _NUMBERS: ClassVar = {"float32": "<f4", "float64": "<f8", "float": "<f8"}  # types of keypoints
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         self._matches, self._keypoints = self.folders(path)
-        self._type, self._columns = self._keypoint_layout(self._keypoints / "keypoints.txt")
-        self._files: dict[Pair, str] = {}
-        for path in sorted(self._matches.rglob(f"*{self._SUFFIX}")):
-            file = path.relative_to(self._matches).as_posix()
-            first, _, second = file.removesuffix(self._SUFFIX).partition(self._SEPARATOR)
-            self._files[first, second] = file
-        if not self._files:
-            raise InputError(
-                f"{self._matches}: expected files IMAGE{self._SEPARATOR}IMAGE{self._SUFFIX}, got none; "
-                "unpack archives first"
-            )
-        self.images = tuple(dict.fromkeys(name for pair in self._files for name in pair))
+        layout = self._keypoints / "keypoints.txt"  # the line `name, dtype, dsize`
+        with reading(layout, mend="expected a line name, dtype, dsize with float32 or float64 and at least 2"):
+            lines = layout.read_text(encoding="utf-8").splitlines()
+            [(_, kind, columns)] = [
+                line.replace(" ", "").split(",") for line in lines if line.strip() and line[0] != "#"
+            ]
+            self._type, self._columns = self._NUMBERS[kind.removeprefix("numpy.")], int(columns)
+        places: dict[Pair, Path] = {}
+        for file in sorted(self._matches.rglob("*.matches")):
+            name = file.relative_to(self._matches).as_posix().removesuffix(".matches")
+            first, _, second = name.partition(".overlapping/")
+            places[first, second] = file
+        if not places:
+            expected = "files IMAGE.overlapping/IMAGE.matches"
+            raise InputError(f"{self._matches}: expected {expected}, got none; unpack archives first")
+        super().__init__(path, places)
 
     @classmethod
     def folders(cls, path: Path) -> tuple[Path, Path]:
@@ -230,12 +214,8 @@ class KapturePairs(PairReader):
         """Whether a folder looks like kapture's."""
         return (folder / cls._MATCHES).is_dir() or folder.parent.match(cls._MATCHES.as_posix())
 
-    def __contains__(self, pair: Pair) -> bool:
-        return pair in self._files
-
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:
-        for pair in pairs:
-            path = self._matches / self._files[pair]
+        for path in (self.places[pair] for pair in pairs):
             values = self._read_matrix(path, "<f8", 3)
             if (values[:, :2] % 1 != 0).any():  # NaN neither
                 raise InputError(f"{path}: expected rows of two whole numbers and a score, got others; match again")
@@ -243,13 +223,6 @@ class KapturePairs(PairReader):
 
     def keypoints(self, image: str) -> Float[np.ndarray, "keypoints 2"]:
         return self._read_matrix(self._keypoints / f"{image}.kpt", self._type, self._columns)[:, :2]
-
-    def _keypoint_layout(self, path: Path) -> tuple[str, int]:
-        """Type and number of columns, from the line `name, dtype, dsize` of a `keypoints.txt`."""
-        with reading(path, mend="expected a line name, dtype, dsize with float32 or float64 and at least 2"):
-            lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and line[0] != "#"]
-            [(_, kind, columns)] = [line.replace(" ", "").split(",") for line in lines]
-            return self._NUMBERS[kind.removeprefix("numpy.")], int(columns)
 
     def _read_matrix(self, path: Path, kind: str, columns: int) -> Float[np.ndarray, "rows columns"]:
         with reading(path, "a file of kapture"):

@@ -1,6 +1,6 @@
-"""Read pickles as data: Python's unpickler with a list of the names that a file may ask for.
+"""Read files that may hold more than data, as data: pickles of NumPy and PyTorch, and MATLAB's files.
 
-Each of these names has a stand-in. No other name is looked up, and nothing in a file is executed.
+Nothing in a file is executed: a pickle may ask only for the names of an unpickler, each of which has a stand-in.
 """
 
 import io
@@ -13,12 +13,12 @@ from pathlib import PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, ClassVar, NamedTuple
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 
 from mfvpr.io.containers import read_npy_header, shorten
 from mfvpr.utils.errors import InputError
 
 NUMPY_MAGIC = b"\x93NUMPY"
-_NUMBERS = "fiub"  # kinds of NumPy's types
 
 
 class Function:
@@ -54,55 +54,21 @@ class DataUnpickler(pickle.Unpickler):
         return self.names[full_name]
 
 
-class _Type:
-    """Type of an array's values: its code, then its byte order."""
-
-    __slots__ = ("code", "dtype")
-
-    def __init__(self, code: str) -> None:
-        self.code = code
-        self.dtype: np.dtype | None = None
-
-    def __setstate__(self, state: tuple) -> None:
-        if state[1] not in "<>|" or state[2:5] != (None, None, None):
-            raise InputError(f"expected arrays of numbers, got {shorten(self.code)}; use the official file")
-        self.dtype = np.dtype(f"{state[1]}{self.code}")
-
-
-class PickledArray:
-    """An array in a pickle: `content` is an array of numbers, or a list of objects."""
-
-    __slots__ = ("content", "shape")
-
-    def __init__(self) -> None:
-        self.content: Any = None
-        self.shape: tuple[int, ...] = ()
-
-    def __setstate__(self, state: tuple) -> None:
-        _, self.shape, array_type, is_fortran, values = state
-        if array_type.dtype.kind == "O":
-            self.content = list(values)
-            return
-        if array_type.dtype.kind not in _NUMBERS:
-            raise InputError(f"expected arrays of numbers, got {shorten(array_type.code)}; use the official file")
-        content = values.encode("latin-1") if isinstance(values, str) else values
-        array = np.frombuffer(content, array_type.dtype).reshape(self.shape, order="F" if is_fortran else "C")
-        self.content = array.astype(array.dtype.newbyteorder("="), copy=False)
-
-
 def _path_text(kind: type[PurePath], *parts: str) -> str:
     return kind(*parts).as_posix()
 
 
 class ArrayUnpickler(DataUnpickler):
-    """Unpickler of `PickledArray` among plain data; paths become text."""
+    """Unpickler of NumPy's arrays among plain data; paths become text."""
 
     names: ClassVar = {
-        "numpy.core.multiarray._reconstruct": Function(lambda *_: PickledArray()),
-        "numpy._core.multiarray._reconstruct": Function(lambda *_: PickledArray()),
-        "numpy.ndarray": Function(lambda *_: PickledArray()),
-        "numpy.dtype": Function(lambda code, *_: _Type(code)),
-        "_codecs.encode": Function(lambda text, *_: text),  # bytes in protocols that have none
+        **dict.fromkeys(
+            ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"),
+            Function(lambda *_: np.ndarray(0, np.int8)),  # which the pickle fills
+        ),
+        "numpy.ndarray": Function(np.ndarray),
+        "numpy.dtype": Function(lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
+        "_codecs.encode": Function(lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
         "__builtin__.bytes": Function(bytes),  # of an array without values
         "builtins.bytes": Function(bytes),
         **{
@@ -115,16 +81,16 @@ class ArrayUnpickler(DataUnpickler):
 
 
 def read_objects(file: BinaryIO, expected: str) -> list[Any]:
-    """Objects of a `.npy` file; arrays among them are `PickledArray`, `expected` is for messages.
+    """Objects of a `.npy` file, NumPy's arrays among them; `expected` is for messages.
 
     Raises:
         InputError: the file holds other content; any error if it is damaged.
     """
     shape, _, dtype = read_npy_header(file)
     content = ArrayUnpickler(file).load() if dtype.hasobject else None
-    if not isinstance(content, PickledArray) or not isinstance(content.content, list) or content.shape != shape:
+    if not isinstance(content, np.ndarray) or content.dtype != object or content.shape != shape:
         raise InputError(f"expected {expected}, got another object of {dtype} {[*shape]}; use the official file")
-    return content.content
+    return content.ravel().tolist()
 
 
 class TorchArchive(NamedTuple):
@@ -147,3 +113,31 @@ def open_torch_archive(file: BinaryIO) -> Iterator[TorchArchive]:
         if len(pickles) != 1:
             raise InputError("expected a file of torch.save, got another zip file")
         yield TorchArchive(archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0])))
+
+
+def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
+    """Read arrays by path: `variable.field.0.field`, with 0, 1, ... for elements of a cell or an array of structures.
+
+    Reads versions 4 to 7.2. If `text`, lines of text are read as well, as arrays of one string. SciPy's errors are
+    raised if the file is damaged.
+    """
+    arrays = {}
+
+    def collect(path: str, value: Any) -> None:
+        if value.dtype.names:  # structures
+            for place, structure in enumerate(value.ravel(order="F")):
+                owner = path if value.size == 1 else f"{path}.{place}"
+                for field in value.dtype.names:
+                    collect(f"{owner}.{field}", structure[field])
+        elif value.dtype == object:  # a cell
+            for place, part in enumerate(value.ravel(order="F")):
+                collect(f"{path}.{place}", part)
+        elif value.dtype.kind == "U" and value.size == 1 and text:
+            arrays[path] = np.array(value.item())
+        elif value.dtype.kind in "fiu" and value.size:
+            arrays[path] = value
+
+    for name, value in scipy.io.loadmat(file, mat_dtype=True).items():
+        if not name.startswith("__"):
+            collect(name, value)
+    return arrays
