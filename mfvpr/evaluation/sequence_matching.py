@@ -1,23 +1,25 @@
 """Matches of a sequence: images -> features -> shortlist -> matches, kept in the folder of a cache, if any."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.system import Pipeline, folders_of
-from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
+from mfvpr.features.feature_set import FeatureSet
 from mfvpr.matchers.host_matcher import Side
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.match_files import MatchStore
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch
@@ -193,3 +195,49 @@ def _match_stores(work: _Work) -> list[MatchStore]:
     line = f"all {number} queries from" if is_done else f"{number} queries with {recipe['candidates']} candidates, in"
     cache.log(f"{work.sequence.name} matches: {line} {stores[0].folder}")
     return stores
+
+
+def validate_candidates(
+    retrieved: Any, name: str, num_queries: int, num_database: int, num_candidates: int
+) -> RetrievalResult:
+    """Check the candidates of the retrieval `name`, which may be user-defined; return them padded with -1 and 0."""
+    if not isinstance(retrieved, RetrievalResult):
+        raise InputError(f"{name}: expected RetrievalResult(shortlist, {{}}, {{}}), got {type(retrieved).__name__}")
+    shortlist = retrieved.candidates
+    if not isinstance(shortlist, Shortlist):
+        raise InputError(f"{name}: expected a Shortlist in RetrievalResult, got {type(shortlist).__name__}")
+    indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
+    expected = (num_queries, num_candidates)
+    if {indices.shape, scores.shape, mask.shape} != {expected} or mask.dtype != bool or indices.dtype.kind not in "iu":
+        shapes = f"{list(indices.shape)}, {list(scores.shape)} and {list(mask.shape)}"
+        parts = f"indices (whole), scores and mask (bool) of {list(expected)} each"
+        raise InputError(f"{name}: expected {parts}, got {shapes}; pad with -1")
+    if not ((indices[mask] >= 0) & (indices[mask] < num_database)).all():
+        got = f"{indices[mask].min()} to {indices[mask].max()}"
+        raise InputError(f"{name}: expected rows of the database from 0 to {num_database - 1}, got {got}")
+    ordered = np.sort(np.where(mask, indices, -1), axis=1)
+    if (is_repeated := (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any():
+        query, place = np.argwhere(is_repeated)[0]
+        got = f"{ordered[query, place]} twice for query {query}"
+        raise InputError(f"{name}: expected every row of the database once, got {got}")
+    if not np.isfinite(scores[mask]).all():
+        raise InputError(f"{name}: expected finite scores")
+    indices, scores = np.where(mask, indices, -1).astype(np.int32), np.where(mask, scores, 0).astype(np.float32)
+    return retrieved._replace(candidates=Shortlist(indices, scores, mask))
+
+
+def image_warnings(folder: ImageFolder, features: FeatureSet, bad: Mapping[int, str]) -> Iterator[str]:
+    """Warnings of bad images, which rank last, and of images without keypoints, which have no matches."""
+    yield from bad.values()
+    counts = np.asarray(features.source.counts)
+    if empty := [row for row in np.flatnonzero(counts == 0).tolist() if row not in bad]:
+        number = f"{len(empty)} such images of {len(folder)}"
+        yield f"{folder.paths[empty[0]]}: no keypoints, so no matches ({number}); scores are 0"
+
+
+def empty_pairs_warning(name: str, matched: Matched) -> Iterator[str]:
+    """Warning if half of the pairs or more have no matches."""
+    real = matched.candidates.mask
+    empty = int((real & (matched.matches[0].counts == 0)).sum())
+    if empty and 2 * empty >= real.sum():
+        yield f"{name}: {empty} of {real.sum()} pairs have no matches; they score 0"

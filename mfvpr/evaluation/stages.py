@@ -4,31 +4,139 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
+from threading import Lock
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
-from mfvpr.core.batch import BIN_STEP
+from mfvpr.core.batch import BIN_STEP, score_settings
 from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
 from mfvpr.core.parameters import with_capacity
+from mfvpr.core.scorer import Scorer, check_host, on_host, require_scores, score_pairs, with_static_functions
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
-from mfvpr.evaluation.batched_scoring import score
+from mfvpr.evaluation.rankings import Scores, fuse_scales
 from mfvpr.features.feature_set import FeatureSet, memory_budget
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
-from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales
+from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
 from mfvpr.storage.match_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
+from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
+from mfvpr.utils.threads import ordered_map
+
+PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
+
+
+def score(
+    scorers: Mapping[str, Scorer],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    *,
+    runtime: Runtime = DEFAULT_RUNTIME,
+) -> dict[str, Scores]:
+    """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
+
+    All scorers together are one program for each shape of a batch, which is reused for other parameter values
+    (histograms: up to the next multiple of 8 bins). Several scales are scored one by one and fused. The devices of
+    `runtime` share the batches, without effect on the bits of the scores.
+    """
+    if not scorers:
+        return {}
+    for scorer in scorers.values():
+        check_host(scorer)
+    num_queries, sets = len(candidates.mask), scales(match_set)
+    size = queries_that_fit(match_set, len(scorers))
+    parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
+    fitted = with_static_functions(with_capacity(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
+
+    def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
+        for part in parts:
+            part_batches = all_batches(match_set, part, settings=1)
+            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=runtime.devices):
+                yield part, places, values
+
+    total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
+    for part, places, values in runtime.progress("scores")(score_parts(), total):
+        scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
+        for name, pair_scores in values.items():
+            scores[name][scale, part.start + query, place] = pair_scores
+    fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
+    return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
+
+
+def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
+    """`match_set.batches` of q queries at every scale; positions are in the flattened `[S, q, C]`."""
+    for scale, scale_set in enumerate(scales(match_set)):
+        pairs = len(queries) * scale_set.counts.shape[1]
+        for places, matches in batches(scale_set, queries, settings=settings):
+            yield scale * pairs + places, matches
+
+
+def run_batches(
+    program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy; devices take turns.
+
+    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`.
+    """
+    to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
+    device_inputs = [put(inputs) for put in to_device]
+    compiled_shapes: set[tuple] = set()
+    compiling: dict[tuple, Lock] = {}
+
+    def run_batch(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
+        number, (places, matches) = numbered
+        device = number % len(to_device)
+        key = device, matches.mask.shape
+        # The first batch of a shape compiles; batches of the same shape wait for it.
+        with nullcontext() if key in compiled_shapes else compiling.setdefault(key, Lock()):
+            values = program(to_device[device](matches), *device_inputs[device])
+        compiled_shapes.add(key)
+        return places, jax.tree.map(lambda leaf: np.asarray(leaf)[..., : len(places)], values)
+
+    # A batch keeps only one core busy, so that one batch per core runs at the same time.
+    workers = max(available_cpus(), len(to_device))
+    run_all = partial(ordered_map, workers=workers) if knows_own_context() else map
+    return iter(run_all(run_batch, enumerate(batches)))
+
+
+def fuse_all(
+    match_set: MatchSet | Scales,
+    scores: Num[np.ndarray, "scales *batch queries candidates"],
+    mask: Bool[np.ndarray, "queries candidates"],
+) -> Float[np.ndarray, "*batch queries candidates"]:
+    """Fused scores of all scales."""
+    if not isinstance(match_set, Scales):
+        return scores[0]
+    weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
+    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
+
+
+def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    host_scorers = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
+    scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in host_scorers})
+    return scores | {name: score_pairs(scorer, matches) for name, scorer in host_scorers.items()}
+
+
+@compiled
+def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    scores = {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
+    for name, values in scores.items():
+        require_scores(name, values, len(matches.mask))
+    return scores
+
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
@@ -217,3 +325,10 @@ def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Ar
         return votes, shift, (low + high)[None] / 2 + jnp.stack([-half, half])
 
     return jax.vmap(of_pair)(matches)
+
+
+def require_finite(name: str, scores: np.ndarray) -> None:
+    """Raise an InputError if every score of a scorer is NaN, infinite, or 0, the score of pairs without matches."""
+    if not np.isfinite(scores).all() and not scores[np.isfinite(scores)].any():
+        fix = "check what the scorer expects of features and sizes"
+        raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; {fix}")

@@ -10,7 +10,7 @@ from PIL import Image
 import mfvpr
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import image_folder
-from mfvpr.evaluation import shortlist_scores, stages
+from mfvpr.evaluation import rankings, stages
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.matchers import match_set as match_sets
@@ -122,7 +122,7 @@ def test_skipped_images_are_listed_and_never_shortlisted(small_street, tmp_path)
         assert values[0, 0] == values[0, 1] > 0
         assert values[0, 2] == 0.0  # no keypoints, no matches
         assert np.isnan(values[0, 3:]).all()
-        np.testing.assert_array_equal(shortlist_scores.rank_shortlist(candidates, values)[0], range(5))
+        np.testing.assert_array_equal(rankings.rank_shortlist(candidates, values)[0], range(5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
