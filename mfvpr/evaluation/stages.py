@@ -156,7 +156,6 @@ def match(
     matcher: Matcher | PairSource = NEIGHBORS,
     *,
     store: MatchStore | None = None,
-    rows: Sequence[int] | None = None,
     runtime: Runtime = DEFAULT_RUNTIME,
 ) -> MatchSet:
     """Match every query with its candidates. Matches of compiled matchers include their ratio, which some weights use.
@@ -168,50 +167,44 @@ def match(
         matcher: of one pair; one that runs on the host takes no part in a cluster.
         store: of these features, candidates and matcher. Queries that it lacks, or has with other candidates, are
             matched and written in small batches; the result is read from it.
-        rows: of the queries that are matched and returned; None = all.
         runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
         InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
     """
     if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
-        _require_same_dimensions(queries, database)
-    sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
+        is_known = (queries.counts > 0).any() and (database.counts > 0).any()
+        if is_known and queries.dimension != database.dimension:
+            got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
+            raise InputError(f"features: expected as many dimensions on both sides, got {got}")
+    is_on_host = isinstance(matcher, PairSource)
+    runtime = replace(runtime, cluster=None) if store is None or is_on_host else runtime
     limits = runtime.memory, runtime.devices
+    if runtime.cluster is not None:
+        limits = runtime.memory or WORKER_MEMORY, None
+    shared = queries, database, candidates, matcher, limits
     if store is None:
-        results = replace(runtime, cluster=None).map(
-            _match_queries, (*sides, matcher, limits), requested, "matching", batched.QUERIES
-        )
+        results = runtime.map(_match_queries, shared, range(len(queries)), "matching", batched.QUERIES)
         matched = [query for _, query in results]
-        shape = len(matched), candidates.indices.shape[1]
-        counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
+        counts = np.array([query.counts for query in matched], np.int32).reshape(candidates.indices.shape)
         return MatchSet.of([query.matches for query in matched], counts)
     missing = [
         row
-        for row, query in store.read(requested)
+        for row, query in store.read(range(len(queries)))
         if query is None or not np.array_equal(query.indices, candidates.indices[row])
     ]
     if missing:
-        if isinstance(matcher, PairSource):
-            runtime = replace(runtime, cluster=None)
-        if runtime.cluster is not None:
-            limits = runtime.memory or WORKER_MEMORY, None
-        results = runtime.map(_match_queries, (*sides, matcher, limits), missing, "matching", batched.QUERIES)
-        together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # on the host, a query may take minutes
+        results = runtime.map(_match_queries, shared, missing, "matching", batched.QUERIES)
+        together = 1 if is_on_host else STORE_BATCH  # on the host, a query may take minutes
         while batch := dict(itertools.islice(results, together)):
             store.write(batch)
-    if (stored := stored_matches(store, rows, memory=runtime.memory)) is None:
+    if (stored := stored_matches(store, memory=runtime.memory)) is None:
         raise InputError(f"{store.folder}: matches were removed or damaged meanwhile; run again")
     return stored[0]
 
 
 def _match_queries(
-    queries: Any,
-    database: Any,
-    candidates: Shortlist,
-    matcher: Matcher | PairSource,
-    limits: Limits,
-    rows: Sequence[int],
+    queries: Any, database: Any, candidates: Shortlist, matcher: Any, limits: Limits, rows: Sequence[int]
 ) -> Iterator[tuple[int, QueryMatches]]:
     """(row, matches) of queries, in the order of `rows`, within limits of memory and devices."""
     sides, (memory, devices) = (queries, database, candidates), limits
@@ -220,20 +213,12 @@ def _match_queries(
     return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
 
 
-def _require_same_dimensions(queries: FeatureSet, database: FeatureSet) -> None:
-    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
-        got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
-        raise InputError(f"features: expected as many dimensions on both sides, got {got}")
-
-
-def stored_matches(
-    store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
-) -> tuple[MatchSet, Shortlist] | None:
+def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist] | None:
     """Matches and shortlist from a store, NumPy; None if some are missing or damaged.
 
     Matches of more than `memory` GB (None: a third of what is free) stay on disk.
     """
-    rows, matches, shortlist = range(store.num_queries) if rows is None else rows, list[Matches](), list[Any]()
+    rows, matches, shortlist = range(store.num_queries), list[Matches](), list[Any]()
     left = memory_budget(memory, jax.local_devices(backend="cpu")[:1])
     for _, query in store.read(rows):
         if query is None:
