@@ -18,8 +18,15 @@ from jaxtyping import Bool, Float, Int, Num
 
 from mfvpr.core.batch import BIN_STEP, score_settings
 from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, check_host, on_host, require_scores, score_pairs, with_static_functions
+from mfvpr.core.scorer import (
+    Scorer,
+    check_host,
+    fit_capacities,
+    on_host,
+    require_scores,
+    score_pairs,
+    with_static_functions,
+)
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.rankings import Scores, fuse_scales
@@ -58,7 +65,7 @@ def score(
     num_queries, sets = len(candidates.mask), scales(match_set)
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
-    fitted = with_static_functions(with_capacity(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
 
     def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
@@ -247,7 +254,7 @@ class Explanation:
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
-    fitted = with_capacity(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
     return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
 
 
@@ -272,7 +279,7 @@ def dominant_shifts(
         query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they
         refer.
     """
-    fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, min(start + SHIFTS_AT_ONCE, len(queries)))
