@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from mfvpr.cli.evaluation import evaluate
-from mfvpr.cli.inputs import prepare
+from mfvpr.cli.jobs import prepare
 from mfvpr.datasets.contents import readings
 from mfvpr.utils import Stopwatch
 from tests.programs import csv_rows, folder, settings_of
