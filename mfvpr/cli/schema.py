@@ -9,8 +9,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
+from mfvpr.evaluation.drives import Method
 from mfvpr.evaluation.protocol import Split
-from mfvpr.evaluation.sequences import Method
 from mfvpr.systems.choices import GROUPS, KEYS, SystemSettings, choices_of, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError

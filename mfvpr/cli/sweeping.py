@@ -11,13 +11,13 @@ from mfvpr.cli.jobs import Inputs, prepare, truth_in_words, with_image_size
 from mfvpr.cli.schema import Searched
 from mfvpr.cli.schema import Sweep as Settings
 from mfvpr.core import Scorer
-from mfvpr.core.parameters import numbers_by_name, static_names
+from mfvpr.core.scorer import numbers_by_name, static_names
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
+from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report import sweeps
 from mfvpr.report.run_files import matched_content
