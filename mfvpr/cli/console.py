@@ -96,11 +96,11 @@ class Progress:
     def __enter__(self) -> "Progress":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Erase the line, or write the last one."""
+    def __exit__(self, error: object, *_: object) -> None:
+        """Erase the line, or write the last one unless the loop was interrupted."""
         if self._is_terminal:
             sys.stderr.write(_ERASE)
-        elif self.n and time.monotonic() - self._start >= _QUIET:
+        elif error is None and self.n and time.monotonic() - self._start >= _QUIET:
             tell(self._line())
 
     def reach(self, number: int, total: int) -> None:

@@ -1,11 +1,13 @@
 """The command `mfvpr` and its programs."""
 
+import _thread
 import argparse
 import inspect
 import io
 import pkgutil
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -119,8 +121,16 @@ def version() -> str:
 
 
 def _prepare_process() -> None:
-    """Let SIGTERM unwind the stack, and names and warnings be printed."""
+    """Let SIGTERM unwind the stack, Ctrl-C never be lost, and names and warnings be printed."""
+
+    def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:  # which no code can catch, as in JAX's callback
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            threading.Timer(0.01, _thread.interrupt_main).start()
+        else:
+            sys.__unraisablehook__(lost)
+
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    sys.unraisablehook = interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
