@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mfvpr import datasets
-from mfvpr.baselines.weight_registry import provenance
+from mfvpr.baselines.learned_weight import provenance
 from mfvpr.cli.console import Progress, tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
