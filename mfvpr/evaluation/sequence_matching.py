@@ -14,8 +14,7 @@ from mfvpr.evaluation.system import Pipeline, folders_of
 from mfvpr.evaluation.validation import empty_pairs_warning, image_warnings, validate_candidates
 from mfvpr.matchers.host_matcher import Side
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import RetrievalResult
+from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils.files import write_text

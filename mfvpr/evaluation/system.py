@@ -28,8 +28,7 @@ from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.lightglue_matcher import LightGlueMatcher
 from mfvpr.matchers.match_set import Scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.retrieval.fitting import with_parts
-from mfvpr.retrieval.retriever import Retriever
+from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 

@@ -26,6 +26,7 @@ from mfvpr.retrieval import (
     Retrieval,
     Retriever,
     ShortlistFiles,
+    SsmVoting,
     WhitenedSearch,
 )
 from mfvpr.retrieval.precomputed import File
@@ -73,8 +74,6 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
     if name == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None, **settings}, data), settings["database_prefix"])
     if name == "ssm":
-        from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
-
         return SsmVoting(_network_extractor("retrieval", name, options))
     search = EXACT if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
     if name == "import":
@@ -94,10 +93,6 @@ def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     extractor_class = getattr(features, _NETWORK_EXTRACTORS[group][name])
     options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
     names = {field.name for field in fields(extractor_class)}
-    if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
-        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's retrieval"}[name]
-        expected = list(extractor_class.image_size)
-        raise InputError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model = _network(group, networks, options.pop("weights", None))
     if (group, name) == ("retrieval", "dinov2"):

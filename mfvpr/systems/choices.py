@@ -119,16 +119,14 @@ def _retrieval() -> dict[str, dict[str, Any]]:
         "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
     }
     small = {"image_size": Setting([224, 224], SIZE, "width, height, multiples of 14")}
-    mixvpr = {"image_size": Setting([320, 320], SIZE, "width, height: the only one that its weights are for")}
-    windows = {"image_size": Setting([224, 224], SIZE, "width, height: the only one that it takes")}
     without_components = without(_network("", descriptor), "components", "weights")
     return {
         "vlad": {**settings_of(features.VladFitting), **whiten},
-        "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **mixvpr, **whiten),
+        "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **whiten),
         "netvlad": _network("netvlad_pitts30k", descriptor, **whiten),
         "gem": {**_weights("cosplace_resnet50_2048"), **without_components, **whiten},
         "dinov2": {**_weights("dinov2_vitl14"), **without_components, **small, **pooling, **whiten},
-        "ssm": _network("vgg16_places365", features.SsmWindows, **windows, **fitting),
+        "ssm": _network("vgg16_places365", features.SsmWindows, **fitting),
         "same": whiten,
         "import": {**without(files, "image_size"), **whiten},
         "pairs": without(files, "database", "lengths", "image_size"),

@@ -17,7 +17,7 @@ from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, 
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.features.feature_extraction import describe_folder
+from mfvpr.features.extractor import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import differences, write_gains, write_rankings

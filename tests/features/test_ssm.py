@@ -14,12 +14,12 @@ from mfvpr.baselines import GridAnchors
 from mfvpr.datasets import ImageFolder
 from mfvpr.evaluation import match_sequence
 from mfvpr.evaluation.sequence_matching import matches_recipe
-from mfvpr.features import Aggregated, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting, windows
+from mfvpr.features import Aggregated, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting
 from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.windows import Windows, kernels, whiten_windows
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
-from mfvpr.retrieval.fitting import whitening_recipe
+from mfvpr.retrieval.retriever import whitening_recipe
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError, progress
 from mfvpr.utils.fingerprints import difference, fingerprint
@@ -96,13 +96,6 @@ def test_the_whitening_is_that_of_the_windows_that_are_drawn(windows_at_most, ze
     assert replace(how, seed=8).sample_rows(9) != rows
 
 
-def test_more_windows_than_memory_has_room_for_are_refused(monkeypatch):
-    monkeypatch.setattr(windows, "free_host_bytes", lambda: 3 * 10**9)
-    rows = [*range(250)]
-    with pytest.raises(InputError, match=r"9000 windows .*41472 .*3\.3 GB .*max_images"):
-        WindowFitting(125).fit([], Windows((14, 14, 512), 9), rows)
-
-
 def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
     single_image = ImageFolder(dataset.database.root, dataset.database.names[:1])
     few, enough = (replace(cells, whitening=WindowFitting(dimension)) for dimension in (12, 11))
@@ -116,7 +109,9 @@ def test_fewer_windows_than_dimensions_are_refused(cells, dataset):
 
 def test_cells_are_whitened_windows_at_their_places(model, cells, learned):
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 48, 3), np.uint8)
-    maps = [image_map.vector.reshape(5, 6, 512).astype(np.float64) for image_map in SsmMaps(model, 2, SMALL)(images)]
+    maps = [
+        image_map.vector.reshape(5, 6, 512).astype(np.float64) for image_map in SsmMaps(model, SMALL, stage=2)(images)
+    ]
     windows_of_map = Windows((5, 6, 512), 3)
     whitening = learned.whitening
     assert cells.scales == learned.scales == ((6, 12, 1.0),)
