@@ -61,32 +61,29 @@ class Extractor(Protocol):
     """Images, uint8 RGB -> a Description of each.
 
     A cache on disk needs the `recipe` of an extractor of your own, see `mfvpr.utils.recipe_of`.
+
+    Attributes:
+        image_size: (width, height) that images are resized to, px.
+        interpolation: of the resizing, see `mfvpr.datasets.image_reading.resize`.
+        batch_size: images per call.
+        vector_size: length of the global descriptor; 0 = no global descriptor.
+        scales: of the local features; () = no local features.
     """
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height) that images are resized to, px."""
-        ...
+    def image_size(self) -> tuple[int, int]: ...
 
     @property
-    def interpolation(self) -> Interpolation:
-        """Interpolation of the resizing, see `mfvpr.datasets.image_reading.resize`."""
-        ...
+    def interpolation(self) -> Interpolation: ...
 
     @property
-    def batch_size(self) -> int:
-        """Images per call."""
-        ...
+    def batch_size(self) -> int: ...
 
     @property
-    def vector_size(self) -> int:
-        """Length of the global descriptor; 0 = no global descriptor."""
-        ...
+    def vector_size(self) -> int: ...
 
     @property
-    def scales(self) -> tuple[Scale, ...]:
-        """Scales of the local features; () = no local features."""
-        ...
+    def scales(self) -> tuple[Scale, ...]: ...
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
         """Descriptions of images of `image_size`; networks raise an `InputError` for images of another size."""
@@ -110,12 +107,13 @@ class Fitting(Protocol):
 
 @runtime_checkable
 class Source(Protocol):
-    """Local features of folders of images that were extracted elsewhere, of one scale."""
+    """Local features of folders of images that were extracted elsewhere, of one scale.
+
+    `image_size` is that of the images that the keypoints are in, px; None = the size of the image files.
+    """
 
     @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(width, height) of the images that the keypoints are in, px; None = the size of the image files."""
-        ...
+    def image_size(self) -> tuple[int, int] | None: ...
 
     @property
     def interpolation(self) -> Interpolation: ...

@@ -32,10 +32,8 @@ class AlikedFeatures(NetworkExtractor):
 
     Keypoints are in row order, or by falling score if an image has more than `max_keypoints`.
 
-    Attributes, beside those of `NetworkExtractor`:
-        threshold: of the detection score, in (0, 1). 0.1 is that of Pivonka & Preucil (IEEE T-IV 2024); its authors'
-            default is 0.2. If no score of an image is above it, keypoints above the image's mean score are taken.
-        max_keypoints: the keypoints of the highest scores are kept; None = all.
+    If no score of an image is above the `threshold`, in (0, 1), keypoints above the image's mean score are taken. The
+    default is that of Pivonka & Preucil (IEEE T-IV 2024).
     """
 
     has_vector = False
@@ -54,7 +52,7 @@ class AlikedFeatures(NetworkExtractor):
         pixels = math.prod(self.image_size)
         return pixels if self.max_keypoints is None else min(self.max_keypoints, pixels)
 
-    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
         results = in_batches(self._program(usual), images, self.batch_size)
         counts = [int(detections.count) for detections, _ in results]
@@ -75,7 +73,7 @@ class AlikedFeatures(NetworkExtractor):
 
         return cache(lambda capacity: compile_network(self.model, partial(extract, capacity=capacity)))
 
-    def _describe(self, result: tuple[Any, Float[np.ndarray, "slots dimensions"]]) -> Description:
+    def describe_result(self, result: tuple[Any, Float[np.ndarray, "slots dimensions"]]) -> Description:
         detections, descriptors = result
         keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))
         features = local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])
@@ -86,12 +84,8 @@ class AlikedFeatures(NetworkExtractor):
 class D2NetFeatures(NetworkExtractor):
     """D2-Net's keypoints and descriptors of 512 dimensions, as the public code extracts them and in its order.
 
-    Scores are activations, which are not comparable between images.
-
-    Attributes, beside those of `NetworkExtractor`:
-        preprocessing: "caffe" as published, or "torch".
-        multiscale: detect at half, full and double size as well, in this order; features are those of one `Scale`.
-        max_keypoints: the keypoints of the highest scores are kept, in the same order; None = all.
+    Scores are activations, which are not comparable between images. `multiscale` detects at half, full and double size,
+    in this order, and gives features of one `Scale`. The published preprocessing is "caffe".
 
     Raises:
         InputError: images of this size are too small for the network.
@@ -125,7 +119,7 @@ class D2NetFeatures(NetworkExtractor):
     def _network_scales(self) -> tuple[float, ...]:
         return d2net.SCALES if self.multiscale else (1.0,)
 
-    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         results = in_batches(self._program(_SHARE), images, self.batch_size)
         crowded = [row for row, levels in enumerate(results) if any(level.count > len(level.mask) for level in levels)]
         for row, levels in zip(crowded, in_batches(self._program(1.0), images[crowded], self.batch_size), strict=True):
@@ -138,7 +132,7 @@ class D2NetFeatures(NetworkExtractor):
         function = partial(d2net.extract, preprocessing=self.preprocessing, scales=self._network_scales)
         return cache(lambda share: compile_network(self.model, partial(function, share=share)))
 
-    def _describe(self, result: tuple[d2net.Detections, ...]) -> Description:
+    def describe_result(self, result: tuple[d2net.Detections, ...]) -> Description:
         keypoints, descriptors, scores = (
             np.concatenate([getattr(level, name)[level.mask] for level in result])
             for name in ("keypoints", "descriptors", "scores")

@@ -28,7 +28,7 @@ class NetworkExtractor:
     """Base of the extractors with a network: dataclasses whose further fields are further settings.
 
     By default it is an extractor of the global descriptors of `model.dimension` numbers that the network returns for
-    preprocessed images. An extractor of another kind defines `compute`, `_describe`, `vector_size` and `scales`.
+    preprocessed images. An extractor of another kind defines `compute`, `describe_result`, `vector_size` and `scales`.
 
     Raises:
         InputError: another network than `network`, or a value that is out of its range.
@@ -65,9 +65,9 @@ class NetworkExtractor:
         if (columns, rows) != tuple(size):
             name = type(self).__name__
             raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
-        return [self._describe(result) for result in self._extract(images)]
+        return [self.describe_result(result) for result in self.run_network(images)]
 
-    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         """Results of the network for each image."""
         return in_batches(self._program, images, self.batch_size)
 
@@ -80,7 +80,7 @@ class NetworkExtractor:
         """Results for a batch; runs in a compiled program."""
         return model(model.preprocess(images))
 
-    def _describe(self, result: Any) -> Description:
+    def describe_result(self, result: Any) -> Description:
         return Description(result.reshape(-1))
 
 
@@ -128,9 +128,7 @@ class DescriptorNetwork(Protocol):
 class GlobalDescriptor(NetworkExtractor):
     """Global descriptors of a `DescriptorNetwork`, which takes images of many sizes, as the public code extracts them.
 
-    Attributes, beside those of `NetworkExtractor`:
-        image_size: (width, height) px; 640 x 480 is Patch-NetVLAD's.
-        components: number of principal components that are kept, scaled to unit length again; None = all.
+    640 x 480 px is Patch-NetVLAD's size. Principal `components` that are kept are scaled to unit length again.
 
     Raises:
         InputError: the network cannot take images of this size, or has fewer principal components.

@@ -39,13 +39,6 @@ class Dinov2Features(NetworkExtractor):
 
         features = Dinov2Features(load_model("dinov2_vitl14"), (504, 504), facet="value", block=-2)  # as EffoVPR's
 
-    Attributes, beside those of `NetworkExtractor`:
-        image_size: (width, height) px, multiples of 14.
-        facet: local features: "token" takes the normalized tokens after the block, "query", "key" and "value" take
-            these parts of the block's attention, with all heads.
-        block: index of the block; -1 is the last, -2 the block before it.
-        threshold: keep patches with at least this score; 0 keeps all, 1 keeps the best.
-
     Raises:
         InputError: no such block, or an image size that is no multiple of 14.
     """
@@ -55,7 +48,7 @@ class Dinov2Features(NetworkExtractor):
     facet: Facet = setting(
         "token",
         word_of(Facet),
-        "token: the normalized tokens after the block; query, key, value: parts of the block's attention",
+        "token: the normalized tokens after the block; query, key, value: parts of its attention, with all heads",
     )
     block: int = setting(-1, whole(-24, 23), "from the last, -1, backward; or from the first, 0, forward")
     threshold: float = setting(
@@ -93,7 +86,7 @@ class Dinov2Features(NetworkExtractor):
         scores = output.attention / jnp.max(output.attention, axis=(1, 2), keepdims=True)
         return of_unit_length(tokens.class_token), of_unit_length(getattr(output, self.facet)), scores
 
-    def _describe(self, result: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Description:
+    def describe_result(self, result: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Description:
         vector, local, scores = result
         row, column = np.nonzero(scores >= self.threshold)
         keypoints = _MIDDLE + PATCH * np.stack([column, row], axis=1)
@@ -126,7 +119,7 @@ class SelaVprFeatures(NetworkExtractor):
         columns, rows = (4 * (side // PATCH) - 3 for side in self.image_size)
         return (Scale(LOCAL, columns * rows),)
 
-    def _describe(self, result: tuple[np.ndarray, Float[np.ndarray, "rows columns dimensions"]]) -> Description:
+    def describe_result(self, result: tuple[np.ndarray, Float[np.ndarray, "rows columns dimensions"]]) -> Description:
         vector, local = result
         row, column = np.indices(local.shape[:2]).reshape(2, -1)
         keypoints = _MIDDLE + _STEP * np.stack([column, row], axis=1)
@@ -137,9 +130,7 @@ class SelaVprFeatures(NetworkExtractor):
 class PatchNetVladFeatures(NetworkExtractor):
     """NetVLAD of the image and of all square patches of its map, as the public code extracts them; scores are 1.
 
-    Attributes, beside those of `NetworkExtractor`:
-        patch_sizes: sides of the patches, in positions of the map; each size is a scale.
-        scale_weights: weight of each scale's score, see `mfvpr.evaluation.fuse_scales`; None = equal weights.
+    Each of the `patch_sizes` is a scale; for `scale_weights` see `mfvpr.evaluation.fuse_scales`.
 
     Raises:
         InputError: duplicate patch sizes, or a patch that is larger than the map; another number of weights than of
@@ -190,7 +181,7 @@ class PatchNetVladFeatures(NetworkExtractor):
     def compute(self, model: VggNetVlad, images: jax.Array) -> Any:
         return model.with_patches(model.preprocess(images), self.patch_sizes)
 
-    def _describe(self, result: tuple[np.ndarray, tuple[np.ndarray, ...]]) -> Description:
+    def describe_result(self, result: tuple[np.ndarray, tuple[np.ndarray, ...]]) -> Description:
         local, (vector, patches), (columns, rows) = [], result, self._map_size
         for size, descriptors in zip(self.patch_sizes, patches, strict=True):
             row, column = np.indices((rows - size + 1, columns - size + 1)).reshape(2, -1)

@@ -146,6 +146,6 @@ class SsmCells(_WhitenedWindows):
         """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
-    def _describe(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:
+    def describe_result(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:
         middles = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
         return Description(local=(local_features(middles, result, self.image_size),))

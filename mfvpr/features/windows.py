@@ -68,13 +68,8 @@ class Windows:
 class WindowFitting:
     """Settings of a whitening that is learned from random windows of random images of the database.
 
-    Attributes:
-        dimension: D' of the whitened vectors.
-        max_images: number of images to learn from; None = all.
-        max_windows: number of windows of these images to learn from; None = all.
-        zero_row: add a window of zeros, as in the public code's second stage.
-        dtype: of the windows and of the result. Sums are always in double precision.
-        seed: of the random images and windows. (The public code has no seed.)
+    `dimension` is D' of the whitened vectors, `dtype` that of the windows and of the result (sums are always in double
+    precision). The public code has no seed; its second stage has a `zero_row`, a window of zeros.
     """
 
     dimension: int = setting(100, whole(1, 4096), "that are learned from the database and kept")
@@ -137,7 +132,8 @@ def learned_whitening(extractor: WindowExtractor) -> Whitening:
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
     if len(whitening.mean) != expected or whitening.origin not in ("", origin(extractor)):
         got = f"one of {len(whitening.mean)} that was learned with others; replace it by a WindowFitting"
-        raise InputError(f"{name}: expected a whitening of {expected} numbers of its network and images, got {got}")
+        own = f"{expected} numbers of its own network, images and windows"
+        raise InputError(f"{name}: expected a whitening of {own}, got {got}")
     return whitening
 
 

@@ -3,13 +3,12 @@
 import re
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 
 from mfvpr.systems.choices import choices_of
-from tests.programs import ROOT, composed, run
+from tests.programs import MFVPR, ROOT, composed, run
 
 pytestmark = pytest.mark.thorough
 
@@ -102,7 +101,7 @@ def test_a_device_that_is_not_there_is_one_line():
 
 @pytest.mark.parametrize("seconds", [1, 4])
 def test_ctrl_c_is_one_line(tmp_path, seconds):
-    command = [sys.executable, "-m", "experiments.evaluate", f"out={tmp_path}/out", f"cache={tmp_path}/cache"]
+    command = [*MFVPR, "evaluate", f"out={tmp_path}/out", f"cache={tmp_path}/cache"]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     time.sleep(seconds)
     process.send_signal(signal.SIGINT)

@@ -188,16 +188,6 @@ def test_slots_and_what_is_on_its_way_stay_within_the_budget():
         assert any(part.new for part in again) == (share < 1 / KEPT)
 
 
-def test_parts_are_what_can_be_asked_for_at_the_same_time():
-    features, _ = counted([200] * 50)
-    slots = Slots(features, np.arange(50), 0, DEVICE)
-    rows = np.arange(50)[::-1]
-    parts = list(slots.parts(rows))
-    np.testing.assert_array_equal(np.concatenate(parts), rows)
-    assert {len(part) for part in parts[:-1]} == {WRITTEN}
-    assert list(slots.parts(rows[:0])) == []
-
-
 def test_rows_are_written_by_one_program_for_each_capacity(compilations):
     rng = np.random.default_rng(5)
 

@@ -108,6 +108,7 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_we
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "image_size=[224, 224]: expected [320, 320]"),
         (["retrieval=ssm", "retrieval.image_size=[336,336]"], "image_size=[336, 336]: expected [224, 224]"),
         (["matching=lightglue"], "mfvpr weights download aliked_lightglue"),
+        (["retrieval=same"], "retrieval=same: expected features with a global descriptor"),
         (["features=aliked", "features.clahe_clip=2"], "Could not override 'features.clahe_clip'"),
         (["system=mix_hist_20"], "Could not find 'system/mix_hist_20'"),
         (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),

@@ -187,18 +187,9 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
         replace(cells, image_size=(40, 48)),
         replace(cells, interpolation="cv2_area"),
         SsmWindows(model),
-        *(
-            replace(cells, whitening=replace(how, **change))
-            for change in (
-                {"dimension": 5},
-                {"seed": 2},
-                {"zero_row": True},
-                {"max_images": 9},
-                {"max_windows": 99},
-                {"dtype": "float64"},
-            )
-        ),
     ]
+    changes = {"dimension": 5, "seed": 2, "zero_row": True, "max_images": 9, "max_windows": 99, "dtype": "float64"}
+    variants += [replace(cells, whitening=replace(how, **{name: value})) for name, value in changes.items()]
     recipes = [whitening_recipe(extractor, extractor.whitening, cache) for extractor in variants]
     assert len({*map(fingerprint, recipes)}) == len(variants)
     assert whitening_recipe(replace(cells, batch_size=1), how, cache) == recipes[0]
@@ -206,16 +197,12 @@ def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_p
 
 def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, dataset, tmp_path):
     image = np.zeros((1, 40, 48, 3), np.uint8)
-    turned = {"image_size": (40, 48)}
-    for change in (
-        {"model": published(1)},
-        {"preprocessing": "caffe"},
-        {"interpolation": "cv2_area"},
-        {"stride": 2},
-        turned,
-    ):
+    changes = {"model": published(1), "preprocessing": "caffe", "interpolation": "cv2_area", "stride": 2}
+    for name, value in changes.items():
         with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
-            replace(learned, **change)(image.swapaxes(1, 2) if change is turned else image)
+            replace(learned, **{name: value})(image)
+    with pytest.raises(InputError, match=r"SsmCells: .*whitening .*network, images and windows"):
+        replace(learned, image_size=(40, 48))(image.swapaxes(1, 2))
     with pytest.raises(InputError, match="SsmCells: expected images of 48 x 40 px, got 40 x 48"):
         learned(image.swapaxes(1, 2))
     assert len(replace(learned, batch_size=1)(image)) == 1
@@ -227,11 +214,10 @@ def test_a_damaged_file_is_made_again(cells, dataset, tmp_path):
     expected = fit_to_database(cells, dataset.database, FeatureCache(tmp_path)).whitening
     [path] = kept(tmp_path)
     content = path.read_bytes()
-    for wrong in (content[:-100] + bytes(100), b""):
-        path.write_bytes(wrong)
-        whitening = fit_to_database(cells, dataset.database, FeatureCache(tmp_path)).whitening
-        np.testing.assert_array_equal(whitening.components, expected.components)
-        assert path.read_bytes() == content
+    path.write_bytes(content[:-100] + bytes(100))
+    whitening = fit_to_database(cells, dataset.database, FeatureCache(tmp_path)).whitening
+    np.testing.assert_array_equal(whitening.components, expected.components)
+    assert path.read_bytes() == content
 
 
 def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, dataset, tmp_path):
