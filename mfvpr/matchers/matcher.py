@@ -21,7 +21,7 @@ from mfvpr.core.matching import (
     slot_numbers,
     with_concrete_sizes,
 )
-from mfvpr.core.nearest import CrossCheck, Product, Query, lines_of, nearest, products, ready
+from mfvpr.core.nearest import CrossCheck, Product, Query, largest_of, lines_of, products, ready
 from mfvpr.core.types import Array, Features, Matches, short_repr, value
 from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError, require_word
@@ -155,7 +155,7 @@ class LightGlueMatcher:
                 expected = f"descriptors of {self.dimension} dimensions, which its weights are for"
                 raise InputError(f"LightGlue: expected {expected}, got {got}")
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
-        best1, best0 = nearest(lines_of(assigned, axis=1)), nearest(lines_of(assigned, axis=0))
+        best1, best0 = largest_of(lines_of(assigned, axis=1)), largest_of(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)
         mutual = best0.index[best1.index] == slot_numbers(features0)
         real = mutual & (confidence > self.filter_threshold) & (best1.similarity > -jnp.inf)
