@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets import Positives
+from mfvpr.retrieval import retriever
 from mfvpr.retrieval.retriever import vote
 
 
@@ -46,18 +47,13 @@ def test_agrees_with_the_loop(num_candidates):
     assert_lists(got, by_loops(queries, database, num_candidates), num_candidates)
 
 
-def test_excluded_images_neither_get_votes_nor_fill_up():
+def test_excluded_images_neither_get_votes_nor_fill_up(monkeypatch):
+    monkeypatch.setattr(retriever, "QUERIES", 2)
     queries, database = windows(1, 5), windows(1, 8)
     excluded = [[0, 1, 2], [], [7], [*range(8)], [3]]
     got = vote(queries, database, 8, excluded=Positives.from_rows(excluded, 8))
     assert_lists(got, by_loops(queries, database, 8, excluded), 8)
     assert not got.mask[3].any()
-
-
-def test_more_queries_than_go_together():
-    queries, database, excluded = windows(2, 70), windows(2, 6), [[row % 6] for row in range(70)]
-    got = vote(queries, database, 2, excluded=Positives.from_rows(excluded, 6))
-    assert_lists(got, by_loops(queries, database, 2, excluded), 2)
 
 
 def test_equal_votes_go_by_row_and_equal_windows_by_image():
