@@ -31,26 +31,12 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
-from mfvpr.systems.choices import SystemSettings, without
+from mfvpr.systems.choices import NETWORKS, SystemSettings, without
 from mfvpr.utils import recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
-
-# Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
-_NETWORK_EXTRACTORS = {
-    "features": {
-        "aliked": "AlikedFeatures",
-        "d2net": "D2NetFeatures",
-        "ssm": "SsmCells",
-        "patch_netvlad": "PatchNetVladFeatures",
-        "selavpr": "SelaVprFeatures",
-        "dinov2": "Dinov2Features",
-    },
-    "retrieval": {"mixvpr": "MixVprDescriptor", "ssm": "SsmWindows"}
-    | dict.fromkeys(["netvlad", "gem", "dinov2"], "GlobalDescriptor"),
-}
 
 
 def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
@@ -90,7 +76,7 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
 
 def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
     """An extractor with a network; the options are fields of the extractor or of its fitting."""
-    extractor_class = getattr(features, _NETWORK_EXTRACTORS[group][name])
+    extractor_class = getattr(features, NETWORKS[group][name][0])
     options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
     names = {field.name for field in fields(extractor_class)}
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)

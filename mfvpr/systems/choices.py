@@ -24,6 +24,7 @@ from mfvpr.utils.fields import (
     PATH,
     POSITIVE,
     REQUIRED,
+    SHAPED_SIZE,
     SIZE,
     TEXT,
     Rule,
@@ -44,6 +45,26 @@ from mfvpr.utils.fields import (
 _INSTALLED = Path(__file__).parent / "conf"  # in a wheel; in a clone, it stands beside the package
 CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"
 GROUPS = ("features", "retrieval", "matching", "scorer")
+
+# Extractors with a network: (class of mfvpr.features, default weights) by choice. They are imported when they are used:
+# Flax takes half a second.
+NETWORKS = {
+    "features": {
+        "aliked": ("AlikedFeatures", "aliked-n16"),
+        "d2net": ("D2NetFeatures", "d2_tf"),
+        "ssm": ("SsmCells", "vgg16_places365"),
+        "patch_netvlad": ("PatchNetVladFeatures", "patchnetvlad_mapillary_512"),
+        "selavpr": ("SelaVprFeatures", "selavpr_msls"),
+        "dinov2": ("Dinov2Features", "dinov2_vitl14"),
+    },
+    "retrieval": {
+        "mixvpr": ("MixVprDescriptor", "mixvpr_4096"),
+        "netvlad": ("GlobalDescriptor", "netvlad_pitts30k"),
+        "gem": ("GlobalDescriptor", "cosplace_resnet50_2048"),
+        "dinov2": ("GlobalDescriptor", "dinov2_vitl14"),
+        "ssm": ("SsmWindows", "vgg16_places365"),
+    },
+}
 
 _WHITEN = Setting(
     None,
@@ -85,52 +106,44 @@ def without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _network(weights: str, owner: type, **more: Any) -> dict[str, Any]:
-    """Settings of a network: of its weights, of its extractor, and further ones."""
-    note = "`mfvpr weights list` has all weights"
-    return {"weights": Setting(weights, TEXT, note), **without(settings_of(owner), "whitening"), **more}
+def _networks(group: str) -> dict[str, dict[str, Any]]:
+    """Settings of extractors with a network, by choice."""
+    known = {}
+    for name, (owner, weights) in NETWORKS[group].items():
+        known[name] = {**_weights(weights), **without(settings_of(getattr(features, owner)), "whitening")}
+    return known
 
 
 def _features() -> dict[str, dict[str, Any]]:
-    files = settings_of(_Files)
-    known = {
-        "sift": settings_of(features.Sift),
-        "aliked": _network("aliked-n16", features.AlikedFeatures),
-        "d2net": _network("d2_tf", features.D2NetFeatures),
-        "ssm": _network("vgg16_places365", features.SsmCells, **settings_of(WindowFitting)),
-        "patch_netvlad": _network("patchnetvlad_mapillary_512", features.PatchNetVladFeatures),
-        "selavpr": _network("selavpr_msls", features.SelaVprFeatures),
-        "dinov2": _network("dinov2_vitl14", features.Dinov2Features),
-        "import": files,
-    }
-    for name in ("sift", "aliked", "d2net"):  # of images of any shape
-        known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
+    known = {"sift": settings_of(features.Sift), **_networks("features"), "import": settings_of(_Files)}
+    for settings in known.values():
+        if settings["image_size"].note == SHAPED_SIZE:  # of images of any shape
+            settings["image_size"] = replace(settings["image_size"], rule=_SHAPED)
+    known["ssm"] |= settings_of(WindowFitting)
     del known["sift"]["batch_size"]
     return known
 
 
 def _retrieval() -> dict[str, dict[str, Any]]:
-    files, whiten = settings_of(_Files), {"whiten": _WHITEN}
-    descriptor = features.GlobalDescriptor
-    fitting: dict[str, Any] = settings_of(WindowFitting)
-    fitting["dimension"] = replace(fitting["dimension"], default=125)
-    pooling = {
+    files, fitting = settings_of(_Files), settings_of(WindowFitting)
+    known = {
+        "vlad": settings_of(features.VladFitting),
+        **_networks("retrieval"),
+        "same": {},
+        "import": without(files, "image_size"),
+        "pairs": without(files, "database", "lengths", "image_size"),
+    }
+    for name in known.keys() - {"ssm", "pairs"}:
+        known[name]["whiten"] = _WHITEN
+    known["ssm"] |= {**fitting, "dimension": replace(fitting["dimension"], default=125)}
+    for name in ("gem", "dinov2"):
+        del known[name]["components"]
+    known["dinov2"] |= {
+        "image_size": Setting([224, 224], SIZE, "width, height, multiples of 14"),
         "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),
         "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
     }
-    small = {"image_size": Setting([224, 224], SIZE, "width, height, multiples of 14")}
-    without_components = without(_network("", descriptor), "components", "weights")
-    return {
-        "vlad": {**settings_of(features.VladFitting), **whiten},
-        "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **whiten),
-        "netvlad": _network("netvlad_pitts30k", descriptor, **whiten),
-        "gem": {**_weights("cosplace_resnet50_2048"), **without_components, **whiten},
-        "dinov2": {**_weights("dinov2_vitl14"), **without_components, **small, **pooling, **whiten},
-        "ssm": _network("vgg16_places365", features.SsmWindows, **fitting),
-        "same": whiten,
-        "import": {**without(files, "image_size"), **whiten},
-        "pairs": without(files, "database", "lengths", "image_size"),
-    }
+    return known
 
 
 def _weights(name: str) -> dict[str, Setting]:
