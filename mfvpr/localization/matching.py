@@ -12,8 +12,7 @@ from mfvpr.core.batch import BIN_STEP, score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Features, Matches
-from mfvpr.evaluation.stages import pair_shifts
-from mfvpr.evaluation.validation import require_finite
+from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
