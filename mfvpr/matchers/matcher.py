@@ -152,8 +152,8 @@ class LightGlueMatcher:
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):
             if (got := features.descriptors.shape[-1]) != self.dimension:
-                expected = f"descriptors of {self.dimension} dimensions, which its weights are for"
-                raise InputError(f"LightGlue: expected {expected}, got {got}")
+                got = f"{got}; take the features that its weights are for"
+                raise InputError(f"LightGlue: expected descriptors of {self.dimension} dimensions, got {got}")
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
         best1, best0 = largest_of(lines_of(assigned, axis=1)), largest_of(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)
