@@ -1,14 +1,11 @@
 """Command lines as they are typed: help, flags of Hydra, mistakes, and Ctrl-C."""
 
 import re
-import signal
-import subprocess
-import time
 
 import pytest
 
 from mfvpr.systems.choices import choices_of
-from tests.programs import MFVPR, ROOT, composed, run
+from tests.programs import ROOT, composed, run
 
 pytestmark = pytest.mark.thorough
 
@@ -97,15 +94,3 @@ def test_a_device_that_is_not_there_is_one_line():
         assert done.returncode == 2
         assert f"error: JAX_PLATFORMS={name}: expected a device" in done.stderr
         assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize("seconds", [1, 4])
-def test_ctrl_c_is_one_line(tmp_path, seconds):
-    command = [*MFVPR, "evaluate", f"out={tmp_path}/out", f"cache={tmp_path}/cache"]
-    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    time.sleep(seconds)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode in (130, -signal.SIGINT), stderr[-2000:]  # a shell sees 130 both times
-    assert stderr.splitlines()[-1].startswith("interrupted")
-    assert "Traceback" not in stderr
