@@ -10,8 +10,7 @@ from urllib.request import urlopen
 
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
 from mfvpr.checkpoints.files import check_published, check_sha256, file_sha256, installed_entry, read_manifest
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import Entry, how_to_install
+from mfvpr.checkpoints.networks import Entry, blueprint, how_to_install
 from mfvpr.cli.console import Progress, refuse
 from mfvpr.report import Table
 from mfvpr.utils import InputError

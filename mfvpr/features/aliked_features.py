@@ -14,8 +14,7 @@ from jaxtyping import Float, Num
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches
-from mfvpr.networks.aliked import STRIDE, Aliked
-from mfvpr.networks.aliked_detection import Detections
+from mfvpr.networks.aliked import STRIDE, Aliked, Detections
 from mfvpr.utils.fields import NOT_NEGATIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 _PIXELS_PER_SLOT = 40  # photographs have a keypoint in 65 px at most

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, require_network
-from mfvpr.networks.imagenet import of_unit_length
+from mfvpr.networks.layers import of_unit_length
 from mfvpr.networks.vit import PATCH, VisionTransformer, require_patches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import SIZE, check_fields, number, setting, whole, word_of

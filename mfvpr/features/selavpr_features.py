@@ -8,8 +8,7 @@ from jaxtyping import Float
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, require_network
-from mfvpr.networks.selavpr import LOCAL, SelaVpr
-from mfvpr.networks.vit import PATCH, require_patches
+from mfvpr.networks.vit import LOCAL, PATCH, SelaVpr, require_patches
 from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
 
 _STEP = PATCH / 4  # px between positions of the local map, which was upsampled twice
