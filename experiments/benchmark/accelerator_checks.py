@@ -16,7 +16,7 @@ from experiments.benchmark import networks
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.nearest import products
 from mfvpr.core.types import Features, Matches
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.threads import ordered_map

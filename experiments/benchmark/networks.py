@@ -29,7 +29,7 @@ from mfvpr.features import (
 )
 from mfvpr.features.network import TOGETHER, compile_network
 from mfvpr.networks.d2net import extract
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 
 BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mfvpr.checkpoints.conversion import Table
-from mfvpr.networks.imagenet import DEVIATION, MEAN
+from mfvpr.networks.layers import DEVIATION, MEAN
 
 Weights = Callable[[str], Tensor]  # published key -> weight
 Local = tuple[np.ndarray, ...]  # descriptor of an image, then the descriptors of its patches by size

@@ -12,7 +12,7 @@ from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches, require_at_least
 from mfvpr.networks.d2net import SCALES, STRIDE, D2Net, Detections, extract, map_size
-from mfvpr.networks.imagenet import Preprocessing
+from mfvpr.networks.layers import Preprocessing
 from mfvpr.utils.fields import FLAG, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 _SHARE = 0.3  # keypoint slots per position of a map; photographs take about a tenth

@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.network import NetworkExtractor
-from mfvpr.networks.imagenet import Images, Pixels
-from mfvpr.networks.layers import of_unit_length
+from mfvpr.networks.layers import Images, Pixels, of_unit_length
 from mfvpr.networks.mixvpr import IMAGE_SIZE, MixVPR
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of

@@ -15,8 +15,7 @@ from flax import nnx
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images
-from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, bias_of, conv, matmul, of_unit_length
+from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import over_batch

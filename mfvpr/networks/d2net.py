@@ -17,8 +17,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, preprocess
-from mfvpr.networks.layers import of_unit_length
+from mfvpr.networks.layers import Images, Pixels, Preprocessing, of_unit_length, preprocess
 from mfvpr.networks.sampling import sample, stretch
 from mfvpr.networks.vgg import Vgg16
 

@@ -1,4 +1,6 @@
-"""Layers that several networks share. Products are of full float32 on every device: with less, keypoints move.
+"""Parts that several networks share: preprocessing of images, convolutions, normalizations, means.
+
+Products are of full float32 on every device: with less, keypoints move.
 
 On a CPU, 3 x 3 convolutions take half of the products: Winograd's F(4, 3) (Lavin & Gray, CVPR 2016) along the rows
 makes four rows of the result from six rows of the input by six convolutions with 1 x 3 kernels, instead of twelve. The
@@ -8,13 +10,26 @@ the last bits. `uniform=True` avoids this by the direct method. On other process
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jax import lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 
 from mfvpr.core.types import Array
+
+Preprocessing = Literal["caffe", "torch"]
+Pixels = Num[Array, "batch height width 3"]  # RGB, 0 .. 255, uint8 or float32
+Images = Float[Array, "batch height width 3"]  # inputs of networks
+
+MEAN = (0.485, 0.456, 0.406)  # of the training images, RGB in 0 .. 1
+DEVIATION = (0.229, 0.224, 0.225)
+_STATISTICS = {  # scale, mean and deviation, in the network's order of the channels
+    "caffe": (1.0, np.array([103.939, 116.779, 123.68]), np.ones(3)),
+    "torch": (255.0, np.array(MEAN), np.array(DEVIATION)),
+}
 
 PRECISION = "highest"  # of products
 EPSILON = 1e-12  # least divisor of vectors, as in the public codes
@@ -43,6 +58,22 @@ _KERNEL = (
     (0, 0, 1),
 )
 _OUTPUT = ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
+
+
+def preprocess(images: Pixels, preprocessing: Preprocessing = "torch") -> Images:
+    """RGB images from 0 to 255 -> inputs of the network, float32.
+
+    "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, divided by the standard deviation. Results
+    for bytes are those of float64, rounded once, as in D2-Net's code.
+    """
+    scale, mean, deviation = _STATISTICS[preprocessing]
+    ordered = images[..., ::-1] if preprocessing == "caffe" else images
+    if images.dtype == jnp.uint8:  # a table, since a device has no float64
+        byte = np.arange(256, dtype=np.float32) / np.float32(scale)
+        table = jnp.asarray((byte[None] - mean[:, None]) / deviation[:, None], jnp.float32)
+        return jnp.stack([table[channel][ordered[..., channel]] for channel in range(3)], axis=-1)
+    scale, mean, deviation = (jnp.asarray(values, jnp.float32) for values in (scale, mean, deviation))
+    return (ordered / scale - mean[None, None, None]) / deviation[None, None, None]
 
 
 def of_unit_length(vectors: Float[Array, "*batch dimensions"]) -> Float[Array, "*batch dimensions"]:

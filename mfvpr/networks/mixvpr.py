@@ -5,8 +5,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, preprocess
-from mfvpr.networks.layers import LayerNorm, Linear, bias_of, matmul, of_unit_length
+from mfvpr.networks.layers import Images, LayerNorm, Linear, bias_of, matmul, of_unit_length, preprocess
 from mfvpr.networks.resnet import ResNet50
 
 IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it

@@ -13,8 +13,17 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, Pixels, preprocess
-from mfvpr.networks.layers import PRECISION, GeneralizedMean, Linear, PointwiseConv, matmul, of_unit_length
+from mfvpr.networks.layers import (
+    PRECISION,
+    GeneralizedMean,
+    Images,
+    Linear,
+    Pixels,
+    PointwiseConv,
+    matmul,
+    of_unit_length,
+    preprocess,
+)
 from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
 

@@ -10,8 +10,7 @@ from jax import lax
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images
-from mfvpr.networks.layers import BatchNorm, Conv3x3, PointwiseConv, conv
+from mfvpr.networks.layers import BatchNorm, Conv3x3, Images, PointwiseConv, conv
 
 _EXPANSION = 4  # channels of a block's output per channel inside
 _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": (3, 512)}  # blocks, channels inside

@@ -7,8 +7,7 @@ from flax import nnx
 from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, preprocess
-from mfvpr.networks.layers import Conv3x3
+from mfvpr.networks.layers import Conv3x3, Images, preprocess
 from mfvpr.utils.errors import InputError
 
 STRIDE = 16  # px between positions of the last block's map

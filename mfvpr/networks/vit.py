@@ -9,8 +9,16 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, preprocess
-from mfvpr.networks.layers import PRECISION, GeneralizedMean, LayerNorm, Linear, matmul, of_unit_length
+from mfvpr.networks.layers import (
+    PRECISION,
+    GeneralizedMean,
+    Images,
+    LayerNorm,
+    Linear,
+    matmul,
+    of_unit_length,
+    preprocess,
+)
 from mfvpr.utils.errors import InputError
 
 Pooling = Literal["cls", "gem"]

@@ -12,7 +12,7 @@ from mfvpr.features import d2net_features as features_d2net
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 from tests.builders import local
 from tests.golden.make_d2net import CASES, PLAIN, projections, samples, texture
 from tests.networks import d2net_oracle as oracle

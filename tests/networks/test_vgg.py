@@ -7,8 +7,7 @@ import pytest
 from flax import nnx
 
 from mfvpr.networks import Vgg16
-from mfvpr.networks.imagenet import preprocess
-from mfvpr.networks.layers import Conv3x3, winograd
+from mfvpr.networks.layers import Conv3x3, preprocess, winograd
 from mfvpr.networks.sampling import sample, stretch
 from tests.networks import aliked_oracle as oracle
 
