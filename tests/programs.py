@@ -21,7 +21,7 @@ from mfvpr.cli import programs, schema
 from mfvpr.cli.inputs import prepare
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.storage.match_files import MatchStore
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.systems.choices import CONF
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.fields import from_values

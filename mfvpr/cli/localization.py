@@ -18,7 +18,7 @@ from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Located, Map, Route
-from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
+from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
@@ -41,7 +41,7 @@ def build_map(settings: MapBuild) -> None:
 
 def print_map(folder: Path) -> None:
     """Print the number of images, the size on disk and the settings of a map."""
-    settings, robot_map = read_declaration(folder), Map.open(folder)
+    settings, robot_map = read_settings(folder), Map.open(folder)
     print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
@@ -186,7 +186,7 @@ def _confidence(settings: Localize, system: System) -> Confidence | None:
         return None
     from mfvpr.cli import confidences  # here: it imports the reports
 
-    map_settings, name = read_declaration(expand_user(settings.map)), system.headline
+    map_settings, name = read_settings(expand_user(settings.map)), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]
     file, scorers = confidences.read_file(settings.confidence), system.final_scores[name].scorers

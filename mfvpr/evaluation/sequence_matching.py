@@ -16,8 +16,8 @@ from mfvpr.matchers.host_matcher import Side
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.retrieval.fitting import fit_to_database
 from mfvpr.retrieval.retriever import RetrievalResult
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.progress import Stopwatch

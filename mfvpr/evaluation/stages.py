@@ -25,7 +25,7 @@ from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.storage.match_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime

@@ -1,17 +1,22 @@
 """`Map`: localize one image in a folder of images whose places are known."""
 
 import math
-import operator
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
-from mfvpr.core.scorer import Scorer
-from mfvpr.core.types import Matches, Shortlist
+from mfvpr.core.batch import BIN_STEP, score_candidates
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.parameters import with_capacity
+from mfvpr.core.scorer import Scorer, require_scores
+from mfvpr.core.types import Features, Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.confidence import REFUSALS, Confidence
@@ -25,25 +30,34 @@ from mfvpr.evaluation.evidence import (
 )
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.stages import pair_shifts
 from mfvpr.evaluation.system import System, noise_images
+from mfvpr.evaluation.validation import require_finite
 from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.declaration import fit_to_map, read_system
-from mfvpr.localization.describing import Described, Image, is_file, load
-from mfvpr.localization.map_calibration import fit_on_drive, read_confidence, write_confidence
-from mfvpr.localization.map_images import MapImages, exclusive
-from mfvpr.localization.matching import match_and_score, padded_size, shift_of
+from mfvpr.localization.map_images import Described, Image, MapImages, exclusive, is_file, load
+from mfvpr.localization.map_settings import fit_on_drive, fit_to_map, read_confidence, read_system, write_confidence
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
 from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle
+from mfvpr.utils.fields import whole
 from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
+from mfvpr.utils.threads import ordered_map
+
+Point = tuple[float, float]
+
+_PAIRS_AT_ONCE = 8  # a scorer takes the time of so many, also for a single image of a rare size
+_LEAST_SLOTS = 256  # of an image
+_ROWS = whole(0, 10**9)  # an argument that is a number of rows
 
 
 class Map(MapImages):
@@ -175,8 +189,8 @@ class Map(MapImages):
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
-        recent = _whole_number("recent", recent)
-        before = None if before is None else _whole_number("before", before)
+        _ROWS.check("recent", recent)
+        (_ROWS | None).check("before", before)
         self._refresh_images()
         pixels, total = load(image), len(self)
         description, resized = self.describing.pixels(pixels, str(image) if is_file(image) else "image")
@@ -277,15 +291,79 @@ class Map(MapImages):
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 
 
-def _whole_number(name: str, value: Any) -> int:
-    """An argument from 0 as int; NumPy's whole numbers are allowed."""
-    try:
-        if (number := operator.index(value)) >= 0:
-            return number
-    except TypeError:
-        pass
-    got = clip_middle(" ".join(repr(value).split()), 80)
-    raise InputError(f"{name}: expected a whole number from 0, got {got}. Use an `int`.")
+def match_and_score(
+    query: Features, candidates: Sequence[Features], matcher: Matcher, scorers: Mapping[str, Scorer], typical: int
+) -> tuple[list[Matches], dict[str, Float[np.ndarray, " candidates"]]]:
+    """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
+
+    Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
+    on the other pairs. A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes
+    a few pairs at a time. `typical` is a usual number of keypoints, or the detector's limit. If no score is finite, an
+    InputError is raised.
+    """
+    padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
+    by_size = defaultdict[int, list[int]](list)
+    for place, candidate in enumerate(candidates):
+        by_size[padded_size(len(candidate.mask), typical)].append(place)
+    parts = [
+        (size, places[start : start + _PAIRS_AT_ONCE])
+        for size, places in sorted(by_size.items(), reverse=True)
+        for start in range(0, len(places), _PAIRS_AT_ONCE)
+    ]
+
+    def match_part(part: tuple[int, list[int]]) -> tuple[Matches, dict[str, np.ndarray]]:
+        size, places = part
+        images = stack_features([candidates[place] for place in places], size, total=_PAIRS_AT_ONCE)
+        pairs = np.stack([np.zeros(_PAIRS_AT_ONCE, np.int32), np.arange(_PAIRS_AT_ONCE, dtype=np.int32)], axis=1)
+        matches = match_pairs(padded_query, images, pairs, np.int32(len(places)), matcher)
+        return jax.device_get((matches, {name: _scores(scorer, matches) for name, scorer in scorers.items()}))
+
+    workers = min(available_cpus(), len(parts))
+    map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
+    matches, scores = {}, {name: np.zeros(len(candidates), np.float32) for name in scorers}
+    for (_, places), (of_part, scores_of_part) in zip(parts, map_parts(match_part, parts), strict=True):
+        for number, place in enumerate(places):
+            matches[place] = jax.tree.map(lambda leaf: leaf[number : number + 1], of_part)  # noqa: B023
+        for name, values in scores_of_part.items():
+            scores[name][places] = values[: len(places)]
+    for name, values in scores.items():
+        require_finite(name, values)
+    return [matches[place] for place in range(len(candidates))], scores
+
+
+def padded_size(count: int, typical: int) -> int:
+    """Slots for an image: `typical` rounded up, or a power of 2 from 256 on: few sizes, so few programs."""
+    size, typical = 1 << (max(count, _LEAST_SLOTS) - 1).bit_length(), round_up(typical, STEP)
+    return min(size, typical) if typical >= count else size
+
+
+def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
+    """Scores of pairs, float32; an InputError if the scorer does not return a real number for each."""
+    scores = score_candidates(scorer, matches)
+    require_scores(type(scorer).__name__, scores, len(matches.mask))
+    return scores.astype(np.float32)
+
+
+def shift_of(
+    scorers: Iterable[Scorer], pair: Matches, size: tuple[int, int]
+) -> tuple[Point | None, tuple[Point, Point] | None]:
+    """`shift` and `shift_interval` of a `Prediction` by the first histogram of shifts, from one pair.
+
+    Shifts of the resized images become px of the query image, whose size is (width, height).
+    """
+    scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
+    if scorer is None:
+        return None, None
+    histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
+    stretch = np.divide(size, np.asarray(pair.image_size0)[0])
+    shift, interval = stretch * shift, stretch * interval
+    low, high = _point(interval[0]), _point(interval[1])
+    return _point(shift), (low, high) if low and high else None
+
+
+def _point(values: np.ndarray) -> Point | None:
+    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None
 
 
 def _extractor(system: System) -> Extractor:

@@ -20,8 +20,7 @@ from jaxtyping import Float
 
 from mfvpr.core.types import Features
 from mfvpr.storage.cache_files import disk_errors_as_input_errors, full_disk_error
-from mfvpr.storage.packing import pack_features, unpack_features
-from mfvpr.utils.arrays import pack_arrays, unpack_arrays
+from mfvpr.storage.packing import pack_arrays, pack_features, unpack_arrays, unpack_features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, lock_folder
 
@@ -95,7 +94,7 @@ class MapFile:
             for row in rows:
                 content: tuple[bytes] | None = database and database.execute(query, [row]).fetchone()
                 try:
-                    features = unpack_features(unpack_arrays(content[0] if content else b"", str(row)))
+                    features = unpack_features(unpack_arrays(content[0] if content else b""))
                 except InputError:
                     raise self._damage(f"row {row}") from None
                 yield row, features
@@ -136,7 +135,7 @@ class MapFile:
                     vector = np.asarray(entry.vector, np.float32).tobytes()
                     values = row, name, place, time.time(), vector, _checksum(name, place, vector)
                     database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
-                    values = row, len(arrays["scores"]), pack_arrays(arrays, str(row))
+                    values = row, len(arrays["scores"]), pack_arrays(arrays)
                     database.execute("INSERT INTO features VALUES (?, ?, ?)", values)
                 database.execute("COMMIT")
             except BaseException:

@@ -20,7 +20,7 @@ from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
-from mfvpr.localization.declaration import read_declaration
+from mfvpr.localization.map_settings import read_settings
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
@@ -111,7 +111,7 @@ def test_lines_have_angles_of_the_shift(folder, small_street, localize):
 def test_a_map_is_built_in_the_shape_of_its_images(tmp_path, small_street, build_map):
     stdout, _ = build_map(tmp_path / "map", small_street, "features.image_size=19200")
     assert stdout == f"{tmp_path}/map: 10 images, 10 of them new\n"
-    assert read_declaration(tmp_path / "map")["features"]["image_size"] == [160, 120]
+    assert read_settings(tmp_path / "map")["features"]["image_size"] == [160, 120]
 
 
 def test_images_of_the_map_are_not_added_again(folder, small_street, call_program, build_map):
@@ -207,7 +207,7 @@ def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street
     second.build(images)
     with pytest.raises(InputError, match="was made with other candidates"):
         first.build(replace(images, root=small_street, names=("queries/0000.png",)))
-    assert read_declaration(tmp_path / "map")["candidates"] == 6
+    assert read_settings(tmp_path / "map")["candidates"] == 6
 
 
 @pytest.mark.slow
@@ -377,7 +377,7 @@ def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
 
 
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):
-    settings = read_declaration(folder)
+    settings = read_settings(folder)
     for candidates, absent in ((settings["candidates"], 0), (settings["candidates"] + 1, 7)):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {

@@ -14,7 +14,7 @@ from mfvpr.evaluation import Pipeline, stages
 from mfvpr.features import FeatureSet, Scale, Sift
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.retrieval import ShortlistFiles
-from mfvpr.storage.match_files import MatchStore
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.utils import ragged, recipe_of
 from tests.builders import make_shortlist, stack
 from tests.golden.make_lightglue import SIZES, SMALL, pair
