@@ -25,7 +25,7 @@ from mfvpr.report.plots import panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import read_csv
 from mfvpr.utils.files import clip_middle, printable, replacing
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
 _MIDDLE = 1  # of the tolerances: the paper's figure

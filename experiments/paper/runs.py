@@ -32,9 +32,8 @@ from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user, lock_folder, remove_leftovers
-from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.fingerprints import fingerprint, versions
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`

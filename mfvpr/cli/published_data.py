@@ -19,7 +19,7 @@ from mfvpr.report.figures import contact_sheet
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
 _UNPUBLISHED = {
     "grief_season": "a park path in summer, and in snow (Krajnik et al., ECMR 2015): database/ and queries/",

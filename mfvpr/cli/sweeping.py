@@ -20,7 +20,7 @@ from mfvpr.utils import Stopwatch
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 _MOST_SETTINGS = 1_000_000
 

@@ -18,9 +18,8 @@ from mfvpr.deployment.stablehlo import PLATFORMS, deserialize, serialize, withou
 from mfvpr.evaluation.system import System
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.fingerprints import recipe_of, versions
 from mfvpr.utils.numerics import as_array
-from mfvpr.utils.versions import versions
 
 FORMAT = "mfvpr exported program 1"
 DESCRIPTION, PROGRAM, MODEL, CHECK = "export.json", "program.stablehlo", "program.onnx", "check"

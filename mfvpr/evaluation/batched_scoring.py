@@ -17,8 +17,7 @@ from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.evaluation.shortlist_scores import Scores, fuse_scales
 from mfvpr.matchers.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.utils.numerics import Device, available_cpus, compiled, knows_own_context
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 

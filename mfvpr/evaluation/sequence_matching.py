@@ -20,8 +20,7 @@ from mfvpr.storage.cache_files import MatchStore
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import Runtime
+from mfvpr.utils.runtime import Runtime, Stopwatch
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
 

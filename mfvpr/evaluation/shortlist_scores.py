@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Num
 from mfvpr.core.ranking import at_least_32_bits, combine, rank
 from mfvpr.core.types import Array, Shortlist
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import at_least_single, compiled, masked, masked_mean, masked_std, or_nan
+from mfvpr.utils.numerics import at_least_single, compiled, is_concrete, masked, masked_mean, safe_sqrt
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
@@ -31,7 +31,7 @@ def balancing_c(
     """
     both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
     retrieval_deviation, deviation = (
-        masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
+        _masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
     )
     c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
     return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
@@ -56,7 +56,7 @@ def fuse_shortlist(
 ) -> Scores:
     """Combined scores of retrieval and re-ranking, see `fuse`; NaN without a candidate."""
     fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
-    return np.asarray(or_nan(fused, candidates.mask))
+    return np.asarray(_or_nan(fused, candidates.mask))
 
 
 def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
@@ -87,7 +87,7 @@ def fuse_scales(
     and affects only the sum of its own candidate. "none" leaves the scores as they are, for pairs without other
     candidates.
     """
-    return or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
+    return _or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
 
 
 @partial(compiled, static_argnames="normalize")
@@ -113,7 +113,7 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
     values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # its square may overflow
     values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
-    mean, deviation = masked_mean(values, finite), masked_std(values, finite)
+    mean, deviation = masked_mean(values, finite), _masked_std(values, finite)
     return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
 
 
@@ -129,3 +129,16 @@ def rank_shortlist(
     """Positions into the shortlist, best first, missing candidates last; ties by retrieval or by database index."""
     tie_break = candidates.indices if breaks_ties_by_row(ties) else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
+
+
+def _masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
+    """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
+    values, mask = values.reshape(-1), mask.reshape(-1)
+    return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
+
+
+def _or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
+    """`values` where `mask`, NaN elsewhere."""
+    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
+        return jax.device_put(np.where(mask, values, np.nan))
+    return jnp.where(mask, values, jnp.nan)

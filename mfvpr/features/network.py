@@ -11,10 +11,9 @@ from flax import nnx
 from jaxtyping import Num
 
 from mfvpr.features.extractor import Description
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import device_bytes, knows_own_context
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
+from mfvpr.utils.runtime import ordered_map
 
 TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
 
@@ -93,7 +92,7 @@ def in_batches(
 
     def run(start: int) -> list[Any]:
         batch = images[start : start + size]
-        outputs = jax.tree.map(np.asarray, program(ragged.repeat_last(batch, size)))
+        outputs = jax.tree.map(np.asarray, program(repeat_last(batch, size)))
         return [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
 
     starts = range(0, len(images), size)

@@ -12,11 +12,11 @@ from jaxtyping import Float, Num
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network
+from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.imagenet import Preprocessing
 from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
 from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
-from mfvpr.utils.whitening import Whitening
 
 CHANNELS = 512
 STAGE1_SIZE = (224, 224)

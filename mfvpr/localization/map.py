@@ -50,8 +50,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import whole
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
 Point = tuple[float, float]
 

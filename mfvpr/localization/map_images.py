@@ -35,9 +35,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import as_array, available_cpus, free_host_bytes
-from mfvpr.utils.progress import Track, no_progress
-from mfvpr.utils.runtime import Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import Runtime, Track, no_progress, ordered_map
 
 _LEARNING = ".learning"  # the folder of features that a vocabulary is being learned from
 _AT_ONCE = 16  # images that are described without a cache

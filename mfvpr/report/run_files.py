@@ -28,7 +28,7 @@ from mfvpr.report.runs import file_names, write_about, write_json, write_table, 
 from mfvpr.report.tables import Table, format_number, write_csv
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.files import write_text
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 SHIFTS = ("shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "width", "height")  # px, of shifts.csv
 

@@ -19,8 +19,7 @@ from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.report.tables import Table, format_values, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import lock_folder, write_text
-from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import fingerprint, versions
 
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # the file of a run that appears last

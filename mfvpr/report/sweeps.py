@@ -22,7 +22,7 @@ from mfvpr.tuning.sweeps.setting_search import Outcome
 from mfvpr.tuning.sweeps.sweep_axes import Axes
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -8,10 +8,10 @@ import numpy as np
 
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.features.feature_extraction import describe_folder
+from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.whitening import Whitening
 
 Tool = TypeVar("Tool")
 

@@ -22,7 +22,7 @@ from mfvpr.storage.packing import pack_arrays, pack_matches, unpack_arrays, unpa
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, write_text
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
 THREADS = 4  # that read and write
 

@@ -29,11 +29,8 @@ from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage.cache_files import THREADS, CacheFiles
 from mfvpr.storage.packing import pack_features, unpack_features
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import fingerprint, recipe_of, versions
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, Stopwatch, ordered_map
 
 DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
 # Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.image_reading` gives

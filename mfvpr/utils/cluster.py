@@ -15,8 +15,8 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus, round_up
-from mfvpr.utils.versions import versions
 
 BLOCK = 32  # rows of a task at most, which a killed worker loses
 _BLOCKS = 16  # tasks at least, if there are so many rows

@@ -15,8 +15,8 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from mfvpr.utils.errors import require_word
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import processor_info
-from mfvpr.utils.versions import versions
 
 VARIABLE = "MFVPR_COMPILED"
 _PROCESSOR = r"^(?:vendor_id|cpu family|model|flags|CPU implementer|CPU part|Features|cpu|isa)\s*:.*$"

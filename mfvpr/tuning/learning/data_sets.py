@@ -13,7 +13,7 @@ from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.selection import Half
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.ragged import repeat_last
+from mfvpr.utils.numerics import repeat_last
 
 
 @dataclass(frozen=True)

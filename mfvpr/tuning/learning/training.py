@@ -15,7 +15,7 @@ import optax
 from mfvpr.core.types import Array
 from mfvpr.tuning.learning.training_checkpoints import lock_checkpoints, restore, save_checkpoint
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.runtime import Track, no_progress
 
 
 class TrainingError(InputError):

@@ -36,10 +36,9 @@ from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_f
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Group, Setting, distinct, group_by_program
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of
+from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of, versions
 from mfvpr.utils.numerics import Device, compiled
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.versions import versions
 
 SETTINGS_PER_BLOCK = 64
 ALONE = "alone"  # the c of a score that is not fused
