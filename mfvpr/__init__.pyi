@@ -62,7 +62,7 @@ from .deployment.programs import ExportShapes
 # tools for a scorer of your own; see mfvpr.testing.check_scorer
 from .core.scorer import Scorer
 from .core.types import value
-from .core.shifts import image_sizes, match_shifts
+from .core.weights import image_sizes, match_shifts
 from .utils.numerics import masked, masked_mean, masked_median, safe_sqrt
 
 # mistakes of a caller, in one line

@@ -6,7 +6,7 @@ from typing import Any
 from mfvpr.cli import run_folder
 from mfvpr.cli.inputs import Inputs, prepare, truth_in_words, with_image_size
 from mfvpr.cli.schema import Learn, Sweep
-from mfvpr.core.parameters import parameters_of
+from mfvpr.core.scorer import parameters_of
 from mfvpr.datasets.contents import fingerprints, readings
 from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.report import sweeps

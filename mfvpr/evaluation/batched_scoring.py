@@ -11,8 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Num
 
 from mfvpr.core.batch import BIN_STEP, score_settings
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, check_host, on_host, require_scores, score_pairs, with_static_functions
+from mfvpr.core.scorer import (
+    Scorer,
+    check_host,
+    fit_capacities,
+    on_host,
+    require_scores,
+    score_pairs,
+    with_static_functions,
+)
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.evaluation.shortlist_scores import Scores, fuse_scales
 from mfvpr.matchers.match_set import MatchSet, Scales, batches, partition, queries_that_fit, scales
@@ -42,7 +49,7 @@ def score(
     num_queries, sets = len(candidates.mask), scales(match_set)
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
-    fitted = with_static_functions(with_capacity(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
 
     def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:

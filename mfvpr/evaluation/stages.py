@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.core.parameters import with_capacity
+from mfvpr.core.scorer import fit_capacities
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.batched_scoring import score
@@ -154,7 +154,7 @@ class Explanation:
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
-    fitted = with_capacity(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
     return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
 
 
@@ -179,7 +179,7 @@ def dominant_shifts(
         query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they
         refer.
     """
-    fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, min(start + SHIFTS_AT_ONCE, len(queries)))

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.parameters import check_bounds
-from mfvpr.core.scorer import Scorer
+from mfvpr.core.scorer import Scorer, check_bounds
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.image_reading import read_size, resize, shape_size

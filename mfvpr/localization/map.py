@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from mfvpr.core.batch import BIN_STEP, score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, require_scores
+from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Features, Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
@@ -353,7 +352,7 @@ def shift_of(
     scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
     if scorer is None:
         return None, None
-    histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    histogram = fit_capacities(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
     shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
     stretch = np.divide(size, np.asarray(pair.image_size0)[0])
     shift, interval = stretch * shift, stretch * interval

@@ -14,8 +14,8 @@ import optax
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import SCORE, parameters_of, with_capacity
 from mfvpr.core.ranking import combine
+from mfvpr.core.scorer import SCORE, fit_capacities, parameters_of
 from mfvpr.core.types import Array, Matches
 from mfvpr.core.weights import RatioWeight, UnitWeight
 from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
@@ -130,7 +130,7 @@ def start(
     """
     scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
     deviation = split.score_deviation(scorer)
-    scorer = with_capacity(scorer, *split.match_set.image_sizes)
+    scorer = fit_capacities(scorer, *split.match_set.image_sizes)
     first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
     if fused:
         c = FIRST_SHARE * split.balance(deviation)
@@ -146,9 +146,9 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
     seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
-    scorer = with_capacity(scorer, *sizes)
+    scorer = fit_capacities(scorer, *sizes)
     first = {"numbers": {}, "weight": _first_weight(split, options)}
-    return Model(scorer, first, 1.0, with_capacity(teacher, *sizes))
+    return Model(scorer, first, 1.0, fit_capacities(teacher, *sizes))
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from mfvpr.core import parameters
 from mfvpr.core.batch import WEIGHTINGS, by_capacity
-from mfvpr.core.scorer import with_static_functions
+from mfvpr.core.scorer import static_names, whole_numbers, with_parameters, with_static_functions
 from mfvpr.core.weights import ChosenWeight
 
 Setting = Mapping[str, Any]
@@ -52,11 +51,11 @@ def group_by_program(
     scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
 ) -> Iterator[Group]:
     """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
-    static, integers = parameters.static_names(scorer), parameters.whole_numbers(scorer)
+    static, integers = static_names(scorer), whole_numbers(scorer)
     weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
     by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
     for choices, members in by_choices:
-        chosen = parameters.with_parameters(scorer, choices)
+        chosen = with_parameters(scorer, choices)
         if weights:
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = with_static_functions(chosen)

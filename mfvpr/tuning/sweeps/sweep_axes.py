@@ -11,9 +11,16 @@ import numpy as np
 
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
-from mfvpr.core import parameters
 from mfvpr.core.batch import WEIGHTINGS, refuse_own_names
-from mfvpr.core.scorer import Scorer
+from mfvpr.core.scorer import (
+    Scorer,
+    check_bounds,
+    fit_capacities,
+    numbers_by_name,
+    parameters_of,
+    static_names,
+    with_parameters,
+)
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting, grid
 from mfvpr.utils.errors import InputError
@@ -33,7 +40,7 @@ class Axes:
         scorer: its other parameters stay.
         values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
-            (`mfvpr.core.parameters`: a weight is the word `fs`, no limit is None). Words stand for weights in every
+            (`mfvpr.core.scorer`: a weight is the word `fs`, no limit is None). Words stand for weights in every
             scorer.
         own: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
 
@@ -48,7 +55,7 @@ class Axes:
     def __post_init__(self) -> None:
         scorer = self.scorer
         refuse_own_names(scorer, self.values, reserved=(*WEIGHTINGS, FUSION))
-        known = sorted({*parameters.numbers_by_name(scorer), *parameters.static_names(scorer), *self.parameters})
+        known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}
         for name, axis in self.values.items():
@@ -66,12 +73,12 @@ class Axes:
             for value in axis:
                 setting = self.setting({name: value})
                 if name in self.parameters and type(scorer) in SCORERS.values():
-                    parameters.check_bounds(parameters.with_parameters(scorer, setting))
+                    check_bounds(with_parameters(scorer, setting))
 
     @property
     def parameters(self) -> Mapping[str, Declared]:
         """Declared parameters of the scorer."""
-        return parameters.parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
+        return parameters_of(self.scorer) if is_dataclass(self.scorer) else {}
 
     @property
     def size(self) -> int:
@@ -100,7 +107,7 @@ class Axes:
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
         """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
         for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
-            parameters.with_capacity(parameters.with_parameters(self.scorer, setting), *image_sizes)
+            fit_capacities(with_parameters(self.scorer, setting), *image_sizes)
 
     def _own(self, name: str) -> Any:
         """The plain value without a sweep."""
@@ -117,7 +124,7 @@ class Axes:
 
 def can_learn(scorer: Any) -> bool:
     """Whether a scorer, or a class of scorers, has fields that are declared to be learned."""
-    return any(parameter.learned for parameter in parameters.parameters_of(scorer).values())
+    return any(parameter.learned for parameter in parameters_of(scorer).values())
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.core.parameters import with_parameters
+from mfvpr.core.scorer import with_parameters
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import shortlist_scores
 from mfvpr.matchers import MatchSet, Scales
