@@ -314,7 +314,10 @@ def match_and_score(
         images = stack_features([candidates[place] for place in places], size, total=_PAIRS_AT_ONCE)
         pairs = np.stack([np.zeros(_PAIRS_AT_ONCE, np.int32), np.arange(_PAIRS_AT_ONCE, dtype=np.int32)], axis=1)
         matches = match_pairs(padded_query, images, pairs, np.int32(len(places)), matcher)
-        return jax.device_get((matches, {name: _scores(scorer, matches) for name, scorer in scorers.items()}))
+        scores = {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}
+        for name, values in scores.items():
+            require_scores(type(scorers[name]).__name__, values, _PAIRS_AT_ONCE)
+        return jax.device_get((matches, {name: values.astype(np.float32) for name, values in scores.items()}))
 
     workers = min(available_cpus(), len(parts))
     map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
@@ -335,13 +338,6 @@ def padded_size(count: int, typical: int) -> int:
     return min(size, typical) if typical >= count else size
 
 
-def _scores(scorer: Scorer, matches: Matches) -> Float[jax.Array, " pairs"]:
-    """Scores of pairs, float32; an InputError if the scorer does not return a real number for each."""
-    scores = score_candidates(scorer, matches)
-    require_scores(type(scorer).__name__, scores, len(matches.mask))
-    return scores.astype(np.float32)
-
-
 def shift_of(
     scorers: Iterable[Scorer], pair: Matches, size: tuple[int, int]
 ) -> tuple[Point | None, tuple[Point, Point] | None]:
@@ -356,12 +352,8 @@ def shift_of(
     shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
     stretch = np.divide(size, np.asarray(pair.image_size0)[0])
     shift, interval = stretch * shift, stretch * interval
-    low, high = _point(interval[0]), _point(interval[1])
-    return _point(shift), (low, high) if low and high else None
-
-
-def _point(values: np.ndarray) -> Point | None:
-    return (float(values[0]), float(values[1])) if np.isfinite(values).all() else None
+    point, low, high = ((float(x), float(y)) if np.isfinite(x + y) else None for x, y in (shift, *interval))
+    return point, (low, high) if low and high else None
 
 
 def _extractor(system: System) -> Extractor:

@@ -18,7 +18,7 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.contents import Contents, contents, files_of, state_of
@@ -116,10 +116,11 @@ class Vectors:
 
 @dataclass
 class Descriptions:
-    """Descriptions of a folder's images by one extractor, each part in files or in memory.
+    """Descriptions of a folder's images by one extractor, each part in files or in memory; workers of a cluster get it.
 
     Attributes:
         parts: the global descriptor, if the extractor gives one, and each scale of its local features.
+        scales: numbers of the parts that are local features.
         keys: of the images.
         states: of the files before they were hashed, see `states`.
         counts: `[parts, M]` keypoints of each image, 1 for a global descriptor; -1 = not looked at yet, or not there.
@@ -127,17 +128,12 @@ class Descriptions:
     """
 
     folder: ImageFolder
-    extractor: Extractor
     parts: list[Items]
+    scales: range
     keys: Sequence[str]
     states: Sequence[str]
     counts: np.ndarray
     bad: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def scales(self) -> range:
-        """Numbers of the parts that are local features."""
-        return range(len(self.parts) - len(self.extractor.scales), len(self.parts))
 
     def missing(self, parts: Iterable[int], rows: Iterable[int]) -> tuple[list[int], list[Path]]:
         """Rows of which a part is not here, without bad ones, and files that are damaged."""
@@ -193,18 +189,6 @@ class _LocalFeatures:
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
         rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else rows
         return self.descriptions.read(self.part, rows)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for workers of a cluster, which need no extractor."""
-        reader = replace(self.descriptions, extractor=_Scales(self.descriptions.extractor.scales))
-        return {"descriptions": reader, "part": self.part}
-
-
-@dataclass(frozen=True)
-class _Scales:
-    """What is left of an extractor in a worker that only reads."""
-
-    scales: tuple[Any, ...]
 
 
 @dataclass
@@ -282,15 +266,9 @@ class FeatureCache:
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
         state = self._open(folder, extractor)
-        self._describe(state, state.scales, rows, f"{label} features")
+        self._describe(state, extractor, state.scales, rows, f"{label} features")
         _require_images(state)
         return tuple(FeatureSet(_LocalFeatures(state, part), dict(state.bad)) for part in state.scales)
-
-    def counts(self, folder: ImageFolder, extractor: Extractor) -> Int[np.ndarray, "scales images"]:
-        """Keypoints of the images whose local features are here, by scale; -1 = not here. Nothing is extracted."""
-        state = self._open(folder, extractor)
-        state.missing(state.scales, range(len(folder)))
-        return state.counts[state.scales]
 
     def vectors(
         self,
@@ -320,11 +298,13 @@ class FeatureCache:
     ) -> Descriptions:
         """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages."""
         state = self._open(folder, extractor)
-        self._describe(state, range(len(state.parts)), rows, label)
+        self._describe(state, extractor, range(len(state.parts)), rows, label)
         return state
 
-    def _describe(self, state: Descriptions, parts: Iterable[int], rows: Iterable[int] | None, label: str) -> None:
-        folder, extractor = state.folder, state.extractor
+    def _describe(
+        self, state: Descriptions, extractor: Extractor, parts: Iterable[int], rows: Iterable[int] | None, label: str
+    ) -> None:
+        folder = state.folder
         with self.watch("features") if self.watch is not None and extractor.scales else nullcontext():
             missing, damaged = state.missing(parts, range(len(folder)) if rows is None else [*rows])
             for path in damaged:
@@ -357,7 +337,8 @@ class FeatureCache:
                 CacheFiles(root, name, recipe | {"part": part}, *(of_vectors if part == "vector" else of_scales))
                 for part in names
             ]
-        return Descriptions(folder, extractor, parts, keys, before, np.full((len(names), len(folder)), -1))
+        scales = range(len(names) - len(extractor.scales), len(names))
+        return Descriptions(folder, parts, scales, keys, before, np.full((len(names), len(folder)), -1))
 
     def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
         opened = source.open(folder, partial=self.skip_bad)
@@ -368,7 +349,7 @@ class FeatureCache:
 
     def _vectors(self, folder: ImageFolder, describer: Extractor, rows: Iterable[int] | None, label: str) -> Vectors:
         state = self._open(folder, describer)
-        self._describe(state, [0], rows, f"{label} descriptors")
+        self._describe(state, describer, [0], rows, f"{label} descriptors")
         _require_images(state)
         values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
         for row, vector in state.read(0, np.flatnonzero(state.counts[0] > 0).tolist()):

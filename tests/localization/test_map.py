@@ -21,7 +21,7 @@ from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map
-from mfvpr.localization import matching as map_matching
+from mfvpr.localization import map as map_module
 from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile, check_entry
@@ -68,9 +68,9 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
     predictions = []
-    monkeypatch.setattr(map_matching, "_AT_ONCE", 2)  # of five candidates
+    monkeypatch.setattr(map_module, "_PAIRS_AT_ONCE", 2)  # of five candidates
     for cores in (1, 2, 3, 7):
-        monkeypatch.setattr(map_matching, "available_cpus", lambda cores=cores: cores)
+        monkeypatch.setattr(map_module, "available_cpus", lambda cores=cores: cores)
         predictions.append([opened(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
     assert predictions[1:] == predictions[:1] * 3
 
