@@ -31,7 +31,7 @@ from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
-from mfvpr.utils.files import expand_user, lock_folder, remove_leftovers
+from mfvpr.utils.files import expand_user, lock_folder
 from mfvpr.utils.fingerprints import fingerprint, versions
 from mfvpr.utils.numerics import available_cpus
 
@@ -51,7 +51,7 @@ _FREE = {"out", "cache", "memory", "devices", "compiled", "cluster"}  # settings
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations, and remove temporary files of a killed process.
+    """Lock a folder for evaluations.
 
     Raises:
         InputError: another process uses the folder, or it has files of others.
@@ -66,7 +66,6 @@ def lock_output(out: Path) -> Iterator[None]:
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
             raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
-        remove_leftovers(out)
         yield
 
 

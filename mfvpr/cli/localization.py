@@ -24,7 +24,7 @@ from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
 from mfvpr.utils import Runtime
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable, used_bytes
+from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable
 
 POLL = 0.2  # seconds between two looks at a folder
 
@@ -42,7 +42,7 @@ def build_map(settings: MapBuild) -> None:
 def print_map(folder: Path) -> None:
     """Print the number of images, the size on disk and the settings of a map."""
     settings, robot_map = read_settings(folder), Map.open(folder)
-    print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
+    print(f"{folder}: {len(robot_map)} images, {sum(path.stat().st_size for path in folder.iterdir()) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 

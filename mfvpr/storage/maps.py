@@ -27,12 +27,12 @@ from mfvpr.utils.files import clip_middle, lock_folder
 FILE = "map.sqlite"  # in the folder of the map
 _FORMAT = 3
 _WAIT = 60  # seconds for another process that writes
-_SCHEMA = """
-CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,
-                      vector BLOB NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL);
-"""
+_SCHEMA = (
+    "CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
+    "CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,"
+    " vector BLOB NOT NULL, checksum INTEGER NOT NULL)",
+    "CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL)",
+)
 
 
 class Entry(NamedTuple):
@@ -124,7 +124,7 @@ class MapFile:
             database.execute("BEGIN IMMEDIATE")
             try:
                 if database.execute("PRAGMA user_version").fetchone()[0] == 0:
-                    for statement in filter(str.strip, _SCHEMA.split(";")):
+                    for statement in _SCHEMA:
                         database.execute(statement)
                     database.execute(f"PRAGMA user_version = {_FORMAT}")
                 of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,16 +15,15 @@ from PIL import Image
 
 from mfvpr.cli import localization
 from mfvpr.cli.schema import Localize
-from mfvpr.datasets import image_folder, read_image
+from mfvpr.datasets import read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
 from mfvpr.localization.map_settings import read_settings
-from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
-from tests.programs import ROOT, output_of, settings_of
+from tests.programs import ROOT, output_of
 
 pytestmark = pytest.mark.thorough
 
@@ -198,18 +196,6 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
     assert words in stderr
 
 
-def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
-    common = (f"map={tmp_path}/map", *QUICK[:-1])
-    settings = [settings_of(*common, f"candidates={number}", config="map") for number in (5, 6)]
-    systems = map(assembly.system, settings)
-    first, second = (Map(tmp_path / "map", system) for system in systems)
-    images = image_folder(small_street / "database")
-    second.build(images)
-    with pytest.raises(InputError, match="was made with other candidates"):
-        first.build(replace(images, root=small_street, names=("queries/0000.png",)))
-    assert read_settings(tmp_path / "map")["candidates"] == 6
-
-
 @pytest.mark.slow
 def test_answers_are_drawn(folder, small_street, tmp_path, localize):
     queries, pictures = small_street / "queries", {}
@@ -350,30 +336,12 @@ def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_
     assert name == f"{video}:0"
 
 
-def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
-    (tmp_path / "a.png").symlink_to("gone")
-    (tmp_path / "b.png").write_bytes(b"image")
-    (tmp_path / "c.png").mkdir()
-    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was listed
-    monkeypatch.setattr(localization, "POLL", 0)
-    name, path = next(localization.images_of(Localize("map", str(tmp_path), watch=True)))
-    assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
-
-
 def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
     image, writes = tmp_path / "a.png", [b"image", b"im"]
     image.write_bytes(b"i")
     monkeypatch.setattr(localization.time, "sleep", lambda _: writes and image.write_bytes(writes.pop()))
     _, path = next(localization.images_of(Localize("map", str(tmp_path), watch=True)))
     assert path.read_bytes() == b"image"
-
-
-def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
-    with MapFile(folder).lock():
-        lines, stderr = localize(twice, "add=true", code=2)
-    assert [(line["image"], "added" in line) for line in lines] == [(f"{twice}/00.png", False)]
-    assert "another process adds images" in stderr
-    assert stderr.count("\n") == 1
 
 
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):

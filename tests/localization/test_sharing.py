@@ -138,17 +138,6 @@ def test_a_map_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
     assert len(opened(folder)) == 6
 
 
-def test_a_vocabulary_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
-    maps = [opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2)]
-    for known in maps:
-        known.learn(first(images, 4))
-    shutil.rmtree(tmp_path / "map")
-    opened(tmp_path / "map", describer=VladFitting(num_words=2)).build(images)
-    for use in (lambda known: known.localize(images.paths[0]), lambda known: known.add(images.paths[0], 0, name="0")):
-        with pytest.raises(InputError, match=r"replaced.* Open the map again"):
-            use(maps.pop())
-
-
 def test_a_map_stays_where_it_is_when_the_working_directory_changes(images, folder, monkeypatch):
     monkeypatch.chdir(folder.parent)
     known = opened(folder.name)

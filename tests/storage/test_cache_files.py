@@ -29,7 +29,6 @@ from mfvpr.storage.packing import (
     unpack_matches,
 )
 from mfvpr.utils.fingerprints import fingerprint
-from tests.builders import make_features
 from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
 from tests.storage.synthetic_features import DAMAGE, assert_same, digests, features_of, matches_of
@@ -65,14 +64,6 @@ def test_descriptors_keep_their_length():
     features = round_as_stored(original)
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), lengths, rtol=3e-7)
     assert (np.linalg.norm(features.descriptors - original.descriptors, axis=1) < 5e-4 * lengths).all()
-
-
-def test_zero_descriptors_stay_zero_and_padding_is_left_out():
-    padded = make_features(np.random.default_rng(0), 5, capacity=9)
-    padded.descriptors[2] = 0
-    features = round_as_stored(padded)
-    assert features.mask.shape == (5,)
-    np.testing.assert_array_equal(features.descriptors[2], 0)
 
 
 @pytest.mark.parametrize("name", ["keypoints", "descriptors", "scores", "image_size"])
