@@ -58,11 +58,8 @@ class ExportedProgram:
             if (str(got.dtype), got.shape) != (each.dtype, each.shape):
                 raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got.dtype} {[*got.shape]}")
         _require_sizes(values)
-        return self._outputs(values)
-
-    def _outputs(self, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        outputs = self.run(*(arrays[each.name] for each in self.inputs))
-        return {each.name: np.asarray(values) for each, values in zip(self.outputs, outputs, strict=True)}
+        outputs = self.run(*(values[each.name] for each in self.inputs))
+        return {each.name: np.asarray(array) for each, array in zip(self.outputs, outputs, strict=True)}
 
     def check(self) -> float:
         """Largest difference from the outputs in the folder, relative where they are above 1."""
@@ -70,7 +67,7 @@ class ExportedProgram:
             {each.name: np.load(self.folder / CHECK / f"{each.name}.npy", allow_pickle=False) for each in tensors}
             for tensors in (self.inputs, self.outputs)
         )
-        return largest_difference(self._outputs(inputs), outputs)
+        return largest_difference(self(**inputs), outputs)
 
 
 def export(
