@@ -38,7 +38,7 @@ from .baselines.rapid import RapidSpatialScore
 # scores of all candidates, whole grids of parameters, fusion and ranking
 from .core.batch import score_candidates, score_grid
 from .core.ranking import combine, rank, rerank
-from .evaluation.shortlist_scores import balancing_c
+from .evaluation.rankings import balancing_c
 
 # data sets, what is correct, and recall
 from . import datasets

@@ -29,9 +29,8 @@ from mfvpr.evaluation.evidence import (
 )
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
-from mfvpr.evaluation.stages import pair_shifts
+from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
-from mfvpr.evaluation.validation import require_finite
 from mfvpr.features.extractor import Extractor, Source
 from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.features.vlad import VladFitting

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.evaluation.confidence import write_confidences
+from mfvpr.evaluation.confidence import chance_calibration_error, reliability, write_confidences
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.reliability import chance_calibration_error, reliability
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport
 from mfvpr.report.plots import reliability_figure
 from mfvpr.report.runs import Figure

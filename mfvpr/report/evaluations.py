@@ -14,11 +14,17 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, middle, threshold_words
 from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.confidence import CalibrationData, Confidence, absent_rankings, calibration_data
+from mfvpr.evaluation.confidence import (
+    CalibrationData,
+    Confidence,
+    PrecisionRecall,
+    absent_rankings,
+    calibration_data,
+    precision_recall,
+)
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason, Recall
+from mfvpr.evaluation.protocol import Half, halves, halves_of_map
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
-from mfvpr.evaluation.reliability import PrecisionRecall, precision_recall
-from mfvpr.evaluation.selection import Half, halves, halves_of_map
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError

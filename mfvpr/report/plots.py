@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mfvpr.evaluation.reliability import Reliability
+from mfvpr.evaluation.confidence import Reliability
 from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
 
 BINS = 12  # of the matches, by the value of an input

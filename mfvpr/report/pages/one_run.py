@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from mfvpr.datasets.datasets import MEANS
+from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.reliability import PrecisionRecall
 from mfvpr.report.pages.charts import Chart, amount_chart, bar_chart, line_chart
 from mfvpr.report.pages.files import Run, read_results, read_run, reading_run
 from mfvpr.report.pages.rendering import PAGE, Gallery, Section, embed, pictures, values_table, write_page
