@@ -110,6 +110,12 @@ def export(
         values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = _model(program, inputs, outputs, required=onnx)
+    recipes: dict[str, Any] = {}
+    for name, part in program.parameters.items():
+        try:
+            recipes[name] = recipe_of(part)
+        except TypeError:  # a plain function
+            recipes[name] = {"function": getattr(part, "__qualname__", type(part).__qualname__)}
     description = {
         "format": FORMAT,
         "versions": versions(),
@@ -118,7 +124,7 @@ def export(
         "outputs": [each._asdict() for each in program.outputs],
         "axes": {"C": shapes.candidates, "K": shapes.keypoints, "D": program.shapes.dimension},
         "image_size": program.shapes.image_size,
-        "parameters": {name: _recipe(part) for name, part in program.parameters.items()},
+        "parameters": recipes,
         "left_out": program.left_out,
         "onnx": onnx_note,
     }
@@ -183,13 +189,6 @@ def _model(
             raise
         return None, {"missing": str(error)}
     return model, {"largest_difference": difference, "tolerance": TOLERANCE}
-
-
-def _recipe(part: Any) -> Any:
-    try:
-        return recipe_of(part)
-    except TypeError:  # a plain function
-        return {"function": getattr(part, "__qualname__", type(part).__qualname__)}
 
 
 def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:

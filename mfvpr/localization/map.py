@@ -96,7 +96,7 @@ class Map(MapImages):
                 made with another system, or a new map of a system whose image size follows the images (`create`).
         """
         system = fit_to_map(Path(folder), system, None, runtime.log)
-        extractor, describer = _extractor(system), _describer(system)
+        extractor, describer = _parts_of(system)
         super().__init__(folder, system, extractor, describer, memory=runtime.memory)
         self.confidence = confidence or read_confidence(self._file, system)
         if threshold is not None and not 0 <= threshold <= 1:
@@ -210,7 +210,7 @@ class Map(MapImages):
         """
         self._refresh_images()
         self.describing.image(noise_images()[0])
-        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
         counts = self._counts().tolist()
         rows = {padded_size(count, self._typical): row for row, count in enumerate(counts)}  # one of each size
         images = self._read_features([*rows.values()])
@@ -261,7 +261,7 @@ class Map(MapImages):
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return None
-        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
         candidates = self._read_features(rows.tolist())
         return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
 
@@ -355,7 +355,8 @@ def shift_of(
     return point, (low, high) if low and high else None
 
 
-def _extractor(system: System) -> Extractor:
+def _parts_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
+    """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
     extractor, candidates = system.pipeline.extractor, system.pipeline.candidates
     if isinstance(extractor, Source):
         name = type(extractor).__name__
@@ -369,19 +370,14 @@ def _extractor(system: System) -> Extractor:
     if system.correlated or system.sequences:
         expected = "a system without frame correlation and sequences; mfvpr.Route follows a drive"
         raise InputError(f"a map ranks single images: expected {expected}")
-    return extractor
-
-
-def _describer(system: System) -> Extractor | VladFitting:
-    """The extractor of global descriptors, or the fitting of the vocabulary; an InputError if a map cannot use it."""
     retriever = system.pipeline.retriever
     if not isinstance(retriever, Retrieval) or not isinstance(retriever.search, ExactSearch):
         name = type(retriever).__name__
         raise InputError(f"{name}: a map retrieves by global descriptors without whitening; expected Retrieval(...)")
     if isinstance(describer := retriever.describer, Extractor):
-        return describer
-    is_same = recipe_of(describer.extractor) == recipe_of(system.pipeline.extractor)
+        return extractor, describer
+    is_same = recipe_of(describer.extractor) == recipe_of(extractor)
     if not is_same or not isinstance(describer.fitting, VladFitting):
         expected = "Aggregated(extractor, VladFitting(...)) of the same extractor"
         raise InputError(f"a map aggregates its local features: expected {expected}")
-    return describer.fitting
+    return extractor, describer.fitting

@@ -82,7 +82,14 @@ class Recipes:
 
     def of(self, value: Any) -> Any:
         """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
-        return recipe_of(value, self._content_of)
+
+        def content_of(path: PurePath) -> Any:
+            if not Path(path).exists():
+                return str(path)
+            content = self.contents(files_of(path))
+            return content.fingerprint if Path(path).is_dir() else content.sha256
+
+        return recipe_of(value, content_of)
 
     def of_features(self, extractor: Any) -> dict[str, Any]:
         """Everything but the image that changes its features: extractor, versions of decoders."""
@@ -92,13 +99,6 @@ class Recipes:
     def of_folder(self, folder: ImageFolder, extractor: Any) -> dict[str, Any]:
         """Everything that changes the features of a folder's images."""
         return self.of_features(extractor) | {"images": self.contents(folder).fingerprint}
-
-    def _content_of(self, path: PurePath) -> Any:
-        path = Path(path)
-        if not path.exists():
-            return str(path)
-        content = self.contents(files_of(path))
-        return content.fingerprint if path.is_dir() else content.sha256
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,15 @@ class FeatureCache:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or the disk cannot be used.
         """
         if isinstance(extractor, Source):
-            source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
+
+            def open_source() -> FeatureSource:
+                opened = extractor.open(folder, partial=self.skip_bad)
+                counts = np.asarray(opened.counts)[np.asarray(opened.counts) >= 0]
+                about = f"about {np.mean(counts) if len(counts) else 0:.0f} features each"
+                self.log(f"{label} features: {len(counts)} of {len(folder)} images imported, {about}")
+                return opened
+
+            source = self.once("opened", open_source, folder, extractor)
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
         state = self._open(folder, extractor)
@@ -339,13 +347,6 @@ class FeatureCache:
             ]
         scales = range(len(names) - len(extractor.scales), len(names))
         return Descriptions(folder, parts, scales, keys, before, np.full((len(names), len(folder)), -1))
-
-    def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
-        opened = source.open(folder, partial=self.skip_bad)
-        counts = np.asarray(opened.counts)
-        number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
-        self.log(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
-        return opened
 
     def _vectors(self, folder: ImageFolder, describer: Extractor, rows: Iterable[int] | None, label: str) -> Vectors:
         state = self._open(folder, describer)
