@@ -137,11 +137,6 @@ def test_a_system_of_ones_own_opens_its_map(small_street, tmp_path):
     assert len(Map(tmp_path, system)) == 10
 
 
-def test_a_folder_of_something_else_is_refused(small_street):
-    with pytest.raises(InputError, match="expected a new or empty folder, or a map"):
-        Map(small_street, small("steering"))
-
-
 def test_a_map_keeps_its_confidence(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
     query = small_street / "queries/0003.png"

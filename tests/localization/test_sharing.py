@@ -50,16 +50,6 @@ def test_threads_get_the_answers_of_one_thread(images, tmp_path):
     assert [shared.localize(path) for path in images.paths] == expected
 
 
-def test_threads_add_to_one_map(images, tmp_path):
-    shared = opened(tmp_path / "map")
-    with ThreadPoolExecutor(4) as threads:
-        [*threads.map(lambda row: shared.add(images.paths[row], row, name=str(row)), range(len(images)))]
-    assert sorted(shared.names) == sorted(map(str, range(len(images))))
-    again = opened(tmp_path / "map")
-    assert again.names == shared.names
-    assert [again.localize(path).place for path in images.paths] == [*range(len(images))]
-
-
 def test_builders_share_one_vocabulary(images, tmp_path):
     learning, other = (opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2))
 

@@ -237,17 +237,6 @@ def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, on_disk
     assert np.isnan(descriptors.values).any(axis=1).tolist() == [False, True, True, False]
 
 
-def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_path, small_street):
-    copy = tmp_path / "copy"
-    shutil.copytree(small_street / "database", copy)
-    lines, extractor = [], Counted()
-    for images, label in ((folder, "summer"), (image_folder(copy), "winter")):
-        FeatureCache(tmp_path / "s", runtime=Runtime(log=lines.append)).local(images, extractor, label=label)
-    assert extractor.seen == len(folder)
-    [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
-    assert lines == [f"summer features: 10 of 10 images to do in {path}"]
-
-
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):
     queries, describer = image_folder(small_street / "queries"), Aggregated(SIFT, VladFitting(num_words=4))
     cache = FeatureCache(tmp_path)
