@@ -286,7 +286,7 @@ def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
                 lambda: known.localize(image, recent=number), lambda: opened(folder, candidates=number)):  # fmt: skip
         with pytest.raises(InputError, match=r"^(recent|before|candidates).*: expected a whole number [^\n]+$"):
             ask()
-    with pytest.raises(InputError, match="^recent=null: expected a whole number"):
+    with pytest.raises(InputError, match=r"^recent=null: expected a whole number"):
         known.localize(image, recent=None)
 
 
