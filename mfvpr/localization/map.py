@@ -191,7 +191,7 @@ class Map(MapImages):
         self._refresh_images()
         pixels, total = load(image), len(self)
         description, resized = self.describing.pixels(pixels, str(image) if is_file(image) else "image")
-        end = max(0, (total if before is None else min(before, total)) - recent)
+        end = max(0, (total if before is None else min(int(before), total)) - int(recent))
         localized = self._localize(description, end, pixels.shape[1::-1], reason_against_image(resized))
         if route is None:
             return localized

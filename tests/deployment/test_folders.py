@@ -155,7 +155,7 @@ def test_a_program_is_written_to_a_new_or_an_empty_folder(tmp_path):
 
 
 def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, monkeypatch):
-    monkeypatch.setattr(folders.program_formats, "find_spec", lambda _: None)
+    monkeypatch.setattr(folders.program_formats, "find_spec", lambda name: None if name == "jax2onnx" else name)
     program = mfvpr.export(tmp_path / "count", mfvpr.MatchCount(), SHAPES)
     assert program.description["onnx"] == {"missing": "jax2onnx is not installed"}
     with pytest.raises(InputError, match=r"onnx=True: expected the package jax2onnx.*pip install 'mfvpr\[export\]'"):
