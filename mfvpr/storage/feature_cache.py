@@ -18,7 +18,7 @@ from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.contents import Contents, contents, files_of, state_of
@@ -277,6 +277,12 @@ class FeatureCache:
         self._describe(state, extractor, state.scales, rows, f"{label} features")
         _require_images(state)
         return tuple(FeatureSet(_LocalFeatures(state, part), dict(state.bad)) for part in state.scales)
+
+    def counts(self, folder: ImageFolder, extractor: Extractor) -> Int[np.ndarray, "scales images"]:
+        """Keypoints of the images whose local features are here, by scale; -1 = not here. Nothing is extracted."""
+        state = self._open(folder, extractor)
+        state.missing(state.scales, range(len(folder)))
+        return state.counts[state.scales]
 
     def vectors(
         self,
