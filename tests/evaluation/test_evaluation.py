@@ -25,7 +25,7 @@ from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistF
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
 from mfvpr.storage import feature_cache as cache_module
-from mfvpr.utils import InputError, progress
+from mfvpr.utils import InputError, runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
 from tests.programs import typed
@@ -128,7 +128,7 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
 
     def only_scores(label):
         assert label == "scores"
-        return progress.no_progress
+        return runtime.no_progress
 
     again = evaluate_parts(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,

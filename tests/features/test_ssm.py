@@ -22,7 +22,7 @@ from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.fitting import whitening_recipe
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import InputError, progress
+from mfvpr.utils import InputError, runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts, local
 from tests.networks.test_ssm_maps import published
@@ -161,7 +161,7 @@ def kept(root):
 def labeled_cache(root, labels):
     """A cache that adds what it computes to the labels."""
     return FeatureCache(
-        root, runtime=mfvpr.Runtime(progress=lambda label: labels.append(label) or progress.no_progress)
+        root, runtime=mfvpr.Runtime(progress=lambda label: labels.append(label) or runtime.no_progress)
     )
 
 
