@@ -306,7 +306,7 @@ def test_a_sweep_takes_features_whose_files_tell_the_image_size(
 def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatch):
     """VLAD asks first; a clock that only extraction moves."""
     clock = [0.0]
-    monkeypatch.setattr(progress, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(runtime, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
     def slow(*arguments, **options):
         clock[0] += 10

@@ -160,9 +160,7 @@ def kept(root):
 
 def labeled_cache(root, labels):
     """A cache that adds what it computes to the labels."""
-    return FeatureCache(
-        root, runtime=mfvpr.Runtime(progress=lambda label: labels.append(label) or runtime.no_progress)
-    )
+    return FeatureCache(root, runtime=mfvpr.Runtime(progress=lambda label: labels.append(label) or runtime.no_progress))
 
 
 def test_what_is_learned_is_kept_and_made_once(cells, learned, dataset, tmp_path):
