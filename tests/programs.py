@@ -18,7 +18,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, schema
-from mfvpr.cli.inputs import prepare
+from mfvpr.cli.jobs import prepare
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.cache_files import MatchStore
