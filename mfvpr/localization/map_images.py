@@ -23,8 +23,7 @@ from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.evidence import strength
 from mfvpr.evaluation.system import System
-from mfvpr.features.extractor import Aggregation, Description, Extractor
-from mfvpr.features.feature_extraction import describe_images
+from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
 from mfvpr.features.feature_set import SHARE, check_features
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.localization.map_settings import check_settings, kept_settings

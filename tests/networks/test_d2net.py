@@ -7,8 +7,7 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
-from mfvpr.features import D2NetFeatures
-from mfvpr.features import d2net_features as features_d2net
+from mfvpr.features import D2NetFeatures, keypoint_networks
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
@@ -207,7 +206,7 @@ def test_what_does_not_fit_is_counted_and_the_strongest_stay():
 
 
 def test_crowded_images_are_extracted_again(small, images, monkeypatch):
-    monkeypatch.setattr(features_d2net, "_SHARE", 0.01)
+    monkeypatch.setattr(keypoint_networks, "_SHARE", 0.01)
     crowded = D2NetFeatures(small.model, small.image_size)
     for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
         assert len(expected.scores) > 2
