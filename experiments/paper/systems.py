@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mfvpr.checkpoints import REGISTRY, is_installed
-from mfvpr.checkpoints.registry import Entry
+from mfvpr.checkpoints.networks import Entry
 from mfvpr.cli.command_line import override
 from mfvpr.cli.schema import DATA_SET_NAME, Evaluate
 from mfvpr.datasets.published import PUBLISHED

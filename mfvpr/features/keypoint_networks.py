@@ -17,7 +17,7 @@ from jaxtyping import Float, Num
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches
 from mfvpr.networks import aliked, d2net
-from mfvpr.networks.imagenet import Preprocessing
+from mfvpr.networks.layers import Preprocessing
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, SHAPED_SIZE, SIZE, setting, whole, word_of
 

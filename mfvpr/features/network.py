@@ -12,7 +12,7 @@ from jaxtyping import Float, Num
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.networks.imagenet import Images, Pixels, of_unit_length
+from mfvpr.networks.layers import Images, Pixels, of_unit_length
 from mfvpr.networks.mixvpr import IMAGE_SIZE
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import SIZE, Rule, check_fields, setting, whole, word_of

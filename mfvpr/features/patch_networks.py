@@ -15,11 +15,10 @@ from jaxtyping import Float
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor
-from mfvpr.networks.imagenet import of_unit_length
+from mfvpr.networks.layers import of_unit_length
 from mfvpr.networks.netvlad import VggNetVlad
-from mfvpr.networks.selavpr import LOCAL, SelaVpr
 from mfvpr.networks.vgg import STRIDE
-from mfvpr.networks.vit import PATCH, VisionTransformer, require_patches
+from mfvpr.networks.vit import LOCAL, PATCH, SelaVpr, VisionTransformer, require_patches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import POSITIVE, SIZE, list_of, number, setting, whole, word_of
 

@@ -13,8 +13,8 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
 from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
-from mfvpr.networks.imagenet import Preprocessing
-from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.networks.layers import Preprocessing
+from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
 from mfvpr.utils.fields import SIZE, setting, whole, word_of
 
 _CHANNELS = 512

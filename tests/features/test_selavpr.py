@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints import networks
-from mfvpr.checkpoints.tables import DINOV2, SELAVPR
+from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
 from mfvpr.networks import SelaVpr, VisionTransformer
 from tests.features.conftest import read_rows
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes, write_zip

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints.tables import DINOV2
+from mfvpr.checkpoints.conversion import DINOV2
 from mfvpr.features import Dinov2Features, GlobalDescriptor
 from mfvpr.networks import VisionTransformer
 from mfvpr.networks.vit import TokenDescriptor
