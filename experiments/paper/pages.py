@@ -17,11 +17,20 @@ from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import Table
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
-from mfvpr.report.pages import one_run
-from mfvpr.report.pages.charts import Chart, bar_chart
-from mfvpr.report.pages.rendering import MOST_PICTURES, Gallery, Section, embed, pictures, values_table, write_page
-from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.pages import write_comparison
 from mfvpr.report.plots import panels, save_figure
+from mfvpr.report.rendering import (
+    MOST_PICTURES,
+    PAGE,
+    Chart,
+    Gallery,
+    Section,
+    bar_chart,
+    embed,
+    pictures,
+    values_table,
+    write_page,
+)
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import read_csv
 from mfvpr.utils.files import clip_middle, printable, replacing
@@ -183,7 +192,7 @@ def write_pages(
         if len(folders) > 1:
             links.append((f"{dataset}: all side by side", out / "comparisons" / f"{dataset}.html"))
             write_comparison([*folders.values()], links[-1][1])
-        links += [(f"{dataset}: {run}", folder / one_run.PAGE) for run, folder in folders.items()]
+        links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
     recalls = dict(table for name, table in tables.items() if name not in (*_COSTS, *_ABOUT))
@@ -207,7 +216,7 @@ def write_pages(
     sections.append(Section("settings", "Data sets and settings", tables=about))
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
-    write_page(out / one_run.PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
+    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
 
 
 def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:

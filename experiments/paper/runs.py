@@ -23,7 +23,7 @@ from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
 from mfvpr.localization.vectors import Vectors
-from mfvpr.report.pages.rendering import PAGE
+from mfvpr.report.rendering import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database

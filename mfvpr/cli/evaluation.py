@@ -8,9 +8,8 @@ from mfvpr.cli.schema import Evaluate
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
-from mfvpr.report.confidences import confidence_figures, confidence_table
-from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.query_figures import query_figures
+from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
+from mfvpr.report.figures import query_figures, reliability_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
@@ -35,7 +34,7 @@ def evaluate(settings: Evaluate) -> None:
     with run_folder.claim(settings.out, settings.dataset["name"]) as folder:
         outcome = evaluation_of(settings)
         report, description = outcome.report, outcome.description
-        tables = [recall_table(report)] if report.thresholds else []
+        tables = [recall_table(report.rows())] if report.thresholds else []
         if tables and report.confidences is not None:
             tables.append(confidence_table(report))
         run_folder.write_results(
@@ -63,7 +62,7 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     systems, ks = confidence and confidence.systems, settings.recall.ks
     report = EvaluationReport(ranked, inputs.thresholds, ks, systems, settings.threshold, lacking)
-    figures = query_figures(report, figure_queries) + (confidence_figures(report) if figure_queries else [])
+    figures = query_figures(report, figure_queries) + (reliability_figures(report) if figure_queries else [])
     return Outcome(inputs, report, _describe(settings, inputs, system), figures)
 
 

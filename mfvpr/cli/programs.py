@@ -220,8 +220,7 @@ _ARGUMENTS = {  # of programs that have commands or arguments instead of setting
 
 def write_page(runs: list[Path], out: Path | None) -> None:
     """Write the page of one run, or of several compared, and print its path."""
-    from mfvpr.report.pages.one_run import write_report
-    from mfvpr.report.pages.several_runs import write_comparison
+    from mfvpr.report.pages import write_comparison, write_report
     from mfvpr.utils.files import printable
 
     if len(runs) == 1:

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from mfvpr.cli import console
 from mfvpr.cli.schema import Common
-from mfvpr.report import runs
-from mfvpr.report.pages import one_run
+from mfvpr.report import pages, runs
 from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
@@ -18,7 +18,7 @@ from mfvpr.utils.files import expand_user
 @contextmanager
 def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
     """The run folder `out`, for this run alone; None = a new one of a data set. Options as of `claim_run_folder`."""
-    folder = expand_user(out) if out else runs.new_run_folder(Path("runs"), dataset)
+    folder = expand_user(out) if out else Path("runs", dataset, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
@@ -71,7 +71,7 @@ def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
 def report_page(folder: Path) -> Path | None:
     """Write the page of an evaluation and return its path; warn and return None if that fails."""
     try:
-        return one_run.write_report(folder)
+        return pages.write_report(folder)
     except (ImportError, InputError, OSError) as error:
         console.tell(f"warning: {folder}: no page was made of it ({error})")
         return None

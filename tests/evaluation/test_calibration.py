@@ -14,8 +14,7 @@ from mfvpr.datasets import Positives
 from mfvpr.datasets.ground_truth import FrameTruth
 from mfvpr.evaluation import Ranked, confidence_inputs, fit_confidence, read_confidences, write_confidences
 from mfvpr.evaluation.confidence import absent_rankings
-from mfvpr.report.confidences import recalls_by_share
-from mfvpr.report.evaluations import EvaluationReport
+from mfvpr.report.evaluations import EvaluationReport, recalls_by_share
 from mfvpr.utils import InputError
 
 NAMES = ("margin", "height", "retrieval", "score")
