@@ -33,7 +33,7 @@ from mfvpr.report.rendering import (
 )
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import read_csv
-from mfvpr.utils.files import clip_middle, printable, replacing
+from mfvpr.utils.files import clip_middle, printable
 from mfvpr.utils.versions import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
@@ -58,14 +58,12 @@ def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
     }
     histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("correct_*.png")))
     if histogram := next(histograms, None):
-        yield "histogram.png", partial(_copy, source=histogram)
+        yield "histogram.png", partial(shutil.copyfile, histogram)
     if groups := mean_recalls(evaluations):
         titles = [row.title for row in evaluations.rows if any(row.title in group for group in groups.values())]
         yield "averages.png", partial(_draw_averages, titles=titles, groups=groups)
     if evaluations.seconds:
         yield "speed.png", partial(_draw_speed, evaluations=evaluations)
-    if evaluations.growth:
-        yield "growth.png", partial(_draw_growth, growth=evaluations.growth)
     if folders:
         cases = [case for name, folder in folders.items() for case in _failures(folder, evaluations.datasets[name])]
         yield "failures.png", partial(_draw_failures, cases=cases)
@@ -117,19 +115,6 @@ def _save_bars(figure: Canvas, path: Path, titles: Sequence[str], label: str, li
     save_figure(figure, path)
 
 
-def _draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
-    """Draw the seconds of a query as the database grows: the search grows, the rest stays."""
-    figure, [axes] = panels(1, 7, 4.2)
-    for title, by_size in growth.items():
-        axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
-    axes.set(xlabel="images of a database, whose descriptors are made up", ylabel="seconds of a query")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    save_figure(figure, path)
-
-
 def _draw_failures(path: Path, cases: Sequence[Sequence[_Image]]) -> None:
     """Draw query, prediction, and the best ranked correct image side by side."""
     heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image, _ in case) for case in cases] or [1.0]
@@ -168,11 +153,6 @@ def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, st
     return database.names.index(row["prediction"]) not in correct
 
 
-def _copy(path: Path, source: Path) -> None:
-    with replacing(path) as temporary:
-        shutil.copyfile(source, temporary)
-
-
 def _image(folder: ImageFolder, name: str, words: str) -> _Image:
     """An image, small, and its title."""
     image = with_longest_side(folder.read(folder.names.index(name)), _SIDE)
@@ -203,8 +183,7 @@ def write_pages(
     about["Versions"] = values_table(versions())
     paths = {path.stem: path for path in (out / "figures").glob("*.png")}
     averages = {"Mean recall at 1 within 2 frames": embed(paths["averages"])} if "averages" in paths else {}
-    titles = {"speed": "Seconds of a query", "growth": "As a database grows"}
-    speed = {title: embed(paths[name]) for name, title in titles.items() if name in paths}
+    speed = {"Seconds of a query": embed(paths["speed"])} if "speed" in paths else {}
     words = "In %. Where the paper prints a number, that and the difference stand beside ours."
     sections = [Section("recall", "Recall", words, [*_by_sequence(evaluations)], recalls, images=averages)]
     words = "Their own pages, and all of a data set side by side, with tests and intervals."

@@ -51,9 +51,13 @@ class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`.
+        results: rows of `results.json`; `common` is one of them, for values that all share.
         about: the content of `run.json`.
         tables: of CSV files, by name without suffix.
+        systems: names in the order of the results; the `headline` decides.
+        sequences: names; a single one without a name has the data set's.
+        thresholds: of a correct prediction, ascending; none without ground truth.
+        within: the threshold of ranks, as it stands behind R@K.
         queries: names of the Q queries of all sequences with ground truth; none without.
         sequence_of: numbers of their sequences.
         places: along the map.
@@ -62,42 +66,18 @@ class Run:
 
     folder: Path
     results: Sequence[Mapping[str, Any]]
+    common: Mapping[str, Any]
     about: Mapping[str, Any]
     tables: Mapping[str, Table]
+    systems: Sequence[str]
+    headline: str
+    sequences: Sequence[str]
+    thresholds: Sequence[float]
+    within: str
     queries: Sequence[str]
     sequence_of: Int[np.ndarray, " queries"]
     places: Int[np.ndarray, " queries"]
     ranks: Mapping[str, Int[np.ndarray, " queries"]]
-
-    @property
-    def common(self) -> Mapping[str, Any]:
-        """Values that all rows of the results share: the data set, seconds, versions and so on."""
-        return self.results[0]
-
-    @property
-    def systems(self) -> list[str]:
-        """Names of the systems, in the order of the results."""
-        return list(dict.fromkeys(row["system"] for row in self.results))
-
-    @property
-    def headline(self) -> str:
-        """The system that decides."""
-        return next(row["system"] for row in self.results if row["decides"])
-
-    @property
-    def sequences(self) -> list[str]:
-        """Names of the sequences; a single one without a name has the data set's."""
-        return _sequences(self.results)
-
-    @property
-    def thresholds(self) -> list[float]:
-        """Distances within which a prediction is correct, ascending; none without ground truth."""
-        return self.common["ground_truth"].get("thresholds", [])
-
-    @property
-    def within(self) -> str:
-        """The threshold of ranks and of all values per query, as it stands behind R@K."""
-        return threshold_words(self.common["ground_truth"]["unit"], middle(self.thresholds))
 
     def hits(self, system: str, k: int = 1, sequence: int | None = None) -> Bool[np.ndarray, " queries"]:
         """In the order of the path, whether one of the first k candidates is correct; `sequence` None = of all."""
@@ -151,26 +131,25 @@ class Run:
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
 
 
-def _sequences(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = dict.fromkeys(row.get("sequence", row["dataset"]) for row in results)
-    return [name for name in names if name not in MEANS]
-
-
 def read_run(folder: Path) -> Run:
     """Read the files of a run folder; InputError if they are not those of an evaluation."""
     with _reading(folder):
-        results = _read_json(folder / LAST)
+        results, about = _read_json(folder / LAST), _read_json(folder / "run.json")
         tables = {name: read_table(folder / f"{name}.csv") for name in _TABLES if (folder / f"{name}.csv").exists()}
-        sequences, lines, sequence_of = _sequences(results), [], []
-        for number in range(len(sequences) if "thresholds" in results[0]["ground_truth"] else 0):
-            part = read_csv(sequence_folder(folder, sequences, number) / "gains.csv")
-            lines += part
-            sequence_of += [number] * len(part)
-        names = [name.removesuffix(" rank") for name in (lines[0] if lines else ()) if name.endswith(" rank")]
-        ranks = {name: np.array([int(line[f"{name} rank"] or 0) for line in lines]) for name in names}
-        queries, places = [line["query"] for line in lines], np.array([int(line["place"]) for line in lines])
-        about = _read_json(folder / "run.json")
-        return Run(folder, results, about, tables, queries, np.array(sequence_of), places, ranks)
+        systems = list(dict.fromkeys(row["system"] for row in results))
+        headline = next(row["system"] for row in results if row["decides"])
+        parts, truth = dict.fromkeys(row.get("sequence", row["dataset"]) for row in results), results[0]["ground_truth"]
+        sequences, thresholds = [name for name in parts if name not in MEANS], truth.get("thresholds", [])
+        within = threshold_words(truth["unit"], middle(thresholds)) if thresholds else ""
+        lines, sequence_of = list[dict[str, str]](), list[int]()
+        for number in range(len(sequences) if thresholds else 0):
+            lines += read_csv(sequence_folder(folder, sequences, number) / "gains.csv")
+            sequence_of += [number] * (len(lines) - len(sequence_of))
+        queries, places = [line["query"] for line in lines], np.array([line["place"] for line in lines], int)
+        ranks = {name: np.array([line[f"{name} rank"] or 0 for line in lines], int) for name in systems if lines}
+        names = systems, headline, sequences, thresholds, within
+        of_queries = queries, np.array(sequence_of, int), places, ranks
+        return Run(folder, results, results[0], about, tables, *names, *of_queries)
 
 
 def _read_json(path: Path) -> Any:

@@ -27,7 +27,7 @@ LAST = "results.json"  # the file of a run that appears last
 _MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
 _PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')
 
-Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
+Figure = tuple[str, Callable[[Path], Any]]  # name of the file, and what draws it there
 
 
 @contextmanager

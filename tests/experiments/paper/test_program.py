@@ -66,7 +66,7 @@ def files(out):
     """Contents that do not depend on the time: every file but seconds and their figures, and results without them."""
     contents = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
-        if path.parent.name == "seconds" or path.stem in ("speed", "growth", "run", "seconds", "report"):
+        if path.parent.name == "seconds" or path.stem in ("speed", "run", "seconds", "report"):
             continue
         content = path.read_bytes()
         if path.name == "results.json":
@@ -105,7 +105,7 @@ def test_runs_of_a_data_set_stand_side_by_side(copy, paper):
     assert not (copy / "tables/sequences_other.md").exists()
     assert '<a href="comparisons/grief_season.html">' in (copy / "report.html").read_text()
     assert (copy / RUN / "report.html").is_file()
-    assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
+    assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "histogram.png"}
 
 
 def test_seconds_of_something_else_are_measured_again(copy, paper):
