@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from experiments.paper.tables import TOLERANCES, Evaluations, average, printed_tables
-from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import Table
@@ -132,8 +132,12 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
     """Query, prediction and correct image of the clearest failures that retrieval did not cause."""
     names, failures = [sequence.name for sequence in dataset.sequences], []
     for place, sequence in enumerate(dataset.sequences):
+        is_of_frames = sequence.truth is not None and sequence.truth.unit == "frames"
+        positives = sequence.truth.positives(TOLERANCES[-1]) if sequence.truth and is_of_frames else None
         for row in read_csv(sequence_folder(run, names, place) / "failures" / "histogram.csv"):
-            if row["correct_image"] and _is_far(sequence, dataset.database, row):
+            predicted = dataset.database.names.index(row["prediction"])
+            near = () if positives is None else positives.of(sequence.images.names.index(row["query"]))
+            if row["correct_image"] and predicted not in near:  # also within the widest of the paper's tolerances
                 failures.append((sequence, row))
     failures.sort(key=lambda failure: -float(failure[1]["margin"] or 0))  # empty between two infinite scores
     for sequence, row in failures[:_FAILURES]:
@@ -143,14 +147,6 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
             _image(dataset.database, row["prediction"], "prediction"),
             _image(dataset.database, row["correct_image"], "correct"),
         ]
-
-
-def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
-    """Whether a prediction is incorrect within the widest of the paper's tolerances, too; True for positions."""
-    if sequence.truth is None or sequence.truth.unit != "frames":
-        return True
-    correct = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
-    return database.names.index(row["prediction"]) not in correct
 
 
 def _image(folder: ImageFolder, name: str, words: str) -> _Image:

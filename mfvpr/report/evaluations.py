@@ -135,19 +135,27 @@ class EvaluationReport:
 
     @cached_property
     def both_probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
-        """Confidence by system, of the queries as they are, and without the images of their place; NaN = unknown."""
-        if self.confidences is None:
-            return self._cross_fitted()
-        probabilities = {}
-        for name in (name for name in self.confidences if name in self.ranked.systems):
-            fitted, pairs = self.confidences[name], [*self._pairs(name)]
-            present = np.concatenate([fitted(*pair) for pair in pairs])
-            absent = np.full_like(present, np.nan)
-            if self.thresholds:
-                parts = zip(pairs, self._truths, strict=True)
-                without = [absent_rankings(*pair, truth, self.threshold) for pair, truth in parts]
-                absent = np.concatenate([fitted(*pair) for pair in without])
-            probabilities[name] = np.stack([present, absent])
+        """Confidence by system, of the queries as they are, and without the images of their place; NaN = unknown.
+
+        Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        """
+        names = self.calibration if self.confidences is None else self.confidences
+        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in names if name in self.ranked.systems}
+        for name, (present, absent) in probabilities.items():
+            if self.confidences is not None:
+                fitted, pairs = self.confidences[name], [*self._pairs(name)]
+                present[:] = np.concatenate([fitted(*pair) for pair in pairs])
+                if self.thresholds:
+                    parts = zip(pairs, self._truths, strict=True)
+                    without = [absent_rankings(*pair, truth, self.threshold) for pair, truth in parts]
+                    absent[:] = np.concatenate([fitted(*pair) for pair in without])
+                continue
+            for half in self.path_halves():
+                tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
+                if np.isfinite(tune.present).all(axis=1).any():
+                    confidence = tune.fit()
+                    present[half.report] = confidence.probability(report.present)
+                    absent[half.report] = confidence.probability(report.absent)
         return probabilities
 
     @property
@@ -194,17 +202,6 @@ class EvaluationReport:
         if system in self.probabilities:
             values["confidence"] = self.probabilities[system]
         return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
-
-    def _cross_fitted(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
-        """Confidence on each half of the path by a fit on the other, without what shows places of both."""
-        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in self.calibration}
-        for name, data in self.calibration.items():
-            for half in self.path_halves():
-                tune, report = data.take(half.tune), data.take(half.report)
-                if np.isfinite(tune.present).all(axis=1).any():
-                    fitted = map(tune.fit().probability, (report.present, report.absent))
-                    probabilities[name][:, half.report] = [*fitted]
-        return probabilities
 
     def _pairs(self, system: str) -> Iterator[tuple[Ranked, Ranked]]:
         """Rankings of each sequence by a system, and by retrieval."""

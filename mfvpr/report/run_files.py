@@ -31,9 +31,8 @@ from mfvpr.report.evaluations import (
     recalls_by_share,
 )
 from mfvpr.report.runs import file_names, write_about, write_json, write_table, writing
-from mfvpr.report.tables import Table, format_number, write_csv
+from mfvpr.report.tables import format_number, write_csv
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.files import write_text
 from mfvpr.utils.versions import versions
 
 SHIFTS = ("shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "width", "height")  # px, of shifts.csv
@@ -358,12 +357,15 @@ def _write_top_predictions(folder: Path, report: EvaluationReport) -> None:
 
 
 def write_gains(folder: Path, report: EvaluationReport) -> None:
-    """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`, with ground truth.
+    """Write `gains.csv` of every sequence, and `differences.csv`; with ground truth.
 
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
     one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need.
     """
-    systems, places = [*report.ranked.systems], _places(report)
+    systems, places, truth = [*report.ranked.systems], np.arange(report.num_queries), report.sequences[0].truth
+    if truth is not None and (len(report.sequences) > 1 or truth.unit == "m"):  # else in the order of the queries
+        known = [positives for positives in report.positives if positives is not None]
+        places = places_along_path(stack_positives(known), truth.unit)
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
     for part, sequence in enumerate(report.sequences):
         columns = [sequence.images.names, report.by_sequence(places)[part].tolist()]
@@ -372,16 +374,12 @@ def write_gains(folder: Path, report: EvaluationReport) -> None:
             ranks = np.where(correct.any(axis=1), np.argmax(correct, axis=1) + 1, 0)
             columns += [correct[:, 0].astype(int).tolist(), [rank or "" for rank in ranks.tolist()]]
         write_csv(report.folder(folder, part) / "gains.csv", header, zip(*columns, strict=True))
-    path, lines, counts = np.argsort(places, kind="stable"), [], {}
-    for pair in itertools.combinations(systems, 2):
-        only_first, only_second, *numbers = difference_cells(*(report.hits(name)[path] for name in pair))
-        lines.append([*pair, only_first, only_second, *numbers])
-        for names, only in ((pair, only_first), (pair[::-1], only_second)):
-            counts[names] = f"{only} (p {float(numbers[-1]):.2g})"
+    path, lines = np.argsort(places, kind="stable"), []
+    hits = {name: report.hits(name)[path] for name in systems}
+    for first, second in itertools.combinations(systems, 2):
+        lines.append([first, second, *difference_cells(hits[first], hits[second])])
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "design_effect", "path_p"]
     write_csv(folder / "differences.csv", header, lines)
-    rows = [[name, *(counts.get((name, other), "") for other in systems)] for name in systems]
-    write_text(folder / "differences.md", Table(["only this is correct, not", *systems], rows).markdown())
 
 
 def difference_cells(hits: Bool[np.ndarray, " queries"], others: Bool[np.ndarray, " queries"]) -> list[str]:
@@ -390,15 +388,6 @@ def difference_cells(hits: Bool[np.ndarray, " queries"], others: Bool[np.ndarray
     """
     only_first, only_second, p_value = mcnemar(hits, others)
     return [str(only_first), str(only_second), *map(format_number, (p_value, *path_test(hits, others)))]
-
-
-def _places(report: EvaluationReport) -> np.ndarray:
-    """`[Q]` places of all queries along the map; those of one sequence without positions are in their order."""
-    truth = report.sequences[0].truth
-    if truth is None or (len(report.sequences) == 1 and truth.unit != "m"):
-        return np.arange(report.num_queries)
-    known = [positives for positives in report.positives if positives is not None]
-    return places_along_path(stack_positives(known), truth.unit)
 
 
 def _write_confidence(folder: Path, report: EvaluationReport) -> None:

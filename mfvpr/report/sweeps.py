@@ -27,7 +27,7 @@ from mfvpr.utils.versions import versions
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-TOP = 10
+TOP = 10  # settings of the summary
 MAX_HEAT_MAPS = 6
 
 
@@ -223,12 +223,8 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
     files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
     figures = []
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
-        figures.append((f"{file}.png", partial(_draw, outcome, first, second)))
+        figures.append((f"{file}.png", lambda path, pair=(first, second): save_figure(_heat_map(outcome, *pair), path)))
     return figures
-
-
-def _draw(outcome: Outcome, first: str, second: str, path: Path) -> None:
-    save_figure(_heat_map(outcome, first, second), path)
 
 
 def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
@@ -245,15 +241,13 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
     fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
     in_grid = own[first] in values[first] and own[second] in values[second]
     defaults = (values[first].index(own[first]), values[second].index(own[second])) if in_grid else None
-    sides, title = ((name, _short(values[name])) for name in (first, second)), "; ".join([_label(outcome), *fixed])
+    sides = []
+    for name in (first, second):
+        stems = [Path(value).stem if value.endswith(".json") else value for value in values[name]]
+        sides.append((name, stems if len({*stems}) == len(stems) else values[name]))  # of files, if these differ
+    title = "; ".join([_label(outcome), *fixed])
     return heat_map_figure(plane, *sides, best=(best[first], best[second]), defaults=defaults, title=title)
 
 
 def _label(outcome: Outcome) -> str:
     return f"{outcome.protocol.label(1, outcome.protocol.thresholds[outcome.protocol.main])} in %"
-
-
-def _short(values: list[str]) -> list[str]:
-    """Shorten JSON files to their stems, if these differ."""
-    names = [Path(value).stem if value.endswith(".json") else value for value in values]
-    return names if len({*names}) == len(names) else values

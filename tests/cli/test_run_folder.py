@@ -98,9 +98,6 @@ def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
         assert [line["only_system"], line["only_other"]] == [str((first > second).sum()), str((first < second).sum())]
         assert float(line["mcnemar_p"]) == pytest.approx(mcnemar(first, second).p_value, rel=1e-6)
         assert float(line["path_p"]) == pytest.approx(path_test(first, second).p_value, rel=1e-6)
-    header, _, _, line, _ = (evaluated / "differences.md").read_text().splitlines()
-    assert header == "| only this is correct, not | retrieval | histogram | histogram + retrieval |"
-    assert line.startswith(f"| histogram | {(hits['histogram'] > hits['retrieval']).sum()} (p ")
 
 
 def test_without_ground_truth_nothing_is_right_or_failed(root, tmp_path, capsys):

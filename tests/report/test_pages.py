@@ -110,12 +110,6 @@ def test_nothing_comes_from_elsewhere(page):
         assert f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" in policy
 
 
-def test_the_same_folder_is_the_same_page(run, tmp_path):
-    first = write_report(run, tmp_path / "a" / "first.html").read_bytes()
-    assert write_report(run, tmp_path / "second.html").read_bytes() == first
-    assert write_report(write_run(tmp_path / "again"), tmp_path / "third.html").read_bytes() == first
-
-
 def test_a_page_replaces_only_a_page(run, tmp_path):
     assert write_report(run, tmp_path / "page.html") == write_report(run, tmp_path / "page.html")
     (tmp_path / "query.jpg").write_bytes(b"precious")
