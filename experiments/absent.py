@@ -17,8 +17,8 @@ from mfvpr.cli.systems import load_system
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
+from mfvpr.evaluation.confidence import reliability
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.reliability import reliability
 from mfvpr.localization.map_calibration import data_of_drive
 from mfvpr.storage import FeatureCache
 

@@ -29,10 +29,9 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset
 from mfvpr.evaluation.confidence import CalibrationData, calibration_data
-from mfvpr.evaluation.drives import Drive
+from mfvpr.evaluation.drives import Drive, DriveFilter
 from mfvpr.evaluation.fusion import FrameCorrelation
 from mfvpr.evaluation.rankings import Ranked
-from mfvpr.evaluation.sequences import DriveFilter
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache

@@ -38,7 +38,7 @@ from .baselines.rapid import RapidSpatialScore
 # scores of all candidates, whole grids of parameters, fusion and ranking
 from .core.batch import score_candidates, score_grid
 from .core.ranking import combine, rank, rerank
-from .evaluation.shortlist_scores import balancing_c
+from .evaluation.rankings import balancing_c
 
 # data sets, what is correct, and recall
 from . import datasets
@@ -62,7 +62,7 @@ from .deployment.programs import ExportShapes
 # tools for a scorer of your own; see mfvpr.testing.check_scorer
 from .core.scorer import Scorer
 from .core.types import value
-from .core.shifts import image_sizes, match_shifts
+from .core.weights import image_sizes, match_shifts
 from .utils.numerics import masked, masked_mean, masked_median, safe_sqrt
 
 # mistakes of a caller, in one line

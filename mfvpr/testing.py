@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mfvpr.core.batch import score_candidates
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, on_host
+from mfvpr.core.scorer import Scorer, fit_capacities, on_host
 from mfvpr.core.types import Array, Matches, per_match
 from mfvpr.utils.errors import NoGradientError
 from mfvpr.utils.numerics import holds_function
@@ -58,7 +57,7 @@ def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | Non
         _random_matches(np.random.default_rng([seed, count]), count, image_size, num_keypoints or 3 * count)
         for count in COUNTS
     ]
-    scorer = with_capacity(scorer, pairs[0].image_size0, pairs[0].image_size1)
+    scorer = fit_capacities(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
     close = partial(_assert_close, TOLERANCE * float(np.abs(scores).max()))
     score_of = scorer if on_host(scorer) else jax.jit(lambda pair: scorer(pair))

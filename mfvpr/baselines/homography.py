@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.baselines import planes
 from mfvpr.baselines.rapid import query_features
-from mfvpr.core.shifts import require_sizes
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import match_confidence
+from mfvpr.core.weights import match_confidence, require_sizes
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, number, one_of, setting, whole
 from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from mfvpr.core.parameters import check_bounds
+from mfvpr.core.scorer import check_bounds
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import POSITIVE, check_fields, number, one_of, setting

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.core.shifts import image_sizes
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import match_confidence
+from mfvpr.core.weights import image_sizes, match_confidence
 from mfvpr.utils.fields import FLAG, check_fields, one_of, setting
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, safe_sqrt, where_finite
 

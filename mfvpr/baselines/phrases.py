@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.core.shifts import match_shifts
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import match_confidence
+from mfvpr.core.weights import match_confidence, match_shifts
 from mfvpr.utils.fields import POSITIVE, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import masked, positive, where_finite
 

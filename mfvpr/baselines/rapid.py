@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import match_confidence
+from mfvpr.core.weights import image_sizes, match_confidence, match_shifts
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, list_of, one_of, setting
 from mfvpr.utils.numerics import at_least_single, masked, masked_mean, where_finite

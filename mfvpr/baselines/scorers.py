@@ -22,7 +22,7 @@ SCORERS: dict[str, type] = {
     "homography": Homography,
     "homography_opencv": OpenCvHomography,
 }
-"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.core.parameters`)."""
+"""Scorers of the programs by name. Their settings follow from their fields (`mfvpr.core.scorer`)."""
 
 PAPER = ("count", "sum", "anchor", "histogram")
 """Scorers that are compared by default."""

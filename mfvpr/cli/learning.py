@@ -21,12 +21,11 @@ from mfvpr.report import comparisons, runs
 from mfvpr.report.run_files import matched_content
 from mfvpr.systems.choices import without
 from mfvpr.tuning.learning.comparison import compare
-from mfvpr.tuning.learning.data_sets import Part, join_data_sets
-from mfvpr.tuning.learning.losses import LOSSES
-from mfvpr.tuning.learning.models import Options
+from mfvpr.tuning.learning.models import LOSSES, Options
+from mfvpr.tuning.learning.splits import Part, join_data_sets
 from mfvpr.tuning.learning.training import Checkpoints
 from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.sweep_axes import can_learn
+from mfvpr.tuning.sweeps.setting_search import can_learn
 from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values

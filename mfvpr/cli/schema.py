@@ -9,9 +9,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.parameters import parameters_of
+from mfvpr.core.scorer import parameters_of
+from mfvpr.evaluation.drives import Method
 from mfvpr.evaluation.protocol import Split
-from mfvpr.evaluation.sequences import Method
 from mfvpr.systems.choices import GROUPS, SystemSettings, choices_of
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError

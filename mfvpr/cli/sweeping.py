@@ -6,9 +6,9 @@ from typing import Any
 from mfvpr.cli import run_folder
 from mfvpr.cli.inputs import Inputs, prepare, truth_in_words, with_image_size
 from mfvpr.cli.schema import Learn, Sweep
-from mfvpr.core.parameters import parameters_of
+from mfvpr.core.scorer import parameters_of
 from mfvpr.datasets.contents import fingerprints, readings
-from mfvpr.evaluation.sequences import DriveFilter
+from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.report import sweeps
 from mfvpr.report.run_files import matched_content
 from mfvpr.systems import assembly

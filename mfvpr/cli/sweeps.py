@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.core import Scorer
-from mfvpr.core.parameters import numbers_by_name, static_names
+from mfvpr.core.scorer import numbers_by_name, static_names
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.protocol import Split

@@ -34,5 +34,5 @@ from .metrics import hits, recall_at_k
 from .nearest import CrossCheck
 from .ranking import combine, rank, rerank
 from .scorer import Scorer
-from .shifts import image_sizes, match_shifts
 from .types import Features, Matches, Ranking, Shortlist
+from .weights import image_sizes, match_shifts

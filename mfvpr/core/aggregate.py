@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mfvpr.core.shifts import image_sizes, match_shifts
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
+from mfvpr.core.weights import Weight, image_sizes, match_confidence, match_shifts, match_weights, weight_field
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, one_of, setting
 from mfvpr.utils.numerics import masked, masked_mean, masked_median, positive, safe_sqrt, where_finite
 

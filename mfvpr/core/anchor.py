@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.core.shifts import image_sizes
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_confidence, match_weights, weight_field
+from mfvpr.core.weights import Weight, image_sizes, match_confidence, match_weights, weight_field
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import at_least_single, masked, positive, safe_sqrt, where_finite
 

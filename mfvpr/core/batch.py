@@ -14,14 +14,18 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.core.matching import filter_matches
-from mfvpr.core.parameters import numbers_by_name, parameters_of, whole_numbers, with_capacity, with_parameters
 from mfvpr.core.scorer import (
     Scorer,
     check_host,
+    fit_capacities,
+    numbers_by_name,
     on_host,
-    require_real,
+    parameters_of,
+    require_scores,
     score_pairs,
     shares_weightings,
+    whole_numbers,
+    with_parameters,
     with_static_functions,
 )
 from mfvpr.core.types import Array, Matches
@@ -47,8 +51,8 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     check_host(scorer)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
-    scores = _score_candidates(fit_to_sizes(partial(with_capacity, scorer, multiple=BIN_STEP), matches), matches)
-    require_real(type(scorer).__name__, scores)
+    scores = _score_candidates(fit_to_sizes(partial(fit_capacities, scorer, multiple=BIN_STEP), matches), matches)
+    require_scores(type(scorer).__name__, scores)
     return scores
 
 
@@ -132,7 +136,7 @@ def score_settings(
         )
     else:
         scores = _score_settings(scorer, matches, dict(settings), dict(weightings))
-    require_real("scorer", scores)
+    require_scores("scorer", scores)
     return scores
 
 
@@ -193,12 +197,12 @@ def by_capacity(
     """Group settings by the capacity of bins that they need: (scorer, rows of settings); one group if traced."""
     if not is_concrete(settings):
         first = with_parameters(scorer, {name: values[0] for name, values in settings.items()})
-        return [(with_capacity(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
+        return [(fit_capacities(first, image_size0, image_size1, multiple=BIN_STEP), np.arange(num_settings))]
     settings = jax.tree.map(np.asarray, settings)
     groups: dict[Any, tuple[Any, list[int]]] = {}
     for row in range(num_settings):
         varied = with_parameters(scorer, {name: values[row] for name, values in settings.items()})
-        fitted = with_capacity(varied, image_size0, image_size1, multiple=BIN_STEP)
+        fitted = fit_capacities(varied, image_size0, image_size1, multiple=BIN_STEP)
         groups.setdefault(jax.tree.structure(fitted), (fitted, []))[1].append(row)
     return [(fitted, np.array(rows)) for fitted, rows in groups.values()]
 

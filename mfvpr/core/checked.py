@@ -34,14 +34,14 @@ from jaxtyping import BFloat16, Bool, Float, Int
 
 from mfvpr.core.nearest import (
     CrossCheck,
+    Largest,
     Lines,
-    Nearest,
     Neighbors,
     Product,
     Query,
     even_size,
+    largest_of,
     lines_of,
-    nearest,
     ready,
     without,
 )
@@ -136,7 +136,7 @@ class _Direction(NamedTuple):
     descriptors: Float[Array, "own _"]
     other_descriptors: Float[Array, "_ _"]
     lines: Lines
-    nearest: Nearest
+    nearest: Largest
     window: Float[Array, " own"]  # 2 e
 
     @property
@@ -198,7 +198,7 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     if not with_second:
         return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
-    rest = to1._replace(lines=lines, nearest=nearest(lines))
+    rest = to1._replace(lines=lines, nearest=largest_of(lines))
     second, settled2 = _settle(rest, rest.is_close & is_match & is_worthwhile)
     neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
     return neighbors, settled & settled2
@@ -213,7 +213,7 @@ def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 ke
 
 def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
     lines, window = lines_of(products, axis), _window(image, other)
-    return _Direction(image.exact, other.exact, lines, nearest(lines), window)
+    return _Direction(image.exact, other.exact, lines, largest_of(lines), window)
 
 
 def _window(image: Rounded, other: Rounded) -> Float[Array, " own"]:
@@ -263,7 +263,7 @@ def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Arr
     return index, settled
 
 
-def count_from(lines: Lines, neighbors: Nearest, threshold: Float[Array, " lines"]) -> Int[Array, " lines"]:
+def count_from(lines: Lines, neighbors: Largest, threshold: Float[Array, " lines"]) -> Int[Array, " lines"]:
     """Number of entries of at least the threshold, which is not above the nearest neighbor.
 
     Of a block without the nearest neighbor, only the largest entry is counted: the number is right if it is 1.

@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
-from mfvpr.core.parameters import SCORE
-from mfvpr.core.shifts import image_sizes, match_shifts, require_sizes
+from mfvpr.core.scorer import SCORE
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import Weight, match_weights, weight_field
+from mfvpr.core.weights import Weight, image_sizes, match_shifts, match_weights, require_sizes, weight_field
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, POSITIVE, check_fields, list_of, one_of, setting, whole
 from mfvpr.utils.numerics import compiled, device_of, is_concrete, masked, positive, round_up, safe_sqrt

@@ -21,7 +21,7 @@ Product = Literal["bfloat16", "float32"]
 BLOCK = 32
 
 
-class Nearest(NamedTuple):
+class Largest(NamedTuple):
     """Largest `similarity` of rows or columns, and its `index`, int32; 0 if all are -inf."""
 
     index: Int[Array, " lines"]
@@ -65,14 +65,14 @@ def lines_of(similarity: Float[Array, "rows columns"], axis: int) -> Lines:
     return Lines(blocks, jnp.max(blocks, axis=axis + 1), axis)
 
 
-def nearest(lines: Lines) -> Nearest:
+def largest_of(lines: Lines) -> Largest:
     """Nearest neighbors of all lines; the device chooses the method, which does not change the result."""
     axis = lines.axis
     if device_of(()).platform == "cpu":
         largest = jnp.max(lines.maxima, axis=axis)
         block = _first_true(lines.maxima == jnp.expand_dims(largest, axis), axis)
         place = _first_true(lines.take(block) == jnp.expand_dims(largest, axis), axis)
-        return Nearest(block * lines.length + place, largest)
+        return Largest(block * lines.length + place, largest)
     shape = lines.blocks.shape
     entries = lines.blocks.reshape(*shape[:axis], -1, *shape[axis + 2 :])
     if lines.removed is not None:
@@ -80,7 +80,7 @@ def nearest(lines: Lines) -> Nearest:
         entries = jnp.where(numbers == jnp.expand_dims(lines.removed, axis), -jnp.inf, entries)
     index = jax.lax.argmax(entries, axis, jnp.int32)
     largest = jnp.take_along_axis(entries, jnp.expand_dims(index, axis), axis=axis)
-    return Nearest(index, jnp.squeeze(largest, axis))
+    return Largest(index, jnp.squeeze(largest, axis))
 
 
 def without(lines: Lines, index: Int[Array, " lines"]) -> Lines:
@@ -136,16 +136,16 @@ class Query:
         similarity = jnp.where(usable, similarity, -jnp.inf)
         rows = jnp.arange(similarity.shape[0], dtype=jnp.int32)
         lines = lines_of(similarity, axis=1)
-        nearest1 = nearest(lines)
-        second1 = nearest(without(lines, nearest1.index)) if with_second else nearest1
+        nearest1 = largest_of(lines)
+        second1 = largest_of(without(lines, nearest1.index)) if with_second else nearest1
         match, real = nearest1.index, nearest1.similarity > -jnp.inf
         if cross_check != "none":
-            nearest0 = nearest(lines_of(similarity, axis=0))
+            nearest0 = largest_of(lines_of(similarity, axis=0))
         if cross_check == "mutual":
             real &= nearest0.index[match] == rows
         if cross_check == "opencv_legacy":
             picked = jnp.where(nearest0.index[None] == rows[:, None], similarity, -jnp.inf)
-            match, largest = nearest(lines_of(picked, axis=1))
+            match, largest = largest_of(lines_of(picked, axis=1))
             real = jnp.isfinite(largest)
         neighbors = Neighbors(match, real, nearest1.index, second1.index, second1.similarity > -jnp.inf)
         return neighbors.without_padding(self.features)

@@ -1,16 +1,25 @@
-"""The contract of a scorer: a function from the matches of one pair to a score."""
+"""The contract of a scorer, a function from the matches of one pair to a score; and its parameters by dotted name.
 
-from collections.abc import Callable
+sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)  # a field of a scorer
+parameters_of(HistogramOfShifts)["sigma"].unit              # "px"
+with_parameters(scorer, {"inner.sigma": 10.0})              # a field of a part
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax.tree_util import GetAttrKey
+from jaxtyping import Float, Num
 
 from mfvpr.core.types import Array, Matches
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import Setting
 
+SCORE = "units of the score"
 Tree = TypeVar("Tree")
 
 
@@ -51,11 +60,10 @@ def on_host(scorer: Any) -> bool:
 
 def shares_weightings(scorer: Any) -> bool:
     """Whether `score_weightings` is there, and of the class that defines the score: a subclass may score otherwise."""
-    owners = [
-        next((cls for cls in type(scorer).__mro__ if name in vars(cls)), None)
-        for name in ("score_weightings", "__call__")
-    ]
-    return owners[0] is not None and owners[0] is owners[1]
+    for cls in type(scorer).__mro__:
+        if "score_weightings" in vars(cls) or "__call__" in vars(cls):
+            return {"score_weightings", "__call__"} <= {*vars(cls)}
+    return False
 
 
 class StaticFunction:
@@ -93,14 +101,75 @@ def score_pairs(scorer: Any, matches: Matches) -> Float[np.ndarray, " pairs"]:
     return scores.astype(np.float32)
 
 
-def require_scores(name: str, scores: Array, pairs: int) -> None:
-    """Raise an InputError unless the scores are a real number for each pair."""
-    if scores.shape != (pairs,):
+def require_scores(name: str, scores: Array, pairs: int | None = None) -> None:
+    """Raise an InputError unless the scores are real numbers, and one for each of some pairs."""
+    if pairs is not None and scores.shape != (pairs,):
         raise InputError(f"{name}: expected a number for each of {pairs} pairs, got an array {list(scores.shape)}")
-    require_real(name, scores)
-
-
-def require_real(name: str, scores: Array) -> None:
-    """Raise an InputError unless the scores are real numbers."""
     if scores.dtype.kind not in "fiub" and scores.dtype != jnp.bfloat16:
         raise InputError(f"{name}: expected real numbers as scores, got {scores.dtype}")
+
+
+def parameters_of(method: Any) -> dict[str, Setting]:
+    """Declared fields of a class, or of an instance, by name."""
+    return {f.name: f.metadata["setting"] for f in fields(method) if "setting" in f.metadata}
+
+
+def check_bounds(method: Any) -> None:
+    """Raise an InputError if a field holds a number out of bounds; none may be traced."""
+    for name, parameter in parameters_of(method).items():
+        parameter.check_numbers(name, getattr(method, name))
+
+
+def numbers_by_name(scorer: Any) -> dict[str, Any]:
+    """Numbers of a scorer by dotted name, which a grid may vary; also a `temperature` of None."""
+
+    def is_number(path: Any, leaf: Any) -> bool:
+        if leaf is None:
+            return path[-1].name == "temperature"
+        scalar = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(leaf) == 0
+        return scalar and (jnp.issubdtype(jnp.result_type(leaf), jnp.number) or isinstance(leaf, bool | np.bool_))
+
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(scorer, is_leaf=lambda leaf: leaf is None)
+        if path and all(isinstance(key, GetAttrKey) for key in path) and is_number(path, leaf)
+    }
+
+
+def whole_numbers(scorer: Any) -> set[str]:
+    """Names of the numbers that are integers, such as indices, and must remain integers."""
+    is_whole = lambda number: jnp.issubdtype(jnp.result_type(number), jnp.integer)  # noqa: E731
+    return {name for name, number in numbers_by_name(scorer).items() if number is not None and is_whole(number)}
+
+
+def static_names(scorer: Any) -> set[str]:
+    """Dotted names of the static fields of a scorer, whose values select the compiled program."""
+    names = set()
+    for f in fields(scorer) if is_dataclass(scorer) else ():
+        if f.metadata.get("static"):
+            names.add(f.name)
+        else:
+            names |= {f"{f.name}.{name}" for name in static_names(getattr(scorer, f.name))}
+    return names
+
+
+def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:
+    """The scorer with parameters replaced by `values`, by dotted name."""
+    for name, new in values.items():
+        outer, _, inner = name.partition(".")
+        part = with_parameters(getattr(scorer, outer), {inner: new}) if inner else new
+        scorer = replace(scorer, **{outer: part})
+    return scorer
+
+
+def fit_capacities(
+    scorer: Any, image_size0: Num[Array, "*batch0 2"], image_size1: Num[Array, "*batch1 2"], *, multiple: int = 1
+) -> Any:
+    """The scorer with the capacities that pairs of these image sizes need, before `vmap` or `jit` hide the sizes.
+
+    The method `fit_capacity(image_size0, image_size1, multiple)` of parts at any depth sets them, see
+    `HistogramOfShifts`; values up to the same `multiple` share programs.
+    """
+    has_capacity = lambda part: callable(getattr(part, "fit_capacity", None))  # noqa: E731
+    fit = lambda part: part.fit_capacity(image_size0, image_size1, multiple) if has_capacity(part) else part  # noqa: E731
+    return jax.tree.map(fit, scorer, is_leaf=has_capacity)

@@ -11,8 +11,7 @@ import numpy as np
 
 from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, on_host, require_scores
+from mfvpr.core.scorer import Scorer, fit_capacities, on_host, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
 from mfvpr.matchers.host_matcher import PairSource
@@ -154,7 +153,7 @@ def make_program(
         got = type(scorers["scores"]).__name__
         raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got {got}; leave with_shift out")
     size = np.asarray(shapes.image_size, np.float32)
-    scorers = with_capacity(scorers, size, size, multiple=BIN_STEP)
+    scorers = fit_capacities(scorers, size, size, multiple=BIN_STEP)
 
     def score(matches: Matches) -> tuple[Array, ...]:
         scores = [jnp.asarray(scorer(matches)) for scorer in scorers.values()]

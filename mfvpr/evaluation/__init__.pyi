@@ -39,18 +39,25 @@ from .confidence import (
     calibration_data,
     confidence_inputs,
     fit_confidence,
+    precision_recall,
     read_confidences,
+    reliability,
     write_confidences,
 )
 from .dataset_ranking import RankedDataset, Recall, rank_dataset
-from .drives import Drive
+from .drives import Drive, DriveFilter
 from .fusion import FinalScore, FrameCorrelation, Fusion
-from .protocol import EvaluationProtocol, Split, evaluation_protocol
-from .rankings import Matched, Ranked
-from .reliability import precision_recall, reliability
-from .selection import Half, best_setting, halves, neighboring_settings, separate
+from .protocol import (
+    EvaluationProtocol,
+    Half,
+    Split,
+    best_setting,
+    evaluation_protocol,
+    halves,
+    neighboring_settings,
+    separate,
+)
+from .rankings import Matched, Ranked, balancing_c, fuse_scales
 from .sequence_matching import match_sequence
-from .sequences import DriveFilter
-from .shortlist_scores import balancing_c, fuse_scales
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

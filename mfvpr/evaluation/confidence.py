@@ -1,12 +1,12 @@
 """Confidence: the probability that the top prediction is correct, from how its score stands out among the others.
 
 A model is fitted on predictions that are known to be correct or incorrect. Differences are in units of the spread of a
-query's scores, so that it can be used for other images.
+query's scores, so that it can be used for other images. Precision, recall and reliability say what it is worth.
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -15,7 +15,6 @@ import scipy  # its subpackages are imported at their first use
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.datasets.ground_truth import Truth
-from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
@@ -29,6 +28,7 @@ _LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which w
 _FORMAT = "mfvpr confidence 2"
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
 _PRIOR = 2  # added candidates of other places, with the variance of all candidates
+BINS = 10  # of probabilities from 0 to 1, by default
 
 
 def confidence_inputs(
@@ -43,48 +43,41 @@ def confidence_inputs(
     retrieval: minus the log of the best rank, from 1, that the retrieval gives to a candidate of the predicted place.
     score: inverse hyperbolic sine of the first score itself, which depends on the scale of scores.
 
-    A larger input means a more confident prediction.
-
-    Args:
-        ranked: of a system.
-        by_retrieval: the ranking of the same candidates by retrieval.
-        inputs: their names.
-        apart: database images within this many rows of the prediction count as its place.
+    A larger input means a more confident prediction. `by_retrieval` ranks the same candidates by retrieval. Database
+    images within `apart` rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores, first = np.where(there, ranked.scores, 0.0).astype(np.float64), ranked.rows[:, :1]
     elsewhere = there & (np.abs(ranked.rows - first) > apart)
-    (count, mean, variance), (_, _, prior) = _moments(scores, elsewhere), _moments(scores, there)
+
+    def moments(where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Number, mean and variance of each query's scores; 0 if there are none."""
+        count = where.sum(axis=1)
+        mean = np.sum(scores, axis=1, where=where) / np.maximum(count, 1)
+        squares = np.sum((scores - mean[:, None]) ** 2, axis=1, where=where)
+        return count, mean, squares / np.maximum(count, 1)
+
+    (count, mean, variance), (_, _, prior) = moments(elsewhere), moments(there)
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
     second = np.max(scores, axis=1, where=elsewhere, initial=-np.inf)
     near = np.abs(by_retrieval.rows - first) <= apart  # the prediction is among them; -1, no candidate, comes last
-    above = {"margin": scores[:, 0] - second, "height": scores[:, 0] - mean}
-    columns = {
-        name: np.where(elsewhere.any(axis=1), np.log1p(np.maximum(value, 0) / spread), np.inf)
-        for name, value in above.items()
-    }
-    columns |= {"retrieval": -np.log1p(np.argmax(near, axis=1)), "score": np.arcsinh(scores[:, 0])}
+    margin, height = (
+        np.where(elsewhere.any(axis=1), np.log1p(np.maximum(scores[:, 0] - other, 0) / spread), np.inf)
+        for other in (second, mean)
+    )
+    retrieval, score = -np.log1p(np.argmax(near, axis=1)), np.arcsinh(scores[:, 0])
+    columns = {"margin": margin, "height": height, "retrieval": retrieval, "score": score}
     return np.where(there[:, :1], np.stack([columns[name] for name in inputs], axis=1), np.nan)
-
-
-def _moments(scores: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number `[Q]`, mean and variance of the scores `[Q, C]`; 0 if there are none."""
-    count = where.sum(axis=1)
-    mean = np.sum(scores, axis=1, where=where) / np.maximum(count, 1)
-    squares = np.sum((scores - mean[:, None]) ** 2, axis=1, where=where)
-    return count, mean, squares / np.maximum(count, 1)
 
 
 @dataclass(frozen=True)
 class Confidence:
-    """A logistic model of the probability that a system's top prediction is correct, see `mfvpr.evaluation`.
+    """A logistic model of the probability that a system's top prediction is correct.
 
     Attributes:
-        inputs: names, see `confidence_inputs`.
-        apart: see `confidence_inputs`.
-        center: mean of each input over the data that the model was fitted on.
-        scale: standard deviation of each input over these data.
+        inputs: names of inputs, see `confidence_inputs`, as for `apart`.
+        center: mean of each input over the data that the model was fitted on; `scale`: standard deviation.
         weights: of the inputs in these units.
         bias: log odds at the center.
         refusals: shares of images without enough evidence for a place (`mfvpr.evaluation.evidence`), of places that the
@@ -122,11 +115,9 @@ def fit_confidence(
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: of `confidence_inputs`; rows that are not finite, without a prediction or without candidates of other
-            places, are left out.
+        values: of `confidence_inputs` with these `inputs` and `apart`; rows that are not finite, without a prediction
+            or without candidates of other places, are left out.
         correct: whether the top prediction is correct; False for queries without a place in the database.
-        inputs: names of the values.
-        apart: with which the values were computed.
 
     Raises:
         InputError: no predictions.
@@ -188,11 +179,7 @@ def calibration_data(ranked: Ranked, by_retrieval: Ranked, truth: Truth, thresho
 
         confidence = calibration_data(by_score, by_retrieval, truth, 2).fit()
 
-    Args:
-        ranked: of a system.
-        by_retrieval: the ranking of the same candidates by retrieval.
-        truth: ground truth of the queries.
-        threshold: largest distance of a correct prediction.
+    `by_retrieval` ranks the same candidates; `threshold` is the largest distance of a correct prediction.
     """
     absent = confidence_inputs(*absent_rankings(ranked, by_retrieval, truth, threshold))
     correct = truth.positives(threshold).contains(ranked.rows)[:, 0]
@@ -206,14 +193,14 @@ def absent_rankings(ranked: Ranked, by_retrieval: Ranked, truth: Truth, threshol
     images to leave out has no candidates: it shows an absent place as it is. Arguments are those of `calibration_data`.
     """
     place = truth.shows_place(AROUND * max(threshold, 1))
-    return _leave_out(ranked, place), _leave_out(by_retrieval, place)
 
+    def leave_out(ranked: Ranked) -> Ranked:
+        is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
+        order = np.argsort(is_left_out, axis=1, kind="stable")
+        rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
+        return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
 
-def _leave_out(ranked: Ranked, place: Positives) -> Ranked:
-    is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
-    order = np.argsort(is_left_out, axis=1, kind="stable")
-    rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
-    return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
+    return leave_out(ranked), leave_out(by_retrieval)
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
@@ -221,40 +208,124 @@ def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recip
 
     An earlier file of confidences is replaced; an InputError for other files.
     """
-    values = {name: vars(confidence) for name, confidence in systems.items()}
     require_replaceable(Path(path), _FORMAT.encode())
+    values = {name: vars(confidence) for name, confidence in systems.items()}
     content = {"format": _FORMAT, "made": recipe, "systems": values}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str, Any]]:
     """Read the file of `write_confidences`: confidences by name of the system, and the recipe."""
-    path = Path(path)
-    expected = "the confidence.json that an evaluation wrote"
+    path, expected = Path(path), "the confidence.json that an evaluation wrote"
     require_file(path, expected)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
             raise ValueError(f"format {content['format']!r}")
-        systems = {name: confidence_from_json(values) for name, values in content["systems"].items()}
-        return systems, dict(content["made"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        return {name: confidence_from_json(each) for name, each in content["systems"].items()}, dict(content["made"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected {expected} ({reason}); evaluate with ground truth to make one") from error
 
 
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
-    """The confidence whose `vars` were written as JSON; a TypeError or ValueError for anything else."""
-    vectors = {name: tuple(values[name]) for name in ("inputs", "center", "scale", "weights")}
-    confidence = Confidence(**{"refusals": REFUSALS, **values, **vectors})
-    numbers = [confidence.bias, *confidence.center, *confidence.scale, *confidence.weights]
-    on, off = refusals = tuple(confidence.refusals)
-    is_known = {*confidence.inputs} <= {*get_args(Input)} and len({*confidence.inputs}) == len(confidence.inputs)
-    if not is_known or len({*map(len, vectors.values())}) > 1:
-        raise ValueError("inputs that are not known")
-    if any(isinstance(number, bool) for number in (*numbers, on, off, confidence.apart)):
-        raise ValueError("values that are no numbers")
-    is_fitted = np.isfinite(numbers).all() and min(confidence.scale, default=0) > 0 and min(confidence.weights) >= 0
-    if not (is_fitted and type(confidence.apart) is int and confidence.apart >= 0 and 0 < on <= 1 and 0 < off <= 1):
+    """The confidence whose `vars` were written as JSON; a TypeError or ValueError for values that make no model."""
+    vectors = {name: tuple(values[name]) for name in ("inputs", "center", "scale", "weights", "refusals")}
+    confidence = Confidence(**{**values, **vectors})
+    numbers = np.array([confidence.center, confidence.scale, confidence.weights], float)
+    is_known = {*confidence.inputs} <= {*get_args(Input)} and numbers.shape[1] == len(confidence.inputs)
+    is_fitted = np.isfinite(numbers).all() and np.isfinite(confidence.bias) and min(confidence.scale) > 0
+    if not (is_known and is_fitted):
         raise ValueError("values that make no model")
-    return replace(confidence, refusals=refusals)
+    return confidence
+
+
+class PrecisionRecall(NamedTuple):
+    """Precision and recall if only queries with a confidence of at least a threshold have a prediction."""
+
+    thresholds: Float[np.ndarray, " thresholds"]  # the distinct confidences of the predictions, descending
+    precision: Float[np.ndarray, " thresholds"]  # fraction of the predictions that are correct
+    recall: Float[np.ndarray, " thresholds"]  # correct predictions, as a fraction of the queries with positives
+
+    @property
+    def average_precision(self) -> float:
+        """Sum of P_n (R_n - R_n-1): the mean precision over recalls from 0 to 1, 0 for recalls that are not reached."""
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
+
+    def recall_at(self, precision: float) -> float:
+        """The highest recall with at least a precision; 0 if there is none."""
+        return float(np.max(self.recall, where=self.precision >= precision, initial=0.0))
+
+
+class Reliability(NamedTuple):
+    """Predictions in bins of equal width of their probabilities, from 0 to 1."""
+
+    probability: Float[np.ndarray, " bins"]  # mean, NaN in an empty bin
+    correct: Float[np.ndarray, " bins"]  # fraction of correct predictions, NaN in an empty bin
+    count: Int[np.ndarray, " bins"]  # of predictions
+
+    @property
+    def calibration_error(self) -> float:
+        """Expected calibration error: mean of |probability - fraction of correct ones| over all predictions, or NaN."""
+        if not self.count.any():
+            return float("nan")
+        return float(np.nansum(self.count * np.abs(self.probability - self.correct)) / self.count.sum())
+
+
+def precision_recall(
+    confidence: Float[np.ndarray, " queries"],
+    correct: Bool[np.ndarray, " queries"],
+    has_positives: Bool[np.ndarray, " queries"] | None = None,
+) -> PrecisionRecall:
+    """Precision and recall of top predictions at every threshold.
+
+    Args:
+        confidence: any number that is larger for more confident predictions; NaN without a prediction.
+        correct: whether the top prediction is correct.
+        has_positives: queries with positives in the database; None = all. A prediction for another query is incorrect
+            and lowers the precision.
+
+    Raises:
+        InputError: a correct prediction for a query without positives.
+    """
+    confidence, correct = np.asarray(confidence, np.float64), np.asarray(correct, bool)
+    has_positives = np.ones(len(correct), bool) if has_positives is None else np.asarray(has_positives, bool)
+    if np.any(correct & ~has_positives):
+        expected = "no correct predictions for queries without positives. Take both from one ground truth."
+        raise InputError(f"correct: expected {expected}")
+    order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
+    thresholds, hits = confidence[order], np.cumsum(correct[order])
+    # Equal confidences, also infinite ones, share a threshold.
+    last = np.flatnonzero(np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1)))
+    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(has_positives.sum(), 1))
+
+
+def reliability(
+    probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"], *, bins: int = BINS
+) -> Reliability:
+    """Compare probabilities with the fractions of correct predictions; NaN probabilities are left out."""
+    there = ~np.isnan(probability)
+    probability, correct = probability[there], np.asarray(correct, bool)[there]
+    place = _bin_numbers(probability, bins)
+    count = np.bincount(place, minlength=bins)
+    divisor = np.where(count > 0, count, np.nan)
+    mean, share = (np.bincount(place, weights=values, minlength=bins) / divisor for values in (probability, correct))
+    return Reliability(mean, share, count)
+
+
+def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> float:
+    """Expected `calibration_error` of perfectly calibrated probabilities, which is above 0 for few queries; exact."""
+    probability = probability[~np.isnan(probability)]
+    if not len(probability):
+        return float("nan")
+    place, distance = _bin_numbers(probability, BINS), 0.0
+    for number in range(BINS):
+        inside, chances = probability[place == number], np.ones(1)  # of 0 ... correct predictions in the bin
+        for value in inside:
+            chances = np.convolve(chances, (1 - value, value))
+        distance += chances @ np.abs(np.arange(len(chances)) - inside.sum())
+    return float(distance / len(probability))
+
+
+def _bin_numbers(probability: np.ndarray, bins: int) -> np.ndarray:
+    return np.clip((probability * bins).astype(int), 0, bins - 1)

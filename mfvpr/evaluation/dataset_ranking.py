@@ -10,7 +10,7 @@
 Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,8 +24,8 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import Matched, Ranked
 from mfvpr.evaluation.sequence_matching import match_sequence
+from mfvpr.evaluation.stages import require_finite
 from mfvpr.evaluation.system import System, folders_of
-from mfvpr.evaluation.validation import score_warnings
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
@@ -173,3 +173,18 @@ def rank_dataset(
     for line in score_warnings(matched, systems, system.scorers):
         cache.warn(line)
     return RankedDataset(dataset, system, matched, systems, watch.seconds)
+
+
+def score_warnings(
+    matched: Sequence[Matched], systems: Mapping[str, Sequence[Ranked]], scorers: Iterable[str]
+) -> Iterator[str]:
+    """Warnings of NaN and infinite scores of every sequence; see also `require_finite`."""
+    for name in scorers:
+        require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
+    for number, sequence in enumerate(matched):
+        for name, rankings in systems.items():
+            values = rankings[number].scores[rankings[number].rows >= 0]
+            if count := int(np.isnan(values).sum()):
+                yield f"{sequence.sequence.name}: {count} scores of {name} are NaN, and rank last"
+            if count := int(np.isinf(values).sum()):
+                yield f"{sequence.sequence.name}: {count} scores of {name} are infinite"

@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Shortlist
-from mfvpr.evaluation.rankings import FRAMES, RETRIEVAL, Ranked
-from mfvpr.evaluation.sequences import DriveFilter
-from mfvpr.evaluation.shortlist_scores import (
+from mfvpr.evaluation.drives import DriveFilter
+from mfvpr.evaluation.rankings import (
+    FRAMES,
+    RETRIEVAL,
+    Ranked,
     RetrievalScore,
     Scores,
     Ties,
@@ -33,7 +35,7 @@ class Fusion:
             sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
             equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
             the same unit for every query. A score that is not finite affects only its own candidate.
-        retrieval_score: kind of retrieval score, see `mfvpr.evaluation.shortlist_scores.retrieval_scores`.
+        retrieval_score: kind of retrieval score, see `mfvpr.evaluation.rankings.retrieval_scores`.
         weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
             and of further scorers, which take part only if they are named here.
     """

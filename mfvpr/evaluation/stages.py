@@ -4,31 +4,146 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
+from threading import Lock
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
-from mfvpr.core.batch import BIN_STEP
+from mfvpr.core.batch import BIN_STEP, score_settings
 from mfvpr.core.histogram import HistogramOfShifts, ShiftHistogram
-from mfvpr.core.parameters import with_capacity
+from mfvpr.core.scorer import (
+    Scorer,
+    check_host,
+    fit_capacities,
+    on_host,
+    require_scores,
+    score_pairs,
+    with_static_functions,
+)
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
-from mfvpr.evaluation.batched_scoring import score
+from mfvpr.evaluation.rankings import Scores, fuse_scales
 from mfvpr.features.feature_set import FeatureSet, memory_budget
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
-from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales
+from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
 from mfvpr.storage.match_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, at_least_single, compiled, device_of
+from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
+from mfvpr.utils.threads import ordered_map
+
+PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
+
+
+def score(
+    scorers: Mapping[str, Scorer],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    *,
+    runtime: Runtime = DEFAULT_RUNTIME,
+) -> dict[str, Scores]:
+    """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
+
+    All scorers together are one program for each shape of a batch, which is reused for other parameter values
+    (histograms: up to the next multiple of 8 bins). Several scales are scored one by one and fused. The devices of
+    `runtime` share the batches, without effect on the bits of the scores.
+    """
+    if not scorers:
+        return {}
+    for scorer in scorers.values():
+        check_host(scorer)
+    num_queries, sets = len(candidates.mask), scales(match_set)
+    size = queries_that_fit(match_set, len(scorers))
+    parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
+    fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
+    scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
+
+    def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
+        for part in parts:
+            part_batches = all_batches(match_set, part, settings=1)
+            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=runtime.devices):
+                yield part, places, values
+
+    total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
+    for part, places, values in runtime.progress("scores")(score_parts(), total):
+        scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
+        for name, pair_scores in values.items():
+            scores[name][scale, part.start + query, place] = pair_scores
+    fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
+    return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
+
+
+def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
+    """`match_set.batches` of q queries at every scale; positions are in the flattened `[S, q, C]`."""
+    for scale, scale_set in enumerate(scales(match_set)):
+        pairs = len(queries) * scale_set.counts.shape[1]
+        for places, matches in batches(scale_set, queries, settings=settings):
+            yield scale * pairs + places, matches
+
+
+def run_batches(
+    program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
+) -> Iterator[tuple[np.ndarray, Any]]:
+    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy; devices take turns.
+
+    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`.
+    """
+    to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
+    device_inputs = [put(inputs) for put in to_device]
+    compiled_shapes: set[tuple] = set()
+    compiling: dict[tuple, Lock] = {}
+
+    def run_batch(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
+        number, (places, matches) = numbered
+        device = number % len(to_device)
+        key = device, matches.mask.shape
+        # The first batch of a shape compiles; batches of the same shape wait for it.
+        with nullcontext() if key in compiled_shapes else compiling.setdefault(key, Lock()):
+            values = program(to_device[device](matches), *device_inputs[device])
+        compiled_shapes.add(key)
+        return places, jax.tree.map(lambda leaf: np.asarray(leaf)[..., : len(places)], values)
+
+    # A batch keeps only one core busy, so that one batch per core runs at the same time.
+    workers = max(available_cpus(), len(to_device))
+    run_all = partial(ordered_map, workers=workers) if knows_own_context() else map
+    return iter(run_all(run_batch, enumerate(batches)))
+
+
+def fuse_all(
+    match_set: MatchSet | Scales,
+    scores: Num[np.ndarray, "scales *batch queries candidates"],
+    mask: Bool[np.ndarray, "queries candidates"],
+) -> Float[np.ndarray, "*batch queries candidates"]:
+    """Fused scores of all scales."""
+    if not isinstance(match_set, Scales):
+        return scores[0]
+    weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
+    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
+
+
+def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    host_scorers = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
+    scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in host_scorers})
+    return scores | {name: score_pairs(scorer, matches) for name, scorer in host_scorers.items()}
+
+
+@compiled
+def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+    scores = {name: score_settings(scorer, matches, {}, {})[0, 0] for name, scorer in scorers.items()}
+    for name, values in scores.items():
+        require_scores(name, values, len(matches.mask))
+    return scores
+
 
 __all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
 
@@ -48,7 +163,6 @@ def match(
     matcher: Matcher | PairSource = NEIGHBORS,
     *,
     store: MatchStore | None = None,
-    rows: Sequence[int] | None = None,
     runtime: Runtime = DEFAULT_RUNTIME,
 ) -> MatchSet:
     """Match every query with its candidates. Matches of compiled matchers include their ratio, which some weights use.
@@ -60,50 +174,44 @@ def match(
         matcher: of one pair; one that runs on the host takes no part in a cluster.
         store: of these features, candidates and matcher. Queries that it lacks, or has with other candidates, are
             matched and written in small batches; the result is read from it.
-        rows: of the queries that are matched and returned; None = all.
         runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
         InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
     """
     if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
-        _require_same_dimensions(queries, database)
-    sides, requested = (queries, database, candidates), range(len(queries)) if rows is None else rows
+        is_known = (queries.counts > 0).any() and (database.counts > 0).any()
+        if is_known and queries.dimension != database.dimension:
+            got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
+            raise InputError(f"features: expected as many dimensions on both sides, got {got}")
+    is_on_host = isinstance(matcher, PairSource)
+    runtime = replace(runtime, cluster=None) if store is None or is_on_host else runtime
     limits = runtime.memory, runtime.devices
+    if runtime.cluster is not None:
+        limits = runtime.memory or WORKER_MEMORY, None
+    shared = queries, database, candidates, matcher, limits
     if store is None:
-        results = replace(runtime, cluster=None).map(
-            _match_queries, (*sides, matcher, limits), requested, "matching", batched.QUERIES
-        )
+        results = runtime.map(_match_queries, shared, range(len(queries)), "matching", batched.QUERIES)
         matched = [query for _, query in results]
-        shape = len(matched), candidates.indices.shape[1]
-        counts = np.array([query.counts for query in matched], np.int32).reshape(shape)
+        counts = np.array([query.counts for query in matched], np.int32).reshape(candidates.indices.shape)
         return MatchSet.of([query.matches for query in matched], counts)
     missing = [
         row
-        for row, query in store.read(requested)
+        for row, query in store.read(range(len(queries)))
         if query is None or not np.array_equal(query.indices, candidates.indices[row])
     ]
     if missing:
-        if isinstance(matcher, PairSource):
-            runtime = replace(runtime, cluster=None)
-        if runtime.cluster is not None:
-            limits = runtime.memory or WORKER_MEMORY, None
-        results = runtime.map(_match_queries, (*sides, matcher, limits), missing, "matching", batched.QUERIES)
-        together = 1 if isinstance(matcher, PairSource) else STORE_BATCH  # on the host, a query may take minutes
+        results = runtime.map(_match_queries, shared, missing, "matching", batched.QUERIES)
+        together = 1 if is_on_host else STORE_BATCH  # on the host, a query may take minutes
         while batch := dict(itertools.islice(results, together)):
             store.write(batch)
-    if (stored := stored_matches(store, rows, memory=runtime.memory)) is None:
+    if (stored := stored_matches(store, memory=runtime.memory)) is None:
         raise InputError(f"{store.folder}: matches were removed or damaged meanwhile; run again")
     return stored[0]
 
 
 def _match_queries(
-    queries: Any,
-    database: Any,
-    candidates: Shortlist,
-    matcher: Matcher | PairSource,
-    limits: Limits,
-    rows: Sequence[int],
+    queries: Any, database: Any, candidates: Shortlist, matcher: Any, limits: Limits, rows: Sequence[int]
 ) -> Iterator[tuple[int, QueryMatches]]:
     """(row, matches) of queries, in the order of `rows`, within limits of memory and devices."""
     sides, (memory, devices) = (queries, database, candidates), limits
@@ -112,20 +220,12 @@ def _match_queries(
     return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
 
 
-def _require_same_dimensions(queries: FeatureSet, database: FeatureSet) -> None:
-    if (queries.counts > 0).any() and (database.counts > 0).any() and queries.dimension != database.dimension:
-        got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
-        raise InputError(f"features: expected as many dimensions on both sides, got {got}")
-
-
-def stored_matches(
-    store: MatchStore, rows: Sequence[int] | None = None, *, memory: float | None = None
-) -> tuple[MatchSet, Shortlist] | None:
+def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist] | None:
     """Matches and shortlist from a store, NumPy; None if some are missing or damaged.
 
     Matches of more than `memory` GB (None: a third of what is free) stay on disk.
     """
-    rows, matches, shortlist = range(store.num_queries) if rows is None else rows, list[Matches](), list[Any]()
+    rows, matches, shortlist = range(store.num_queries), list[Matches](), list[Any]()
     left = memory_budget(memory, jax.local_devices(backend="cpu")[:1])
     for _, query in store.read(rows):
         if query is None:
@@ -154,7 +254,7 @@ class Explanation:
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
-    fitted = with_capacity(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
     return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
 
 
@@ -179,7 +279,7 @@ def dominant_shifts(
         query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they
         refer.
     """
-    fitted = with_capacity(scorer, *match_set.image_sizes, multiple=BIN_STEP)
+    fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
         part = slice(start, min(start + SHIFTS_AT_ONCE, len(queries)))
@@ -217,3 +317,10 @@ def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Ar
         return votes, shift, (low + high)[None] / 2 + jnp.stack([-half, half])
 
     return jax.vmap(of_pair)(matches)
+
+
+def require_finite(name: str, scores: np.ndarray) -> None:
+    """Raise an InputError if every score of a scorer is NaN, infinite, or 0, the score of pairs without matches."""
+    if not np.isfinite(scores).all() and not scores[np.isfinite(scores)].any():
+        fix = "check what the scorer expects of features and sizes"
+        raise InputError(f"{name}: every score of a pair that has matches is NaN or infinite; {fix}")

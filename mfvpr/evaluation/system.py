@@ -11,16 +11,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.parameters import check_bounds
-from mfvpr.core.scorer import Scorer
+from mfvpr.core.scorer import Scorer, check_bounds
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.image_reading import read_size, resize, shape_size
 from mfvpr.evaluation import stages
+from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
-from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.sequences import DriveFilter
-from mfvpr.evaluation.shortlist_scores import Ties
+from mfvpr.evaluation.rankings import RETRIEVAL, Ties
 from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift

@@ -10,11 +10,9 @@ from jaxtyping import Float
 
 from mfvpr.core.batch import BIN_STEP, score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import Scorer, require_scores
+from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Features, Matches
-from mfvpr.evaluation.stages import pair_shifts
-from mfvpr.evaluation.validation import require_finite
+from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
@@ -89,7 +87,7 @@ def shift_of(
     scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
     if scorer is None:
         return None, None
-    histogram = with_capacity(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    histogram = fit_capacities(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
     shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
     stretch = np.divide(size, np.asarray(pair.image_size0)[0])
     shift, interval = stretch * shift, stretch * interval

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mfvpr.core.matching import at_least_one, distance_ratio, make_matches, slot_numbers
-from mfvpr.core.nearest import lines_of, nearest, ready
+from mfvpr.core.nearest import largest_of, lines_of, ready
 from mfvpr.core.types import Features, Matches, short_repr, value
 from mfvpr.matchers.matcher import CHUNK_SIZE
 from mfvpr.networks.lightglue_assignment import Packed, assignment
@@ -82,7 +82,7 @@ class LightGlueMatcher:
                     "features that its weights are for"
                 )
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
-        best1, best0 = nearest(lines_of(assigned, axis=1)), nearest(lines_of(assigned, axis=0))
+        best1, best0 = largest_of(lines_of(assigned, axis=1)), largest_of(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)
         mutual = best0.index[best1.index] == slot_numbers(features0)
         real = mutual & (confidence > self.filter_threshold) & (best1.similarity > -jnp.inf)

@@ -14,16 +14,19 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
 from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.confidence import CalibrationData, Confidence, absent_rankings, calibration_data
-from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
-from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
-from mfvpr.evaluation.reliability import (
+from mfvpr.evaluation.confidence import (
+    CalibrationData,
+    Confidence,
     PrecisionRecall,
+    absent_rankings,
+    calibration_data,
     chance_calibration_error,
     precision_recall,
     reliability,
 )
-from mfvpr.evaluation.selection import Half, halves, halves_of_map
+from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
+from mfvpr.evaluation.protocol import Half, halves, halves_of_map
+from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError

@@ -20,7 +20,7 @@ from mfvpr.core.types import Matches
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation.reliability import reliability
+from mfvpr.evaluation.confidence import reliability
 from mfvpr.evaluation.stages import Explanation, explain
 from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization

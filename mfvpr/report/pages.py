@@ -13,8 +13,8 @@ from jaxtyping import Bool, Int
 
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.reliability import PrecisionRecall
 from mfvpr.evaluation.statistics import Estimate, estimate
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.rendering import (

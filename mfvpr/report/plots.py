@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.evaluation.reliability import Reliability
+from mfvpr.evaluation.confidence import Reliability
 from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
 
 COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light

@@ -13,7 +13,7 @@ from mfvpr.baselines import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
-from mfvpr.core.parameters import parameters_of
+from mfvpr.core.scorer import parameters_of
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System

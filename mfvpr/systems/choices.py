@@ -12,7 +12,7 @@ from typing import Any, Literal
 from mfvpr import features
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
-from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
+from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
 from mfvpr.io.checks import Lengths
 from mfvpr.matchers import LightGlueMatcher, NearestNeighborMatcher

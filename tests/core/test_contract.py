@@ -25,8 +25,7 @@ from mfvpr import (
     score_candidates,
     score_grid,
 )
-from mfvpr.core.parameters import with_capacity
-from mfvpr.core.scorer import with_static_functions
+from mfvpr.core.scorer import fit_capacities, with_static_functions
 from mfvpr.utils import InputError
 from tests.builders import SIZE, per_match, random_matches, stack
 from tests.core import batches
@@ -44,7 +43,7 @@ SIZES = np.array([SIZE, SIZE], np.float32)
 
 def fit(scorer):
     """The scorer with the capacity that the tests' images need."""
-    return with_static_functions(with_capacity(scorer, SIZES, SIZES))
+    return with_static_functions(fit_capacities(scorer, SIZES, SIZES))
 
 
 def score(scorer, matches):

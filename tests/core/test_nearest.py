@@ -9,7 +9,7 @@ import pytest
 
 from mfvpr.core import nearest as nearest_module
 from mfvpr.core.checked import count_from
-from mfvpr.core.nearest import lines_of, nearest, without
+from mfvpr.core.nearest import largest_of, lines_of, without
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
@@ -18,9 +18,9 @@ pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 def two_of(values, axis):
     """The nearest and the second nearest of all lines, and the number of entries that are at least as near."""
     lines = lines_of(values, axis)
-    first = nearest(lines)
+    first = largest_of(lines)
     rest = without(lines, first.index)
-    second = nearest(rest)
+    second = largest_of(rest)
     return first, second, count_from(lines, first, first.similarity), count_from(lines, first, second.similarity)
 
 

@@ -19,8 +19,8 @@ from mfvpr.datasets.streets.camera import (
     plan_return,
     visible_points,
 )
-from mfvpr.datasets.streets.sheets import Sheet, texture
-from mfvpr.datasets.streets.weather import WEATHERS, fall_rain
+from mfvpr.datasets.streets.drawing import fall_rain
+from mfvpr.datasets.streets.sheets import WEATHERS, Sheet, texture
 
 pytestmark = pytest.mark.thorough
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.evaluation import shortlist_scores, stages
+from mfvpr.evaluation import rankings, stages
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers import match_set as match_sets
 from mfvpr.tuning import sweeps
@@ -50,7 +50,7 @@ def devices_agree():
     """Runs in a process with 8 devices."""
     import jax
 
-    from mfvpr.evaluation import batched_scoring
+    from mfvpr.evaluation import stages
 
     match_sets.PAIRS_STEP = match_sets.BATCH_SLOTS = 2  # pairs of a batch
     match_set, candidates = make_set()
@@ -62,8 +62,8 @@ def devices_agree():
         placed.append((matches.mask.shape, *matches.mask.devices()))
         return matches.mask.sum(axis=1)
 
-    batches = batched_scoring.all_batches(match_set, range(QUERIES), settings=1)
-    for places, counts in batched_scoring.run_batches(program, (), batches, devices=devices):
+    batches = stages.all_batches(match_set, range(QUERIES), settings=1)
+    for places, counts in stages.run_batches(program, (), batches, devices=devices):
         np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
@@ -118,9 +118,7 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tm
         listed = replace(candidates, mask=seen)
         for rows, setting in zip(by_setting, settings, strict=True):
             scores = stages.score({"sum": mfvpr.AggregatedScore(mean=setting["mean"])}, scales, listed)["sum"]
-            order = shortlist_scores.rank_shortlist(
-                listed, shortlist_scores.fuse_shortlist(listed, scores, setting["c"])
-            )
+            order = rankings.rank_shortlist(listed, rankings.fuse_shortlist(listed, scores, setting["c"]))
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
 

@@ -156,17 +156,14 @@ def test_what_is_written_is_read(rankings, tmp_path):
 
 def broken(**changes):
     confidence = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
-    return {"format": "mfvpr confidence 2", "made": {}, "systems": {"histogram": confidence | changes}}
+    content = {"histogram": confidence | {"refusals": [0.2, 0.5]} | changes}
+    return json.dumps({"format": "mfvpr confidence 2", "made": {}, "systems": content})
 
 
 @pytest.mark.parametrize(
     "content",
-    ["", "[]", '{"format": 3}', *(json.dumps(broken(**changes)) for changes in (
-        {"inputs": ["else"]}, {"center": [0, 1]}, {"scale": [0]}, {"bias": float("nan")}, {"weights": ["a"]},
-        {"weights": ["1_0"]}, {"scale": "1"}, {"center": [True]}, {"bias": "0"}, {"center": [10**400]},
-        {"more": [1]}, {"apart": -1}, {"bias": None}, {"apart": 2.5}, {"apart": True}, {"weights": [-1.0]},
-        {name: values * 2 for name, values in broken()["systems"]["histogram"].items() if isinstance(values, list)})),
-     '{"format": "mfvpr confidence 2", "made": ' + "[" * 100_000 + "]" * 100_000 + "}"],
+    ["", "[]", '{"format": 3}', broken(inputs=["else"]), broken(center=[0, 1]), broken(scale=[0]), broken(more=[1]),
+     broken(bias=float("nan")), broken(weights=["a"]), broken(bias=None)],
 )  # fmt: skip
 def test_other_files_are_refused_in_one_line(content, tmp_path):
     path = tmp_path / "confidence.json"

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mfvpr.evaluation import drives
-from mfvpr.evaluation.drives import Drive, Evidence
+from mfvpr.evaluation.drives import LAG, Drive, DriveFilter, Evidence, follow
 from mfvpr.evaluation.rankings import Ranked
-from mfvpr.evaluation.sequences import LAG, DriveFilter, follow
 from mfvpr.utils import InputError
 
 SPEEDS = (-1, 1, 2)

@@ -10,7 +10,7 @@ from mfvpr import datasets
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import FrameCorrelation, Fusion, match_sequence, stages
 from mfvpr.evaluation.fusion import final_scores, rank_by_scores
-from mfvpr.evaluation.shortlist_scores import rank_shortlist
+from mfvpr.evaluation.rankings import rank_shortlist
 from tests import oracles
 from tests.builders import evaluate_parts
 from tests.evaluation.conftest import SCORERS, SIFT, VLAD

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets import Positives
-from mfvpr.evaluation.selection import places_along_path
+from mfvpr.evaluation.protocol import places_along_path
 from mfvpr.evaluation.statistics import path_test
 
 PLACES = 60

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mfvpr.evaluation import precision_recall, reliability
-from mfvpr.evaluation.reliability import chance_calibration_error
+from mfvpr.evaluation.confidence import chance_calibration_error
 from mfvpr.utils import InputError
 
 

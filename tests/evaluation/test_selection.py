@@ -6,7 +6,7 @@ import pytest
 from mfvpr import frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives
 from mfvpr.evaluation import best_setting, halves, neighboring_settings
-from mfvpr.evaluation.selection import halves_of_map
+from mfvpr.evaluation.protocol import halves_of_map
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 3])

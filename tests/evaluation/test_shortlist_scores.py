@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mfvpr import Shortlist, balancing_c, combine, rank
 from mfvpr.evaluation import Fusion
-from mfvpr.evaluation.shortlist_scores import fuse, fuse_scales, fuse_shortlist, retrieval_scores
+from mfvpr.evaluation.rankings import fuse, fuse_scales, fuse_shortlist, retrieval_scores
 from tests import oracles
 
 pytestmark = pytest.mark.thorough

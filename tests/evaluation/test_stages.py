@@ -10,7 +10,7 @@ from PIL import Image
 import mfvpr
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import image_folder
-from mfvpr.evaluation import shortlist_scores, stages
+from mfvpr.evaluation import rankings, stages
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.matchers import match_set as match_sets
@@ -85,8 +85,7 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
 
 def test_matches_of_another_shortlist_or_that_are_damaged_are_made_again(features, candidates, matches, tmp_path):
     store, other = open_store(tmp_path), replace(candidates, indices=candidates.indices[:, ::-1].copy())
-    stages.match(features[1], features[0], candidates, store=store, rows=range(5))
-    assert stages.stored_matches(store) is None
+    stages.match(features[1], features[0], candidates, store=store)
     stages.match(features[1], features[0], other, store=store)
     np.testing.assert_array_equal(stages.stored_matches(store)[1].indices, other.indices)
     assert_same_match_sets(stages.match(features[1], features[0], candidates, store=store), matches)
@@ -122,7 +121,7 @@ def test_skipped_images_are_listed_and_never_shortlisted(small_street, tmp_path)
         assert values[0, 0] == values[0, 1] > 0
         assert values[0, 2] == 0.0  # no keypoints, no matches
         assert np.isnan(values[0, 3:]).all()
-        np.testing.assert_array_equal(shortlist_scores.rank_shortlist(candidates, values)[0], range(5))
+        np.testing.assert_array_equal(rankings.rank_shortlist(candidates, values)[0], range(5))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

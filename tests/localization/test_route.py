@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mfvpr.evaluation.drives import Evidence
+from mfvpr.evaluation.drives import Evidence, follow
 from mfvpr.evaluation.rankings import Ranked
-from mfvpr.evaluation.sequences import follow
 from mfvpr.localization import Alternative, Drive, Prediction, Route, route
 from mfvpr.utils import InputError
 

@@ -19,7 +19,7 @@ from mfvpr import Matches
 from mfvpr.core import filter_matches
 from mfvpr.core.types import Shortlist, per_match, per_pair
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.shortlist_scores import rank_shortlist
+from mfvpr.evaluation.rankings import rank_shortlist
 from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matchers import MatchSet, NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched

@@ -1,15 +1,13 @@
 """The pinhole camera, its drives down the street, and the shifts of the scene between two images."""
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mfvpr.datasets.streets.weather import Floats, Rng
+from mfvpr.datasets.streets.sheets import Floats, Rng
 
 NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 CAMERA_HEIGHT = 1.6  # meters
@@ -142,13 +140,3 @@ def image_shift(points: Float[np.ndarray, "points 3"], query: Camera, database: 
     (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
     x, y = np.median((after - before)[inside_query & inside_database], axis=0)
     return float(x), float(y)
-
-
-def write_ground_truth(path: Path, facades: Iterable[Facade], queries: list[Camera], database: list[Camera]) -> None:
-    """Write the pairs of frames and their shifts in px; see `draw_streets`."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("query", "database", "shift_x", "shift_y"))
-        for i, (query, candidate) in enumerate(zip(queries, database, strict=True)):
-            shift = image_shift(visible_points(facades, query), query, candidate)
-            writer.writerow((f"{i:04d}.png", f"{i:04d}.png", *(f"{s:.3f}" for s in shift)))

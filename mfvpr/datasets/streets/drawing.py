@@ -16,14 +16,13 @@ from mfvpr.datasets.streets.camera import (
     NEAR,
     SPACING,
     Camera,
+    image_shift,
     plan_drives,
     plan_return,
-    write_ground_truth,
+    visible_points,
 )
-from mfvpr.datasets.streets.objects import traffic
-from mfvpr.datasets.streets.scene import Scene, build_scene
-from mfvpr.datasets.streets.sheets import Panel, Prop
-from mfvpr.datasets.streets.weather import WEATHERS, Floats, Image, Weather, expose
+from mfvpr.datasets.streets.scene import Scene, build_scene, traffic
+from mfvpr.datasets.streets.sheets import WEATHERS, Floats, Image, Panel, Prop, Rng, Weather
 from mfvpr.utils.numerics import available_cpus
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
@@ -125,7 +124,11 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Pro
     for drive in drives:
         drive.folder.mkdir()
         if drive.ground_truth is not None:
-            write_ground_truth(drive.ground_truth, scene.facades, drive.cameras, drives[0].cameras)
+            lines = ["query,database,shift_x,shift_y"]
+            for row, (query, candidate) in enumerate(zip(drive.cameras, drives[0].cameras, strict=True)):
+                x, y = image_shift(visible_points(scene.facades, query), query, candidate)
+                lines.append(f"{row:04d}.png,{row:04d}.png,{x:.3f},{y:.3f}")
+            drive.ground_truth.write_text("\n".join(lines) + "\n", newline="\r\n")
     # All drives in turn, so that threads rarely need the textures of one weather at the same time.
     shots = [(drive, row) for row in range(len(drives[0].cameras)) for drive in drives]
     pool = ThreadPoolExecutor(available_cpus())  # more would only wait for each other
@@ -220,3 +223,50 @@ def clip_outline(homography: Floats) -> Floats | None:
         if (corner[2] > NEAR) != (following[2] > NEAR):
             outline.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
     return np.array([point[:2] / point[2] for point in outline]) if outline else None
+
+
+def expose(image: Image, weather: Weather, rng: Rng) -> Image:
+    """The image with all effects of its weather; a few frames are much worse than the rest."""
+    seen = image.astype(np.float32)
+    # Heavy-tailed: below 1 in six of ten frames, above 10 in one of ten.
+    severity = min(rng.exponential() ** 3, 20.0) * image.shape[1] / 448
+    if weather.motion:  # long exposures blur along the turn
+        seen = cv2.blur(seen, (1 + int(weather.motion * severity), 1))
+    if weather.bloom:  # a glow around bright lights, as from a lens
+        small = cv2.resize(seen, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        bright = np.maximum(small - 150, 0)
+        spread = 0.6 * cv2.GaussianBlur(bright, (0, 0), 2) + 0.9 * cv2.GaussianBlur(bright, (0, 0), 7)
+        seen = seen + weather.bloom * cv2.resize(spread, seen.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    defocus = weather.defocus + weather.drops * severity
+    if weather.defocus_spread:
+        defocus += weather.defocus_spread * rng.random()
+    if defocus:
+        seen = cv2.GaussianBlur(seen, (0, 0), defocus)
+    if weather.flakes:
+        seen = fall_snow(seen, int(rng.uniform(0.5, 1.5) * weather.flakes), rng)
+    if weather.streaks:
+        seen = fall_rain(seen, int(rng.uniform(0.5, 1.5) * weather.streaks), rng)
+    seen += weather.noise * rng.standard_normal(seen.shape, np.float32)
+    return np.clip(seen, 0, 255).astype(np.uint8)
+
+
+def fall_snow(image: Floats, count: int, rng: Rng) -> Floats:
+    """The image with `count` flakes of several sizes in front."""
+    height, width = image.shape[:2]
+    flakes = np.zeros((height, width), np.uint8)
+    for x, y, radius in rng.uniform((0, 0, width / 1100), (width, height, width / 240), (count, 3)):
+        center = (round(x * 16), round(y * 16))
+        cv2.circle(flakes, center, round(radius * 16), int(rng.integers(70, 180)), -1, cv2.LINE_AA, 4)
+    share = cv2.GaussianBlur(flakes, (0, 0), 0.8).astype(np.float32)[..., None] / 255
+    return image + share * (245 - image)
+
+
+def fall_rain(image: Floats, count: int, rng: Rng) -> Floats:
+    """The image with `count` streaks of several lengths in front, all blown to the same side."""
+    height, width = image.shape[:2]
+    streaks, slant = np.zeros((height, width), np.uint8), rng.uniform(-0.3, 0.3)
+    for x, y, length in rng.uniform((0, 0, width / 60), (width, height, width / 14), (count, 3)):
+        start, end = (round(x * 16), round(y * 16)), (round((x + slant * length) * 16), round((y + length) * 16))
+        cv2.line(streaks, start, end, int(rng.integers(40, 120)), 1, cv2.LINE_AA, 4)
+    share = cv2.GaussianBlur(streaks, (0, 0), 0.6).astype(np.float32)[..., None] / 255
+    return image + share * (image.mean() + 60 - image)

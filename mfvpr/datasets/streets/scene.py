@@ -1,20 +1,95 @@
-"""The street: houses on both sides, ground, trees, lamps, signs, cars, and the sky."""
+"""The street: houses on both sides, ground, trees, lamps, signs, cars, and the sky.
+
+The order of the random numbers decides the pixels: changing it is a new `drawing.VERSION`.
+"""
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import Facade
-from mfvpr.datasets.streets.houses import Design, draw_facade, draw_wall
-from mfvpr.datasets.streets.objects import Car, build_car, draw_lamp, draw_sign
-from mfvpr.datasets.streets.sheets import Panel, Prop, Sheet, Texture, blotches, texture, upright
-from mfvpr.datasets.streets.weather import ROOFS, WALLS, WEATHERS, Image, Rng, Weather, as_array, pick, tone
+from mfvpr.datasets.streets.camera import LANE, Camera, Facade
+from mfvpr.datasets.streets.sheets import (
+    ACCENTS,
+    CARS,
+    DARK,
+    GLASS,
+    ROOFS,
+    TRIMS,
+    WALLS,
+    WARM,
+    WEATHERS,
+    Color,
+    Image,
+    Panel,
+    Prop,
+    Rng,
+    Sheet,
+    Texture,
+    Weather,
+    as_array,
+    blotches,
+    draw_glyphs,
+    move,
+    pick,
+    texture,
+    tone,
+    upright,
+)
 
 LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
 CLOUDS = {weather: place for place, weather in enumerate(WEATHERS.values())}  # seeds of the clouds of each weather
+# Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
+TRAFFIC = (
+    (LANE, 7, 25, False),
+    (-LANE, 5, 22, True),
+    (-LANE, 25, 50, True),
+    (4.0, 5, 18, False),
+    (4.0, 25, 50, False),
+    (-4.0, 5, 18, True),
+)
+
+Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
+
+
+class Motif(NamedTuple):
+    """A window type, shared by many houses: size in meters, panes, ornaments."""
+
+    width: float
+    height: float
+    columns: int
+    rows: int
+    ornament: str
+
+
+MOTIFS = (
+    Motif(1.0, 1.6, 2, 3, "shutters"),
+    Motif(1.1, 1.7, 2, 2, "arch"),
+    Motif(1.7, 1.4, 3, 1, "lintel"),
+    Motif(1.1, 2.1, 2, 3, "railing"),
+    Motif(1.2, 1.5, 2, 4, "lintel"),
+)
+
+
+class Body(NamedTuple):
+    """Shape of a car, in meters: heights of hood and roof; where glass and roof start, from the rear and the front."""
+
+    length: float
+    width: float
+    hood: float
+    roof: float
+    rear: tuple[float, float]
+    front: tuple[float, float]
+
+
+BODIES = (
+    Body(4.3, 1.75, 0.92, 1.45, (0.15, 0.7), (1.3, 2.1)),
+    Body(4.6, 1.8, 0.95, 1.42, (0.7, 1.3), (1.3, 2.1)),
+    Body(5.4, 2.0, 1.15, 2.5, (0.02, 0.06), (0.8, 1.5)),
+)
 
 
 @dataclass(frozen=True)
@@ -72,6 +147,15 @@ def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Fac
     return props, facades
 
 
+class Design:
+    """Design that several houses share: width in meters, floors above the ground floor, windows, use."""
+
+    def __init__(self, rng: Rng) -> None:
+        self.motif = MOTIFS[int(rng.integers(len(MOTIFS)))]
+        self.width, self.floors = rng.uniform(6.0, 11.0), int(rng.integers(1, 4))
+        self.shop = bool(rng.random() < 0.5)
+
+
 def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tuple[Prop, Facade]:
     """A house whose facade stands at side * x (side -1: left) from z onwards, in meters."""
     width, depth, rise = design.width, 9.0, rng.uniform(1.8, 3.4)
@@ -99,6 +183,116 @@ def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tupl
     return Prop(z + width / 2, (gable, roof, facade)), Facade(inner, z, z + width, height)
 
 
+def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
+    """The street side of a house: a ground floor of 3.6 m, more floors of 3 m each, a cornice."""
+    trim, accent = pick(rng, TRIMS), pick(rng, ACCENTS)
+    width, floors, motif = design.width, design.floors, design.motif
+    sheet = Sheet(width, 4.1 + 3.0 * floors, wall)
+    draw_wall(sheet, rng)
+    draw_damage(sheet, rng)
+    bays = int(width // 2.4)
+    middles = (np.arange(bays) + 0.5) * width / bays
+    for floor in range(floors):
+        for x in middles:
+            draw_window(sheet, rng, float(x), 1.1 + 3.0 * floor, motif, trim, accent)
+    top = 0.5 + 3.0 * floors
+    sheet.rect(0, top - 0.1, width, 0.18, trim, snow=180)
+    if design.shop:
+        draw_shop(sheet, rng, top, trim, accent)
+    else:
+        for x in middles[1:]:
+            draw_window(sheet, rng, float(x), top + 1.0, MOTIFS[4], trim, accent)
+        sheet.rect(middles[0] - 0.7, top + 0.7, 1.4, 2.9, trim)
+        sheet.rect(middles[0] - 0.55, top + 0.85, 1.1, 2.75, accent)
+    sheet.rect(0, 0, width, 0.3, tone(trim, 0.92), snow=120)
+    return sheet
+
+
+def draw_wall(sheet: Sheet, rng: Rng) -> None:
+    """Bricks or plaster over the whole sheet, with stains and rain streaks of its own."""
+    rows, columns = sheet.day.shape[:2]
+    if rng.random() < 0.3:
+        joint = tone(tuple(sheet.day[0, 0, :3].tolist()), 0.9)
+        for row, y in enumerate(np.arange(0, sheet.height, 0.22)):
+            sheet.rect(0, y, sheet.width, 0.04, joint)
+            for x in np.arange(0.3 * (row % 2), sheet.width, 0.6):
+                sheet.rect(x, y, 0.04, 0.22, joint)
+    fine = 0.03 * rng.standard_normal((rows, columns), np.float32)
+    patches = 0.05 * blotches(rng, (rows, columns), 40) + 0.05 * blotches(rng, (rows, columns), 12)
+    streaks = 0.05 * blotches(rng, (1, columns), 5) * np.linspace(1, 0, rows, dtype=np.float32)[:, None]
+    foot = 1 - 0.25 * np.exp(-np.linspace(sheet.height, 0, rows, dtype=np.float32) / 0.6)[:, None]
+    sheet.shade(((1 + fine + patches + streaks) * foot)[..., None])
+
+
+def draw_damage(sheet: Sheet, rng: Rng) -> None:
+    """Marks that tell walls apart: flaked plaster with bare bricks, posters, scribbles."""
+    for _ in range(rng.integers(10, 22)):
+        x, y = rng.uniform((0.3, 0.5), (sheet.width - 0.3, sheet.height - 0.5))
+        angles = np.linspace(0, 2 * np.pi, 11)
+        radii = rng.uniform(0.4, 1.0, 11) * rng.uniform(0.12, 0.45)
+        flake = np.stack([x + radii * np.cos(angles), y + 0.7 * radii * np.sin(angles)], 1)
+        sheet.polygon(flake, pick(rng, ((150, 96, 80), (196, 186, 170), (110, 100, 96))))
+    for _ in range(rng.integers(2, 6)):
+        x, y = rng.uniform(0.2, sheet.width - 1.2), sheet.height - rng.uniform(2.0, 2.6)
+        w, h = rng.uniform(0.5, 1.0), rng.uniform(0.8, 1.3)
+        sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
+        for _ in range(4):
+            sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
+        draw_glyphs(sheet, rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
+    if rng.random() < 0.5:
+        start = (rng.uniform(0.5, sheet.width - 1.5), sheet.height - 1.4)
+        draw_glyphs(sheet, rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
+
+
+def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: Color, accent: Color) -> None:
+    """One window with its middle at x and its upper edge at y; one in four is lit at night."""
+    w, h = motif.width, motif.height
+    left = x - w / 2
+    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else DARK
+    if motif.ornament == "arch":
+        sheet.ellipse(x, y, w / 2 + 0.1, 0.45, trim)
+        sheet.ellipse(x, y, w / 2, 0.35, GLASS, glow)
+    sheet.rect(left - 0.1, y - 0.1 * (motif.ornament != "arch"), w + 0.2, h + 0.2, trim)
+    sheet.rect(left, y, w, h, tone(GLASS, rng.uniform(0.7, 1.5)), glow)
+    for side in (0, 1):  # curtains, each drawn a different way
+        cloth = rng.uniform(0.05, 0.35) * w
+        sheet.rect(left + side * (w - cloth), y, cloth, h * rng.uniform(0.5, 1), (198, 190, 178), tone(glow, 0.7))
+    for column in range(1, motif.columns):
+        sheet.rect(left + w * column / motif.columns - 0.03, y, 0.06, h, trim)
+    for row in range(1, motif.rows):
+        sheet.rect(left, y + h * row / motif.rows - 0.03, w, 0.06, trim)
+    sheet.rect(left - 0.2, y + h + 0.08, w + 0.4, 0.12, tone(trim, 0.85), snow=240)
+    if motif.ornament == "shutters":
+        for x in (left - 0.6, left + w + 0.1):
+            sheet.rect(x, y - 0.05, 0.5, h + 0.1, accent)
+            for slat in np.arange(0.12, h, 0.2):
+                sheet.rect(x + 0.08, y + slat, 0.34, 0.06, tone(accent, 0.65))
+    elif motif.ornament == "lintel":
+        sheet.rect(left - 0.25, y - 0.32, w + 0.5, 0.16, trim, snow=200)
+    elif motif.ornament == "railing":
+        for x in np.arange(left - 0.15, left + w + 0.2, 0.14):
+            sheet.rect(x, y + h - 0.9, 0.04, 0.9, (40, 40, 44))
+        sheet.rect(left - 0.2, y + h - 0.95, w + 0.4, 0.07, (40, 40, 44), snow=220)
+    if rng.random() < 0.3:  # flowers on the sill
+        for x in rng.uniform(left, left + w, 7):
+            sheet.ellipse(x, y + h + 0.02, 0.1, 0.1, pick(rng, ((70, 110, 60), (190, 60, 70), (220, 160, 60))))
+
+
+def draw_shop(sheet: Sheet, rng: Rng, top: float, trim: Color, accent: Color) -> None:
+    """A ground floor with a sign, an awning and a display window from `top` to the foot of the sheet."""
+    sheet.rect(0.3, top + 0.2, sheet.width - 0.6, 0.75, accent, tone(accent, 0.9))
+    draw_glyphs(sheet, rng, 0.6, top + 0.32, rng.uniform(0.5, 1.0) * (sheet.width - 1.2), 0.5, trim)
+    sheet.rect(0.5, top + 1.1, sheet.width - 2.2, 2.1, (54, 52, 54), tone(WARM, 0.85))
+    for x in np.arange(0.8, sheet.width - 2.4, 0.7):  # goods
+        size = rng.uniform(0.2, 0.6)
+        sheet.rect(x, top + 3.1 - size, 0.45, size, pick(rng, (*ACCENTS, *WALLS)), (150, 110, 60))
+    sheet.rect(sheet.width - 1.5, top + 1.1, 1.1, sheet.height - top - 1.1, tone(accent, 0.7))
+    sheet.rect(sheet.width - 1.35, top + 1.3, 0.8, 1.2, GLASS, tone(WARM, 0.7))
+    if rng.random() < 0.5:
+        for stripe, x in enumerate(np.arange(0.4, sheet.width - 1.8, 0.4)):
+            sheet.rect(x, top + 1.0, 0.4, 0.7, trim if stripe % 2 else accent, snow=150)
+
+
 def build_tree(rng: Rng, x: float, z: float) -> Prop:
     """A tree in leaf with its trunk at x and z, in meters: trunk, branches and a round crown of many dabs."""
     width, height = rng.uniform(3.0, 4.4), rng.uniform(5.0, 6.6)
@@ -118,8 +312,13 @@ def build_tree(rng: Rng, x: float, z: float) -> Prop:
 
 def build_furniture(seed: int, length: float) -> list[Prop]:
     """Lamps, trees and signs along both sidewalks."""
-    rng = np.random.default_rng([seed, 2])
-    lamp = texture(draw_lamp())
+    rng, iron = np.random.default_rng([seed, 2]), (52, 58, 56)
+    sheet = Sheet(1.0, 5.2, None)
+    sheet.rect(0.44, 0.6, 0.12, 4.6, iron)
+    sheet.rect(0.38, 4.3, 0.24, 0.9, iron)
+    sheet.polygon([(0.22, 0.1), (0.78, 0.1), (0.66, 0.75), (0.34, 0.75)], (226, 222, 204), (255, 236, 190))
+    sheet.polygon([(0.15, 0.14), (0.85, 0.14), (0.5, 0.0)], iron, snow=240)
+    lamp = texture(sheet)
     places = enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING))
     props = [upright(lamp, 5.4 if index % 2 else -5.4, z, 1.0, 5.2) for index, z in places]
     for side in (-1, 1):
@@ -130,6 +329,22 @@ def build_furniture(seed: int, length: float) -> list[Prop]:
             elif kind < 0.75:
                 props.append(upright(texture(draw_sign(rng)), side * 4.9, z + rng.uniform(-3, 3), 0.9, 2.9))
     return props
+
+
+def draw_sign(rng: Rng) -> Sheet:
+    sheet, red, white = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232)
+    sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
+    kind = rng.integers(3)
+    if kind == 0:
+        sheet.ellipse(0.45, 0.45, 0.42, 0.42, red)
+        sheet.ellipse(0.45, 0.45, 0.32, 0.32, white)
+    elif kind == 1:
+        sheet.polygon([(0.0, 0.85), (0.9, 0.85), (0.45, 0.05)], red)
+        sheet.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], white)
+    else:
+        sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
+    draw_glyphs(sheet, rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else white)
+    return sheet
 
 
 def build_ground(rng: Rng, z: float) -> Prop:
@@ -173,7 +388,81 @@ def draw_sky(rng: Rng, weather: Weather) -> Image:
     sky += cover * 0.7 * (as_array(tone(weather.horizon, 1.15)) - sky)
     for layer, gain in ((0.16, 0.92), (0.10, 0.8)):
         bumps = 0.35 * blotches(rng, (1, columns), 60) + 0.1 * blotches(rng, (1, columns), 8)
-        ridge = rows * (1 - layer * (1 + bumps))
-        hill = np.arange(rows)[:, None] > ridge
+        hill = np.arange(rows)[:, None] > rows * (1 - layer * (1 + bumps))
         sky[hill] = as_array(tone(weather.horizon, gain)) * as_array((0.92, 1.0, 0.98))
     return np.dstack([np.clip(sky, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8)])
+
+
+def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
+    """Cars ahead, oncoming cars and parked cars around the camera."""
+    props = []
+    for x, nearest, farthest, oncoming in TRAFFIC:
+        car = cars[int(rng.integers(len(cars)))]
+        if rng.random() < 0.7:
+            x, z = x + rng.uniform(-0.2, 0.2), camera.z + rng.uniform(nearest, farthest)
+            props.append(move(car[oncoming], x, z))
+    return props
+
+
+def build_car(seed: int, index: int) -> Car:
+    """Car number `index` of the street with this seed; panels that face away are included, but never painted."""
+    rng = np.random.default_rng([seed, 4, index])
+    body, color = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
+    right = texture(draw_side(rng, body, color))
+    ends = []
+    for lights, glow in (((160, 30, 30), (255, 50, 40)), ((236, 236, 228), (255, 250, 230))):  # rear, front
+        end = Sheet(body.width, body.hood - 0.2, tone(color, 0.94))  # below the glass, with lights and plate
+        end.rect(0, end.height - 0.22, body.width, 0.22, (48, 48, 52))
+        end.rect(body.width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
+        for x in (0.08, body.width - 0.4):
+            end.rect(x, 0.12, 0.32, 0.18, lights, glow)
+        ends.append(texture(end))
+    shadow, top = Sheet(2.0, 2.0, None), Sheet(1.0, 1.0, tone(color, 1.1))
+    shadow.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
+    top.settle_snow(235)
+    glass = Sheet(body.width, body.roof - body.hood, color)  # rear window or windshield with its frame
+    glass.rect(0.12, 0.08, body.width - 0.24, min(0.8, glass.height - 0.12), (48, 58, 68))
+    covers = [texture(sheet) for sheet in (shadow, top, glass)]
+
+    def left(weather: Weather) -> Image:
+        return right(weather)[:, ::-1]
+
+    def assemble(near: tuple[float, float], far: tuple[float, float], end: Texture, sides: tuple[Texture, ...]) -> Prop:
+        width, length, x = body.width, body.length, -body.width / 2
+        roof, across = length - far[1], (width, 0, 0)
+        shadow, top, glass = covers
+        panels = (
+            Panel(shadow, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
+            Panel(top, (x, -body.hood, length), across, (0, 0, -length)),
+            Panel(end, (x, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
+            Panel(top, (x, -body.roof, roof), across, (0, 0, near[1] - roof)),
+            Panel(glass, (x, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
+            Panel(sides[0], (x, -body.roof, length), (0, 0, -length), (0, body.roof, 0)),
+            Panel(sides[1], (-x, -body.roof, 0), (0, 0, length), (0, body.roof, 0)),
+        )
+        return Prop(length / 2, panels)
+
+    rear, front = ends
+    return assemble(body.rear, body.front, rear, (left, right)), assemble(body.front, body.rear, front, (right, left))
+
+
+def draw_side(rng: Rng, body: Body, paint: Color) -> Sheet:
+    """The right side of a car, which drives to the right."""
+    sheet = Sheet(body.length, body.roof, None)
+    length, waist = body.length, body.roof - body.hood
+    low, high = body.rear
+    nose, brow = length - body.front[0], length - body.front[1]
+    sheet.polygon([(low, waist), (high, 0), (brow, 0), (nose, waist)], tone(paint, 0.9), snow=90)
+    sheet.rect(0, waist, length, body.hood - 0.22, paint)
+    if body.roof < 2:
+        inner = [(low + 0.25, waist), (high + 0.08, 0.1), (brow - 0.05, 0.1), (nose - 0.2, waist)]
+        sheet.polygon(inner, (44, 54, 64))
+        sheet.rect(length * 0.48, 0.1, 0.08, waist, paint)
+    else:
+        draw_glyphs(sheet, rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
+        sheet.polygon([(brow - 1.0, 0.3), (brow, 0.3), (nose - 0.2, waist), (brow - 1.0, waist)], (44, 54, 64))
+    sheet.rect(0, body.roof - 0.4, length, 0.12, tone(paint, 0.6))
+    for x in (0.85, length - 0.85):
+        sheet.ellipse(x, body.roof - 0.33, 0.33, 0.33, (30, 30, 32))
+        sheet.ellipse(x, body.roof - 0.33, 0.18, 0.18, (170, 172, 176))
+    return sheet

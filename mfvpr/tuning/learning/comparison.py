@@ -11,15 +11,13 @@ from mfvpr.core.metrics import hits
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Shortlist
 from mfvpr.core.weights import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
-from mfvpr.evaluation.protocol import EvaluationProtocol
-from mfvpr.evaluation.selection import best_setting
+from mfvpr.evaluation.protocol import EvaluationProtocol, best_setting
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.tuning.learning.models import Model, Options, of_matches, start, train
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.training import Checkpoints, Fit
-from mfvpr.tuning.sweeps.setting_groups import FUSION, Setting
-from mfvpr.tuning.sweeps.setting_rankings import SweepOptions, rank_settings
-from mfvpr.tuning.sweeps.sweep_axes import Axes, can_learn
+from mfvpr.tuning.sweeps.setting_rankings import FUSION, Setting, SweepOptions, rank_settings
+from mfvpr.tuning.sweeps.setting_search import Axes, can_learn
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
@@ -65,7 +63,7 @@ def compare(
     """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
 
     Everything is chosen or learned on one half of the path and reported on the other, or chosen on some data sets and
-    reported on others, see `mfvpr.tuning.learning.data_sets`. "gradient" learns the scorer's parameters through the
+    reported on others, see `mfvpr.tuning.learning.splits`. "gradient" learns the scorer's parameters through the
     ranking, and "match weights" the weights as well. "match labels" learns weights from labels of matches: a match is
     correct if it is one of a correct pair and agrees with the dominant shift.
 

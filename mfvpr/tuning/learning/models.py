@@ -10,20 +10,94 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Bool, Float, Num
 
 from mfvpr.baselines.learned_weight import RELATIVE, LearnedWeight
 from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.parameters import SCORE, parameters_of, with_capacity
 from mfvpr.core.ranking import combine
+from mfvpr.core.scorer import SCORE, fit_capacities, parameters_of
 from mfvpr.core.types import Array, Matches
 from mfvpr.core.weights import RatioWeight, UnitWeight
-from mfvpr.evaluation.shortlist_scores import RetrievalScore, Ties
-from mfvpr.tuning.learning.losses import Loss, cross_entropy, mean_loss
+from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.tuning.learning.splits import Batch, TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Schedule, fit
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import as_float, masked_mean
+from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
+
+Loss = Callable[[Array, Array, Array], Array]
+
+
+def cross_entropy(
+    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"]
+) -> Float[Array, ""]:
+    """-log of the probability that softmax(scores) gives to all positives together, in nats."""
+    scores, positives, real, teaches = _usable(scores, positives, mask)
+    # The highest score is subtracted first: else scores in the thousands round a small loss away.
+    scores = scores - jax.lax.stop_gradient(jnp.max(scores, where=real, initial=-jnp.inf))
+    loss = jax.nn.logsumexp(scores, where=real) - jax.nn.logsumexp(scores, where=positives)
+    return jnp.where(teaches, loss, 0.0)
+
+
+def smooth_recall_at_1(
+    scores: Num[Array, " candidates"],
+    positives: Bool[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
+    temperature: float | Float[Array, ""],
+) -> Float[Array, ""]:
+    """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
+
+    It tends to 1 - R@1 as the temperature tends to 0.
+    """
+    scores, positives, real, teaches = _usable(scores, positives, mask)
+    probability = jax.nn.softmax(scores / positive(temperature, scores.dtype), where=real)
+    return jnp.where(teaches, jnp.sum(masked(probability, ~positives)), 0.0)
+
+
+def smooth_average_precision(
+    scores: Num[Array, " candidates"],
+    positives: Bool[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
+    temperature: float | Float[Array, ""],
+) -> Float[Array, ""]:
+    """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), in [0, 1].
+
+    The rank of a candidate is 1 + the sum of sigmoid(lead / temperature) over all other candidates, where lead is how
+    far their score is above its own. The loss tends to 1 - average precision as the temperature tends to 0; a tie
+    counts half.
+    """
+    scores, positives, real, teaches = _usable(scores, positives, mask)
+    lead = jax.nn.sigmoid((scores[None] - scores[:, None]) / positive(temperature, scores.dtype))  # [i, j] of j over i
+    is_other = real[None] & ~jnp.eye(len(real), dtype=bool)
+    rank = 1 + jnp.sum(masked(lead, is_other), axis=1)
+    rank_among_positives = 1 + jnp.sum(masked(lead, is_other & positives[None]), axis=1)
+    return jnp.where(teaches, 1 - masked_mean(rank_among_positives / rank, positives), 0.0)
+
+
+LOSSES: dict[str, Loss] = {
+    "cross_entropy": cross_entropy,
+    "recall": partial(smooth_recall_at_1, temperature=1.0),
+    "average_precision": partial(smooth_average_precision, temperature=1.0),
+}
+"""Losses of the programs, by name."""
+
+
+def mean_loss(
+    loss: Loss,
+    scores: Num[Array, "queries candidates"],
+    positives: Bool[Array, "queries candidates"],
+    mask: Bool[Array, "queries candidates"],
+) -> Float[Array, ""]:
+    """Mean of the loss of one query over the queries with a positive; 0 if there are none."""
+    return masked_mean(jax.vmap(loss)(scores, positives, mask), jnp.any(positives & mask, axis=-1))
+
+
+def _usable(scores: Array, positives: Array, mask: Array) -> tuple[Array, Array, Array, Array]:
+    """Scores, positives, real candidates, and whether the query has a positive; without one, no loss divides by 0."""
+    positives = positives & mask
+    teaches = jnp.any(positives)
+    return masked(as_float(scores), mask & teaches), positives | ~teaches, mask | ~teaches, teaches
+
 
 TEACHER_SIGMA = 0.03  # of the teacher of single matches, in units of the largest side of an image
 FIRST_SHARE = 0.3  # the retrieval's weight at the start, in units of the balanced weight
@@ -108,8 +182,8 @@ class Options:
     """Options of learning and comparing scores."""
 
     c: float | None = None  # the retrieval's weight if it is set by hand; None = balanced
-    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.evaluation.shortlist_scores.retrieval_scores`
-    ties: Ties = "retrieval"  # as in `mfvpr.evaluation.shortlist_scores.rank_shortlist`
+    retrieval_score: RetrievalScore = "cosine"  # as in `mfvpr.evaluation.rankings.retrieval_scores`
+    ties: Ties = "retrieval"  # as in `mfvpr.evaluation.rankings.rank_shortlist`
     loss: Loss = cross_entropy  # of one query
     steps: int = 200  # updates of a training, at most
     every: int = 5  # steps from one validation to the next
@@ -130,7 +204,7 @@ def start(
     """
     scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
     deviation = split.score_deviation(scorer)
-    scorer = with_capacity(scorer, *split.match_set.image_sizes)
+    scorer = fit_capacities(scorer, *split.match_set.image_sizes)
     first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
     if fused:
         c = FIRST_SHARE * split.balance(deviation)
@@ -146,9 +220,9 @@ def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
     seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
     sigma = TEACHER_SIGMA * float(np.max(seen))
     teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
-    scorer = with_capacity(scorer, *sizes)
+    scorer = fit_capacities(scorer, *sizes)
     first = {"numbers": {}, "weight": _first_weight(split, options)}
-    return Model(scorer, first, 1.0, with_capacity(teacher, *sizes))
+    return Model(scorer, first, 1.0, fit_capacities(teacher, *sizes))
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:

@@ -1,9 +1,7 @@
 """Search of parameters of re-ranking over complete data sets, in compiled calls on cached matches."""
 
-from mfvpr.tuning.sweeps.setting_groups import Setting, grid
-from mfvpr.tuning.sweeps.setting_rankings import DriveRanking, SweepOptions, rank_settings
-from mfvpr.tuning.sweeps.setting_search import Outcome, search_grid, search_optuna
-from mfvpr.tuning.sweeps.sweep_axes import Axes
+from mfvpr.tuning.sweeps.setting_rankings import DriveRanking, Setting, SweepOptions, grid, rank_settings
+from mfvpr.tuning.sweeps.setting_search import Axes, Outcome, search_grid, search_optuna
 
 __all__ = [
     "Axes",

@@ -10,7 +10,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from mfvpr import InputError
-from mfvpr.tuning.learning import training_checkpoints as checkpoints
+from mfvpr.tuning.learning import training as checkpoints
 from tests.storage.synthetic_features import DAMAGE
 from tests.tuning.learning.toys import RECIPE, contents, program, same, train
 

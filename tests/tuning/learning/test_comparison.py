@@ -10,8 +10,7 @@ from mfvpr import AggregatedScore, AnchorPoints, HistogramOfShifts, InputError, 
 from mfvpr.baselines.learned_weight import ABSOLUTE
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.comparison import Options, start
-from mfvpr.tuning.learning.losses import LOSSES, cross_entropy, mean_loss
-from mfvpr.tuning.learning.models import Model, first_numbers
+from mfvpr.tuning.learning.models import LOSSES, Model, cross_entropy, first_numbers, mean_loss
 from mfvpr.tuning.sweeps import Axes
 from tests.builders import random_matches, stack
 from tests.tuning.learning.paths import QUERIES, SIZES, TOLERANCES, split

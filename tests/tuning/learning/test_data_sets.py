@@ -9,9 +9,8 @@ import pytest
 from mfvpr import HistogramOfShifts, InputError, Runtime
 from mfvpr.core.types import per_match
 from mfvpr.tuning.learning import comparison
-from mfvpr.tuning.learning.data_sets import Part, join_data_sets
 from mfvpr.tuning.learning.models import Options
-from mfvpr.tuning.learning.splits import VALIDATION, training_splits
+from mfvpr.tuning.learning.splits import VALIDATION, Part, join_data_sets, training_splits
 from mfvpr.tuning.sweeps import Axes
 from tests.tuning.learning.paths import QUERIES, TOLERANCES, path
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from mfvpr import rank, recall_at_k
-from mfvpr.tuning.learning.losses import cross_entropy, mean_loss, smooth_average_precision, smooth_recall_at_1
+from mfvpr.tuning.learning.models import cross_entropy, mean_loss, smooth_average_precision, smooth_recall_at_1
 
 pytestmark = pytest.mark.thorough
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mfvpr.tuning.learning import training_checkpoints as checkpoints
+from mfvpr.tuning.learning import training as checkpoints
 from mfvpr.tuning.learning.training import Checkpoints, Fit, Schedule, fit
 
 ROOT = Path(__file__).parents[3]

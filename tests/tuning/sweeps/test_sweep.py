@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import mfvpr
-from mfvpr.core.parameters import with_parameters
+from mfvpr.core.scorer import with_parameters
 from mfvpr.core.types import Shortlist
-from mfvpr.evaluation import shortlist_scores
+from mfvpr.evaluation import rankings
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.setting_groups import group_by_program
+from mfvpr.tuning.sweeps.setting_rankings import group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
@@ -65,8 +65,8 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = shortlist_scores.fuse_shortlist(seen, scores, c) if fused else scores
-    order = shortlist_scores.rank_shortlist(seen, scores, **options)
+    scores = rankings.fuse_shortlist(seen, scores, c) if fused else scores
+    order = rankings.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
 
@@ -132,8 +132,8 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.6
     settings = [{"max_distance": limit, "c": c} for limit in (0.05, 2.0) for c in (None, 0.0)]  # 0.05: mostly ties
     got = rank(mfvpr.MatchCount(), settings, *data, views=[candidates.mask, view], ties="index")
-    for seen, rankings in zip((candidates.mask, view), got, strict=True):
-        for first_rows, setting in zip(rankings, settings, strict=True):
+    for seen, by_view in zip((candidates.mask, view), got, strict=True):
+        for first_rows, setting in zip(by_view, settings, strict=True):
             expected = one_by_one(mfvpr.MatchCount(), setting, *data, view=seen, ties="index")
             np.testing.assert_array_equal(first_rows[:, :CANDIDATES], expected)
             assert (first_rows[:, CANDIDATES:] == -1).all()
