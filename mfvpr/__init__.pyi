@@ -30,10 +30,10 @@ from .core.anchor import AnchorPoints
 from .baselines.grid_anchors import GridAnchors
 from .core.histogram import HistogramOfShifts, ShiftHistogram
 from .baselines.homography import Homography
-from .baselines.homography_opencv import OpenCvHomography
-from .baselines.lost import LostScore
-from .baselines.phrases import VisualPhrases
-from .baselines.rapid import RapidSpatialScore
+from .baselines.homography import OpenCvHomography
+from .baselines.spatial_scores import LostScore
+from .baselines.spatial_scores import VisualPhrases
+from .baselines.spatial_scores import RapidSpatialScore
 
 # scores of all candidates, whole grids of parameters, fusion and ranking
 from .core.batch import score_candidates, score_grid

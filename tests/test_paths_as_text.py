@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError, Shortlist, io
-from mfvpr.baselines.learned_weight import LearnedWeight
-from mfvpr.baselines.weight_registry import read_weight, write_weight
+from mfvpr.baselines.learned_weight import LearnedWeight, read_weight, write_weight
 from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets
 from mfvpr.evaluation import Confidence, read_confidences, write_confidences
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles

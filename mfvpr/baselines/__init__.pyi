@@ -12,9 +12,6 @@ __all__ = [
 ]
 
 from .grid_anchors import GridAnchors
-from .homography import Estimate, Homography
-from .homography_opencv import OpenCvHomography
-from .lost import LostScore
-from .phrases import VisualPhrases
-from .rapid import RapidSpatialScore
+from .homography import Estimate, Homography, OpenCvHomography
 from .scorers import ALONE, PAPER, SCORERS
+from .spatial_scores import LostScore, RapidSpatialScore, VisualPhrases

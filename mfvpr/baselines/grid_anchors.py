@@ -15,7 +15,6 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import masked
 
-LARGEST = 2**24  # float32 holds all integers up to it
 _OUTSIDE = {"unequal": -1000, "zero": 0}
 
 
@@ -47,14 +46,10 @@ class GridAnchors:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.side < 1 or not 1 <= self.size <= self.side or self.size % 2 == 0:
+        if self.size > self.side or self.size % 2 == 0 or self.side * self.size > 2**12:
             raise InputError(
-                f"GridAnchors(side={self.side}, patch={self.patch}): expected a side from 1, and an odd patch up to it"
-            )
-        if self.side**2 * self.size**2 > LARGEST:
-            raise InputError(
-                f"GridAnchors(side={self.side}, patch={self.patch}): expected scores up to 2^24, which "
-                "float32 holds exactly; choose fewer cells"
+                f"patch={self.size}: expected an odd number of cells up to the side of {self.side}, with side * patch "
+                "up to 4096 (float32 holds no larger score exactly)"
             )
 
     @property
@@ -79,8 +74,14 @@ class GridAnchors:
         index = jnp.full(len(cells), len(cells), jnp.int32).at[target].min(cell0, mode="drop")
         matched = index < len(cells)
         score = self._agreements(index, matched, cells)
-        if self.wrap:
-            score += self._agreements_outside(index, matched, cells)
+        if self.wrap:  # anchors may agree with the value of the padding around the grid
+            side, half = self.side, self.size // 2
+            row, column = jnp.divmod(cells, side)
+            down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset, as n <= side
+            right = right - half
+            outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
+            is_near = (jnp.abs(down) <= half) & (right <= half)
+            score += jnp.sum(matched & is_near & outside, dtype=jnp.int32)
         usable = jnp.all((cell1 >= 0) & (cell1 < len(cells)) & (cell0 >= 0) & (cell0 < len(cells)))
         for count in (matches.count0, matches.count1):
             usable &= count is None or jnp.asarray(count) == len(cells)
@@ -115,12 +116,3 @@ class GridAnchors:
         right, full_row = count_offsets(0, range(1, half + 1)), range(-half, half + 1)
         counts = jax.lax.fori_loop(1, half + 1, lambda row, counts: counts + count_offsets(row, full_row), right)
         return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)
-
-    def _agreements_outside(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
-        """Number of anchors that agree with the value of the padding around the grid."""
-        side, half = self.side, self.size // 2
-        row, column = jnp.divmod(cells, side)
-        down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset, as n <= side
-        right = right - half
-        outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
-        return jnp.sum(matched & (jnp.abs(down) <= half) & (right <= half) & outside, dtype=jnp.int32)

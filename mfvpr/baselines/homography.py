@@ -1,21 +1,32 @@
 """Homography by RANSAC, SSM-RAN's re-ranking (paper, section IV): how many matches one plane's motion explains.
 
-The result is that of OpenCV's findHomography, up to the random samples: all samples of a round are solved and counted
-at once, and samples after the one where OpenCV would stop do not count.
+`Homography` has the result of OpenCV's findHomography, up to the random samples: all samples of a round are solved and
+counted at once, and samples after the one where OpenCV would stop do not count. `OpenCvHomography` calls OpenCV.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.baselines import planes
-from mfvpr.baselines.rapid import query_features
+from mfvpr.baselines.spatial_scores import query_features
+from mfvpr.core.scorer import check_bounds
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence, require_sizes
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, number, one_of, setting, whole
-from mfvpr.utils.numerics import at_least_single, masked, where_finite, without_gradient
+from mfvpr.utils.numerics import (
+    at_least_single,
+    available_cpus,
+    is_concrete,
+    masked,
+    where_finite,
+    without_gradient,
+)
 
 _MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
 _ROUNDS = 8  # the search ends after so many times the rounds that samples without degenerate draws would need
@@ -44,8 +55,7 @@ class Homography:
         max_iterations: maximum number of samples; an array less than 1 scores NaN. Degenerate draws do not count, but
             the search ends early if almost all draws (49 of 50) are degenerate.
         confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
-            as the best model has; an array of 1 never stops early, one not above 0 scores
-            NaN.
+            as the best model has; an array of 1 never stops early, one not above 0 scores NaN.
         measure: `inliers` counts inliers; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after the count.
@@ -83,23 +93,13 @@ class Homography:
         if len(real) == 0:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
         require_sizes(matches.image_size0, matches.image_size1)
-        frame = planes.Frame.of(
-            *(jnp.asarray(size, points.dtype) for size in (matches.image_size1, matches.image_size0))
-        )
+        frame = planes.Frame.of(matches.image_size1, matches.image_size0, points.dtype)
         normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
         threshold = threshold / frame.scale[1]
         order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
-        search = _Search(
-            self.measure,
-            matches.confidence is None,
-            normalized[order],
-            counts[order],
-            number,
-            threshold,
-            max_iterations,
-            probability,
-        )
+        limits = threshold, max_iterations, probability
+        search = _Search(self.measure, matches.confidence is None, normalized[order], counts[order], number, *limits)
         # The generator is named, because others draw different numbers in a batch.
         model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:
@@ -212,3 +212,71 @@ class _State(NamedTuple):
 def _maximum_before(values: Float[Array, " samples"], start: Float[Array, ""]) -> Float[Array, " samples"]:
     """Maximum of `start` and all values before each one."""
     return jnp.maximum(jnp.concatenate([jnp.zeros_like(values[:1]), jax.lax.cummax(values)[:-1]]), start)
+
+
+@value
+class OpenCvHomography:
+    """s = number of inliers of cv2.findHomography, from the candidate's points to the query's.
+
+        mfvpr.score_candidates(mfvpr.OpenCvHomography(), candidate_matches)  # [C]
+
+    The score runs on the host: all functions of the library accept it, but `jit`, `vmap` and gradients do not. (JAX's
+    callbacks may deadlock.) OpenCV's samples depend on the order of the matches, so that matches are sorted by
+    `index0`, or by their coordinates without it. A match of confidence 0 is ignored, all others count fully. OpenCV 4
+    counts the inliers before its last least squares, version 5 after it.
+
+    Attributes:
+        threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
+        max_iterations: maximum number of samples; rounded to an integer.
+        confidence: RANSAC stops once a sample of inliers only was drawn with this probability.
+        estimator: `ransac`, the paper's, or `magsac` (USAC_MAGSAC; Barath et al., CVPR 2020).
+        few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD).
+    """
+
+    threshold: float | Array = setting(24.0, POSITIVE, unit="px")
+    max_iterations: float | Array = setting(2000.0, number(1.0, 1000000.0), "at most", unit="samples")
+    confidence: float | Array = setting(0.995, number(1e-06, 0.999999), "that a sample was all inliers")
+    estimator: str = setting("ransac", one_of("ransac", "magsac"), static=True)
+    few: str = setting("count", one_of("count", "zero"), "less than 4 matches", static=True)
+
+    __post_init__ = check_fields
+
+    def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
+        """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""
+        if not is_concrete((self, matches)):
+            raise InputError(
+                "homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
+                "OpenCV runs outside of JAX; call score_candidates, or take Homography"
+            )
+        check_bounds(self)  # OpenCV replaces a threshold of 0 by 3 px
+        points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
+        real = np.asarray(matches.mask)
+        if matches.confidence is not None:
+            if np.isnan(np.asarray(matches.confidence)[real]).any():
+                return np.array(np.nan, np.float32)
+            real = real & (np.asarray(matches.confidence) > 0)
+        points = points[real]
+        if not np.isfinite(points).all():
+            return np.array(np.nan, np.float32)
+        if len(points) < 4:
+            return np.array(len(points) if self.few == "count" else 0, np.float32)
+        import cv2  # here, because it slows down the import of the library
+
+        keys = points.T[::-1] if matches.index0 is None else [np.asarray(matches.index0)[real]]
+        points = points[np.lexsort([*keys])]
+        _, inliers = cv2.findHomography(
+            points[:, :2],
+            points[:, 2:],
+            {"ransac": cv2.RANSAC, "magsac": cv2.USAC_MAGSAC}[self.estimator],
+            float(self.threshold),
+            maxIters=round(float(self.max_iterations)),
+            confidence=float(self.confidence),
+        )
+        return np.array(0 if inliers is None else inliers.sum(), np.float32)
+
+    def score_pairs(self, matches: Matches) -> Float[np.ndarray, " pairs"]:
+        """Scores of pairs `[P, K, ...]`, float32."""
+        host, count = jax.tree.map(np.asarray, matches), len(matches.mask)
+        pairs = (jax.tree.map(lambda leaf, pair=pair: leaf[pair], host) for pair in range(count))
+        with ThreadPoolExecutor(available_cpus()) as pool:  # OpenCV releases Python's lock
+            return np.fromiter(pool.map(self, pairs), np.float32, count)

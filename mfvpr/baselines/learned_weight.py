@@ -1,9 +1,15 @@
-"""Learned match weight: a small network with measurements of one match as inputs."""
+"""Learned match weight, a small network with measurements of one match as inputs; its files, and weights by name.
 
+The file of a learned weight is JSON with its provenance.
+"""
+
+import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import field
-from functools import partial
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import field, fields
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,13 +18,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array, Matches, value
-from mfvpr.core.weights import match_ratio
+from mfvpr.core.weights import WEIGHTS, Weight, match_ratio
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_file, require_replaceable, write_text
 from mfvpr.utils.numerics import as_float, masked, masked_median
 
 RELATIVE = ("ratio", "distance_rank", "relative_distance", "score0_rank", "score1_rank")
 ABSOLUTE = ("scores0", "scores1", "distance", "ratio", "x0", "y0", "x1", "y1")
-_UNIT_BIAS = math.log(math.e - 1)  # softplus(_UNIT_BIAS) = 1
+SUFFIX = ".json"
+_FORMAT = "mfvpr match weight 1"
+_LEARNED = {path.stem: path for path in sorted((Path(__file__).parent / "learned").glob(f"*{SUFFIX}"))}
 
 
 @value
@@ -49,11 +58,9 @@ class LearnedWeight:
 
         Without a real match, inputs are not standardized.
         """
-        if not names or isinstance(names, str) or len({*names}) < len(names):
-            raise InputError(f"LearnedWeight: expected different names of inputs, got {names}")
+        if not names or isinstance(names, str) or len({*names} & {*INPUTS}) < len(names):
+            raise InputError(f"LearnedWeight: expected different names of {', '.join(INPUTS)}, got {names}")
         names = (*names,)
-        if unknown := [name for name in names if name not in INPUTS]:
-            raise InputError(f"LearnedWeight: unknown input {unknown[0]}; expected some of {', '.join(INPUTS)}")
         raw = np.asarray(jax.jit(_raw_inputs, static_argnums=1)(matches, names), np.float64)
         real = raw[np.asarray(matches.mask)]
         shape = (len(names), hidden)
@@ -65,7 +72,7 @@ class LearnedWeight:
             hidden=jax.random.normal(key, shape, dtype=float) / shape[0] ** 0.5,
             hidden_bias=jnp.zeros(hidden),
             output=jnp.zeros(hidden),
-            output_bias=jnp.asarray(_UNIT_BIAS, dtype=float),
+            output_bias=jnp.asarray(math.log(math.e - 1), dtype=float),  # softplus is 1
             names=names,
         )
 
@@ -98,14 +105,14 @@ def _field(name: str, matches: Matches) -> Array:
 
 def _rank(name: str, matches: Matches) -> Array:
     """Share of the pair's matches with a smaller value, in (0, 1); equal values count half."""
+
+    def of_pair(values: Float[Array, " slots"], mask: Bool[Array, " slots"]) -> Float[Array, " slots"]:
+        ordered = jnp.sort(masked(values, mask, jnp.inf))
+        below, up_to = (jnp.searchsorted(ordered, values, side=side) for side in ("left", "right"))
+        return (below + up_to).astype(values.dtype) / (2 * jnp.maximum(jnp.sum(mask), 1)).astype(values.dtype)
+
     values = masked(_field(name, matches), matches.mask)
-    return jax.lax.stop_gradient(jnp.vectorize(_mid_ranks, signature="(k),(k)->(k)")(values, matches.mask))
-
-
-def _mid_ranks(values: Float[Array, " slots"], mask: Bool[Array, " slots"]) -> Float[Array, " slots"]:
-    ordered = jnp.sort(masked(values, mask, jnp.inf))
-    below, up_to = (jnp.searchsorted(ordered, values, side=side) for side in ("left", "right"))
-    return (below + up_to).astype(values.dtype) / (2 * jnp.maximum(jnp.sum(mask), 1)).astype(values.dtype)
+    return jax.lax.stop_gradient(jnp.vectorize(of_pair, signature="(k),(k)->(k)")(values, matches.mask))
 
 
 def _relative_distance(matches: Matches) -> Array:
@@ -138,3 +145,80 @@ INPUTS: Mapping[str, Callable[[Matches], Any]] = {
     "y1": partial(_coordinate, 1, 1),
 }
 """Inputs of a learned weight, `[..., K]`, by name; their values on padding are arbitrary."""
+
+
+def write_weight(path: Path | str, weight: LearnedWeight, provenance: Mapping[str, Any]) -> None:
+    """Write a weight of finite numbers as JSON, exact to the last bit, with its provenance (JSON values).
+
+    An earlier file of a weight is replaced; an InputError for other files.
+    """
+    require_replaceable(Path(path), _FORMAT.encode())
+    arrays = {f.name: np.asarray(getattr(weight, f.name)).tolist() for f in fields(weight) if f.name != "names"}
+    content = {"format": _FORMAT, "made": provenance, "inputs": list(weight.names), **arrays}
+    write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
+    """Weight and provenance from a file of `write_weight`, exact to the last bit; an InputError for other files."""
+    path = Path(path)
+    require_file(path, "a match weight that mfvpr learn wrote")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        names = (*content["inputs"],)
+        arrays = {f.name: np.asarray(content[f.name], np.float32) for f in fields(LearnedWeight) if f.name != "names"}
+        inputs, hidden = len(names), arrays["output"].size
+        shapes = [(inputs,), (inputs,), (inputs, hidden), (hidden,), (hidden,), ()]
+        if content["format"] != _FORMAT or not {*names} <= {*INPUTS}:
+            raise ValueError("another format")
+        if [values.shape for values in arrays.values()] != shapes or not (arrays["scale"] > 0).all():
+            raise ValueError("arrays of other shapes")
+        if not all(np.isfinite(values).all() for values in arrays.values()):
+            raise ValueError("numbers that are not finite")
+        weight = LearnedWeight(
+            **{name: jnp.asarray(values, dtype=float) for name, values in arrays.items()}, names=names
+        )
+        return weight, dict(content["made"])
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path}: expected a match weight that mfvpr learn wrote ({error})") from error
+
+
+class _NamedWeights(Mapping[str, Weight]):
+    """Weights by name; files are read on access, and the same name returns the same object."""
+
+    def __getitem__(self, name: Any) -> Weight:
+        return WEIGHTS[name] if name in WEIGHTS else _read_by_name(name)[0]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*WEIGHTS, *_LEARNED])
+
+    def __len__(self) -> int:
+        return len(WEIGHTS) + len(_LEARNED)
+
+
+def provenance(name: str) -> dict[str, Any]:
+    """Provenance of a learned weight, as `write_weight` stored it; empty for a fixed weight."""
+    return {} if name in WEIGHTS else _read_by_name(name)[1]
+
+
+def _read_by_name(name: Any) -> tuple[Weight, dict[str, Any]]:
+    if name not in _LEARNED and not (isinstance(name, str) and name.endswith(SUFFIX)):
+        raise KeyError(name)
+    path = _LEARNED.get(name, Path(os.path.expanduser(name)))
+    return _read(path, path.stat().st_mtime_ns if path.exists() else 0)
+
+
+@cache
+def _read(path: Path, modified_ns: int) -> tuple[Weight, dict[str, Any]]:
+    """Contents of a file; `modified_ns` makes a modified file a new entry of the cache."""
+    return read_weight(path)
+
+
+NAMED_WEIGHTS: Mapping[str, Weight] = _NamedWeights()
+"""Weights by word, or by the path `*.json` of a file that `mfvpr learn` wrote (InputError for other files)."""
+
+
+def named_weight(weight: Weight | str) -> Weight:
+    """The weight that a word or the path of a file stands for; any other weight as it is."""
+    if isinstance(weight, str) and weight not in NAMED_WEIGHTS:
+        raise InputError(f"weight={weight!r}: expected one of {', '.join(NAMED_WEIGHTS)}, or FILE{SUFFIX}")
+    return NAMED_WEIGHTS[weight] if isinstance(weight, str) else weight

@@ -4,11 +4,11 @@ A model is a matrix, row by row, that maps points of the candidate (1) to points
 coordinates x1, y1, x0, y0. Samples are uniform, never degenerate, and independent of batch and padding.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
 from mfvpr.core.types import Array
 
@@ -25,8 +25,11 @@ def canonical_order(points: Float[Array, "slots 4"], real: Bool[Array, " slots"]
     """Slots of the real matches, sorted by a hash of their coordinates whatever their order, then padding."""
     bits = jax.lax.bitcast_convert_type(points.astype(jnp.float32) + 0.0, jnp.uint32)  # 0 and -0 are equal
     code = jnp.zeros(real.shape, jnp.uint32)
-    for column in range(4):
-        code = _mix(code ^ bits[:, column])
+    for column in range(4):  # Wellons' lowbias32, which maps no two numbers to the same
+        code = code ^ bits[:, column]
+        code = (code ^ (code >> 16)) * jnp.uint32(0x7FEB352D)
+        code = (code ^ (code >> 15)) * jnp.uint32(0x846CA68B)
+        code = code ^ (code >> 16)
     keys = ~real, code, *bits.T  # the coordinates decide if two codes are equal
     return jax.lax.sort((*keys, jnp.arange(len(real), dtype=jnp.int32)), num_keys=len(keys))[-1]
 
@@ -91,13 +94,6 @@ def _is_degenerate(samples: Float[Array, "coordinates=4 matches=4 samples"]) -> 
     return ((number != 0) & (number != len(same_orientation))) | jnp.any(jnp.stack(flat), axis=0)
 
 
-def _mix(code: Array) -> Array:
-    """Hash of 32-bit numbers that maps no two to the same (Wellons' lowbias32)."""
-    code = (code ^ (code >> 16)) * jnp.uint32(0x7FEB352D)
-    code = (code ^ (code >> 15)) * jnp.uint32(0x846CA68B)
-    return code ^ (code >> 16)
-
-
 class Frame(NamedTuple):
     """Coordinates in which the points of an image lie within -1 and 1, where single precision is enough.
 
@@ -108,9 +104,9 @@ class Frame(NamedTuple):
     scale: Float[Array, "2"]  # px
 
     @classmethod
-    def of(cls, size1: Float[Array, "2"], size0: Float[Array, "2"]) -> "Frame":
+    def of(cls, size1: Num[Array, "2"], size0: Num[Array, "2"], dtype: Any) -> "Frame":
         """Frame of images with sizes in px; an invalid size leaves coordinates as they are."""
-        sizes = jnp.stack([size1, size0])
+        sizes = jnp.stack([jnp.asarray(size, dtype) for size in (size1, size0)])
         half = jnp.where(jnp.isfinite(sizes) & (sizes > 0), sizes, 0.0) / 2
         scale = jnp.max(half, axis=1)
         return cls(half.reshape(4), jnp.where(scale > 0, scale, 1.0))

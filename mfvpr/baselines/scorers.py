@@ -1,11 +1,8 @@
 """Scorers by name."""
 
 from mfvpr.baselines.grid_anchors import GridAnchors
-from mfvpr.baselines.homography import Homography
-from mfvpr.baselines.homography_opencv import OpenCvHomography
-from mfvpr.baselines.lost import LostScore
-from mfvpr.baselines.phrases import VisualPhrases
-from mfvpr.baselines.rapid import RapidSpatialScore
+from mfvpr.baselines.homography import Homography, OpenCvHomography
+from mfvpr.baselines.spatial_scores import LostScore, RapidSpatialScore, VisualPhrases
 from mfvpr.core.aggregate import AggregatedScore, MatchCount
 from mfvpr.core.anchor import AnchorPoints
 from mfvpr.core.histogram import HistogramOfShifts

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from typing import Any
 
-from mfvpr.baselines.weight_registry import provenance
+from mfvpr.baselines.learned_weight import provenance
 from mfvpr.cli.console import tell
 from mfvpr.cli.schema import Common
 from mfvpr.datasets import Dataset, ImageFolder, QuerySequence

@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.baselines.learned_weight import LearnedWeight
-from mfvpr.baselines.weight_registry import write_weight
+from mfvpr.baselines.learned_weight import LearnedWeight, write_weight
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import mcnemar, path_test, recall_interval
@@ -104,7 +103,7 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
 
 
 def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str, Any]) -> None:
-    """Write every learned match weight by name, with how it was learned; see `mfvpr.baselines.weight_registry`."""
+    """Write every learned match weight by name, with how it was learned; see `mfvpr.baselines.learned_weight`."""
     for name, weight in _weights(comparison).items():
         write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from mfvpr import features
 from mfvpr.baselines import SCORERS
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
+from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, named_weight
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
 from mfvpr.core.scorer import parameters_of

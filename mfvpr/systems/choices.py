@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mfvpr import features
+from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, SUFFIX
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, SUFFIX
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
 from mfvpr.io.checks import Lengths

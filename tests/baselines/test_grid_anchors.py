@@ -110,9 +110,9 @@ def test_matches_without_indices_and_impossible_grids_raise():
         GridAnchors(3)(pair)
     for options, line in (
         ({"side": 0}, "side=0: expected a whole number from 1"),
-        ({"side": 9, "patch": 4}, "an odd patch"),
-        ({"side": 9, "patch": 11}, "patch up to it"),
-        ({"side": 75}, "side=75: expected a whole number from 1 to 74"),
+        ({"side": 9, "patch": 4}, "patch=4: expected an odd number"),
+        ({"side": 9, "patch": 11}, "up to the side of 9"),
+        ({"side": 74, "patch": 57}, "side . patch up to 4096"),
     ):
         with pytest.raises(InputError, match=line):
             GridAnchors(**options)

@@ -1,38 +1,56 @@
-"""Files of learned weights: equal to the last bit; other files raise."""
+"""Files of learned weights, and weights by name: words, files of the package, files of users; in programs as well."""
 
 import json
+import os
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from mfvpr import InputError
-from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
-from mfvpr.baselines.weight_registry import read_weight, write_weight
+import mfvpr
+from mfvpr import HistogramOfShifts, InputError
+from mfvpr.baselines.learned_weight import (
+    ABSOLUTE,
+    NAMED_WEIGHTS,
+    RELATIVE,
+    LearnedWeight,
+    provenance,
+    read_weight,
+    write_weight,
+)
+from mfvpr.core.weights import WEIGHTS
+from mfvpr.systems.assembly import scorers
 from tests.builders import random_matches
+from tests.programs import results, shared, small, typed
 
+pytestmark = pytest.mark.thorough
+
+MATCHES = random_matches(np.random.default_rng(0), 30)
+LEARNED = [name for name in NAMED_WEIGHTS if name not in WEIGHTS]
 PROVENANCE = {"command": "by hand", "seeds": [1, 2]}
+WEIGHT = replace(LearnedWeight.create(jax.random.key(1), MATCHES, 3), output=np.float32([1, -2, 0.5]))
 
 
-def create(names=RELATIVE):
-    return LearnedWeight.create(jax.random.key(1), random_matches(np.random.default_rng(0), 30), 3, names=names)
+@pytest.fixture
+def file(tmp_path):
+    write_weight(tmp_path / "mine.json", WEIGHT, PROVENANCE)
+    return tmp_path / "mine.json"
 
 
 @pytest.mark.parametrize("names", [RELATIVE, ABSOLUTE])
-def test_to_the_last_bit(tmp_path, names):
-    weight = create(names)
-    write_weight(tmp_path / "weight.json", weight, PROVENANCE)
-    got, provenance = read_weight(tmp_path / "weight.json")
-    assert (got.names, provenance) == (names, PROVENANCE)
+def test_to_the_last_bit(file, names):
+    weight = LearnedWeight.create(jax.random.key(1), MATCHES, 3, names=names)
+    write_weight(file, weight, PROVENANCE)
+    got, made = read_weight(file)
+    assert (got.names, made) == (names, PROVENANCE)
     jax.tree.map(np.testing.assert_array_equal, got, weight)
     assert {leaf.dtype for leaf in jax.tree.leaves(got)} == {np.dtype("float32")}
-
-
-def test_numbers_that_are_not_finite_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_weight(tmp_path / "weight.json", replace(create(), output_bias=np.float32(np.nan)), PROVENANCE)
-    assert list(tmp_path.iterdir()) == []
+        write_weight(file.with_name("other.json"), replace(weight, output_bias=np.float32(np.nan)), PROVENANCE)
+    assert list(file.parent.iterdir()) == [file]
 
 
 @pytest.mark.parametrize(
@@ -46,25 +64,98 @@ def test_numbers_that_are_not_finite_are_not_written(tmp_path):
         {"output": [1, "a", 2]},
         {"output_bias": [1]},
         {"center": None},
-        {"scale": [1, 1, 1e-300, 1, 1]},
-        {"output_bias": 1e300},
-        {"output_bias": True},
-        {"output_bias": 10**400},
-        {"inputs": ["ratio", "ratio", "score0_rank", "score1_rank", "distance_rank"]},
-        {"inputs": dict.fromkeys(RELATIVE)},
     ],
 )
-def test_damaged_files_raise(tmp_path, change):
-    path = tmp_path / "weight.json"
-    write_weight(path, create(), PROVENANCE)
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(InputError, match=r"weight\.json: .*mfvpr learn"):
-        read_weight(path)
+def test_damaged_files_raise(file, change):
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(InputError, match=r"mine\.json: .*mfvpr learn"):
+        read_weight(file)
 
 
 def test_missing_files_and_other_json_raise(tmp_path):
     (tmp_path / "text.json").write_text("[]")
-    (tmp_path / "deep.json").write_text("[" * 100_000)
-    for name, reason in (("none.json", "got nothing"), ("text.json", ""), ("deep.json", "Recursion")):
+    for name, reason in (("none.json", "got nothing"), ("text.json", "")):
         with pytest.raises(InputError, match=f"{name}: .*mfvpr learn.*{reason}"):
             read_weight(tmp_path / name)
+
+
+def test_names():
+    assert len(NAMED_WEIGHTS) == len([*NAMED_WEIGHTS])
+    assert {name: NAMED_WEIGHTS[name] for name in [*NAMED_WEIGHTS][: len(WEIGHTS)]} == WEIGHTS
+    for name in ("heavy", "../weighting", None, ("fs",), 1):
+        assert name not in NAMED_WEIGHTS
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_weights_of_the_package_have_a_provenance(name):
+    weight = NAMED_WEIGHTS[name]
+    assert weight is NAMED_WEIGHTS[name]
+    assert weight.names == RELATIVE
+    weights = np.asarray(weight(MATCHES))[np.asarray(MATCHES.mask)]
+    assert (weights > 0).all()
+    assert weights.std() > 0.01
+    path = Path(mfvpr.__file__).parent / "baselines" / "learned" / f"{name}.json"
+    assert provenance(name) == read_weight(path)[1]
+    assert provenance(name)["command"].startswith("python -m experiments.learn dataset=streets:seed=")
+    assert not re.search(r"/(home|root|work|tmp|Users)/", path.read_text())
+
+
+def test_the_file_of_a_user(file, monkeypatch):
+    scorer = scorers({"method": "histogram", "weight": str(file)})["histogram"]
+    jax.tree.map(np.testing.assert_array_equal, scorer.weight, WEIGHT)
+    assert float(scorer(MATCHES)) == float(HistogramOfShifts(weight=WEIGHT)(MATCHES)) > 0
+    assert NAMED_WEIGHTS[str(file)] is scorer.weight
+    monkeypatch.setenv("HOME", str(file.parent))
+    jax.tree.map(np.testing.assert_array_equal, NAMED_WEIGHTS["~/mine.json"], WEIGHT)
+    write_weight(file, replace(WEIGHT, output_bias=np.float32(7)), {})
+    os.utime(file, ns=(1, 1))
+    assert float(NAMED_WEIGHTS[str(file)].output_bias) == 7 != float(scorer.weight.output_bias)
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path_factory):
+    """Run a program on small data: its exit code, stdout and stderr."""
+    settings = small(shared(tmp_path_factory))
+    return lambda program, *options: typed(monkeypatch, capsys, program, *settings, *options)
+
+
+def weighted_histogram(weight, out):
+    return "figures=0", "scorer=histogram", f"scorer.weight={weight}", f"out={out}"
+
+
+@pytest.mark.slow
+def test_programs_rank_by_a_file_as_by_the_equal_word(run, file, tmp_path):
+    constant = tmp_path / "constant.json"
+    write_weight(constant, replace(WEIGHT, output=np.zeros(3, np.float32)), {})  # 1 for every match
+    axis = f"grid.weight=[unit,{constant},{file}]"
+    code, _, stderr = run("sweep", "scorer=sum", axis, f"out={tmp_path}/sweep")
+    assert code == 0, stderr
+    unit, same = (json.dumps(row["recall_at"]) for row in results(tmp_path / "sweep")["settings"][:2])
+    assert unit == same
+    rankings = []
+    for number, name in enumerate(("unit", constant, file)):
+        code, _, stderr = run("evaluate", *weighted_histogram(name, tmp_path / str(number)))
+        assert code == 0, stderr
+        lines = (tmp_path / str(number) / "predictions" / "histogram.csv").read_text().splitlines()
+        rankings.append([line.split(",")[:3] for line in lines])
+    assert rankings[0] == rankings[1] != rankings[2]
+
+
+def test_a_file_of_other_content_is_another_setting_of_a_confidence(run, tmp_path):
+    warnings = []
+    for number, weight in enumerate((WEIGHT, WEIGHT, replace(WEIGHT, output=np.float32([3, 0, 1])))):
+        file = tmp_path / f"{number}.json"
+        write_weight(file, weight, {})
+        confidence = [f"confidence={tmp_path}/0/confidence.json"] if number else []
+        code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / str(number)), *confidence)
+        assert code == 0, stderr
+        warnings.append("other settings of scorer" in stderr)
+    assert warnings == [False, False, True]
+
+
+def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):
+    expected = {"none.json": "none.json: expected a match weight", "mine.txt": "expected one of fs, dmf, ratio, unit"}
+    for name, words in expected.items():
+        code, stdout, stderr = run("evaluate", "scorer=histogram", f"scorer.weight={tmp_path}/{name}")
+        assert (code, stdout, stderr.count("\n")) == (2, "", 1)
+        assert words in stderr

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.baselines.weight_registry import read_weight
+from mfvpr.baselines.learned_weight import read_weight
 from mfvpr.cli import evaluation, learning, sweeping
 from mfvpr.tuning.learning import models, training
 from mfvpr.tuning.learning.splits import TrainingSplit

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, named_weight
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS, named_weight
 from mfvpr.core.batch import WEIGHTINGS, refuse_own_names
 from mfvpr.core.scorer import (
     Scorer,

@@ -8,7 +8,7 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import InputError
-from mfvpr.baselines.weight_registry import NAMED_WEIGHTS
+from mfvpr.baselines.learned_weight import NAMED_WEIGHTS
 from mfvpr.core import hits
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
