@@ -9,10 +9,8 @@ from .retrieval.search import retrieve
 
 # matches of two images, and of a query with its candidates
 from .matchers.host_matcher import HostMatcher
-from .matchers.lightglue_matcher import LightGlueMatcher
-from .matchers.matcher import Matcher, NearestNeighborMatcher, match_pairs
+from .matchers.matcher import LightGlueMatcher, Matcher, NearestNeighborMatcher, match_pairs, soft_match
 from .core.matching import compact, filter_matches, match, match_candidates
-from .matchers.soft import soft_match
 
 # weights of matches
 from .core.weights import (
@@ -46,8 +44,8 @@ from .datasets.positives import frame_positives, radius_positives
 from .core.metrics import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
-from .cli.systems import load_system
-from .cli.sweeps import sweep
+from .cli.command_line import load_system
+from .cli.sweeping import sweep
 from .evaluation.system import Pipeline, System
 from .utils.cluster import Cluster
 from .utils.runtime import Runtime

@@ -18,7 +18,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, schema
-from mfvpr.cli.inputs import prepare
+from mfvpr.cli.jobs import prepare
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
 from mfvpr.storage.match_files import MatchStore
@@ -27,14 +27,16 @@ from mfvpr.utils import Stopwatch
 from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent
+MFVPR = (sys.executable, "-c", "from mfvpr.cli.programs import main; main()")  # the command `mfvpr` of this clone
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
 QUERIES, CANDIDATES = 24, 8  # of the small data set
 
 
 def run(*arguments, program="evaluate", cwd=ROOT, **environment):
     """A command line in a process of its own, which takes seconds to import what it needs: see `typed`."""
+    command = [*MFVPR, program] if program in programs.COMMANDS else [sys.executable, "-m", f"experiments.{program}"]
     return subprocess.run(
-        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
+        [*command, *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=280,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
     )  # fmt: skip

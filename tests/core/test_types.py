@@ -98,7 +98,7 @@ PROGRAMS_OF_THEIR_OWN = {
     "deployment/folders.py",  # of programs that were read from files
     "deployment/stablehlo.py",  # of a new function, which has one scorer
     "matchers/batched_matching.py",  # of a new function, which has one matcher
-    "matchers/lightglue_matcher.py",  # of networks of Flax, whose classes jit compares
+    "matchers/matcher.py",  # of networks of Flax, whose classes jit compares
     "utils/numerics.py",
     "testing.py",  # of new functions, each of which has one scorer
 }
