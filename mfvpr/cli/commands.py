@@ -27,8 +27,7 @@ from mfvpr.io.containers import reading
 from mfvpr.report import Table, prediction_files
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import contact_sheet
-from mfvpr.report.pages.one_run import write_report
-from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.pages import write_comparison, write_report
 from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.storage import FeatureCache
