@@ -47,8 +47,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     plain function runs operation by operation. Capacities (`max_bins` of the histogram) are fitted to the image sizes;
     under a caller's `jit`, where sizes are traced, set them before.
     """
-    check_candidates(matches)
-    check_host(scorer)
+    check_candidates(scorer, matches)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
     scores = _score_candidates(fit_to_sizes(partial(fit_capacities, scorer, multiple=BIN_STEP), matches), matches)
@@ -77,9 +76,8 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
-    check_candidates(matches)
+    check_candidates(scorer, matches)
     refuse_own_names(scorer, axes)
-    check_host(scorer)
     weights = _weights(axes["weight"]) if "weight" in axes and hasattr(scorer, "weight") else ()
     values = {
         name: np.arange(len(weights)) if name == "weight" and weights else _axis(scorer, name, axis)
@@ -245,8 +243,9 @@ def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
     return jax.tree.map(join, *parts)
 
 
-def check_candidates(matches: Matches) -> None:
-    """Raise a ValueError unless the matches are `[C, K, ...]`."""
+def check_candidates(scorer: Any, matches: Matches) -> None:
+    """Raise a ValueError unless the matches are `[C, K, ...]`, and a scorer of the host is a value."""
+    check_host(scorer)
     if np.ndim(matches.mask) != 2:
         raise ValueError(
             f"expected matches [C, K, ...] of candidates, got a mask of shape {np.shape(matches.mask)}; of one pair "

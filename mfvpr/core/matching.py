@@ -52,7 +52,10 @@ def match_prepared(query: Query, candidate: Features, *, cross_check: CrossCheck
     """`match` of a query that `prepare_query` prepared once for all of its candidates."""
     if cross_check == "candidate":
         exchanged = Query(ready(candidate))
-        return _swap_images(match_prepared(exchanged, query.features, cross_check="none", with_ratio=with_ratio))
+        matches = match_prepared(exchanged, query.features, cross_check="none", with_ratio=with_ratio)
+        sides = [f.name[:-1] for f in fields(matches) if f.name.endswith("0")]
+        swapped = {f"{name}{1 - side}": getattr(matches, f"{name}{side}") for name in sides for side in (0, 1)}
+        return replace(matches, **swapped)
     candidate = ready(at_least_one(candidate))
     neighbors = query.neighbors(candidate, cross_check, with_second=with_ratio)
     ratio = _distance_ratio(query.features, candidate, neighbors) if with_ratio else None
@@ -183,12 +186,6 @@ def make_matches(
         count1=keypoint_count(features1),
         **optional,
     )
-
-
-def _swap_images(matches: Matches) -> Matches:
-    names = [f.name[:-1] for f in fields(matches) if f.name.endswith("0")]
-    sides = {f"{name}0": getattr(matches, f"{name}1") for name in names}
-    return replace(matches, **sides, **{f"{name}1": getattr(matches, f"{name}0") for name in names})
 
 
 def slot_numbers(features: Features) -> Int[Array, " keypoints"]:
