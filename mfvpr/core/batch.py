@@ -1,6 +1,5 @@
 """Scores of the candidates of one query, by one scorer or by a grid of its parameters: `lax.map` around `vmap`."""
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -277,11 +276,8 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
     numeric = [*numbers_by_name(scorer), *(["weight"] if hasattr(scorer, "weight") else []), "max_distance"]
     if name not in numeric:
-        nearest = difflib.get_close_matches(name, numeric, n=1) or numeric
-        raise ValueError(
-            f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)} "
-            f"(nearest: {nearest[0]})"
-        )
+        names = ", ".join(numeric)
+        raise ValueError(f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {names}")
     points = np.asarray(axis) if is_concrete(axis) else jnp.asarray(axis)  # on the host, which takes them apart
     if not (jnp.issubdtype(points.dtype, jnp.integer) and name in whole_numbers(scorer)):
         points = points.astype(jnp.result_type(float))

@@ -114,20 +114,18 @@ def choose_product(
     if product is not None:
         require_word("product", product, Product)
     may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
-    if not may_be_faster or device_of(sides).platform != "cpu":
+    if not may_be_faster or product == "float32" or device_of(sides).platform != "cpu":
         return "float32"
     dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
-    conditions = {
-        "cross_check=mutual": cross_check == "mutual",
-        "chunk_size=1": chunk_size == 1,
-        "descriptors in single or half precision": dtypes == {jnp.dtype(jnp.float32)},
-        "images with slots": all(side.mask.shape[-1] for side in sides),
-        "descriptors of one length": len(lengths) == 1,
-    }
-    missing = [condition for condition, holds in conditions.items() if not holds]
-    if product == "bfloat16" and missing:
-        raise ValueError(f"product=bfloat16: expected {' and '.join(missing)}; leave product out")
-    return product or ("float32" if missing else "bfloat16")
+    can_be_compared = dtypes == {jnp.dtype(jnp.float32)} and len(lengths) == 1
+    if can_be_compared and cross_check == "mutual" and chunk_size == 1 and all(side.mask.shape[-1] for side in sides):
+        return "bfloat16"
+    if product == "bfloat16":
+        raise ValueError(
+            "product=bfloat16: expected cross_check=mutual, chunk_size=1, images with slots, and descriptors of one "
+            "length in single or half precision; leave product out"
+        )
+    return "float32"
 
 
 class _Direction(NamedTuple):

@@ -73,19 +73,14 @@ class HistogramOfShifts:
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
-            and smooth in everything but the number of bins. None is the paper's maximum; an array
-            not above 0 scores NaN.
+            and smooth in everything but the number of bins. None is the paper's maximum; an array not above 0 is NaN.
     """
 
     bin_size: float | Array = setting(15.0, POSITIVE, unit="px")
     sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)
     weight: Weight = weight_field("fs")
     truncate: float | Array = setting(
-        math.inf,
-        POSITIVE | None,
-        "vote only within so many; None = for all bins",
-        unit="sigmas",
-        none=math.inf,
+        math.inf, POSITIVE | None, "vote only within so many; None = for all bins", unit="sigmas", none=math.inf
     )
     shift_range: tuple[float, float] | None = setting(
         None, list_of(NOT_NEGATIVE, 2) | None, "None = all possible shifts", unit="[x, y] px", swept=False
@@ -112,7 +107,7 @@ class HistogramOfShifts:
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""
         shifts, bins, weights = self._shifts(matches), self._bins(matches), match_weights(self.weight, matches)[None]
-        return _where_usable(self._maxima(shifts, bins, weights), matches, shifts, bins, weights)[0]
+        return bins.where_usable(self._maxima(shifts, bins, weights), matches, shifts, weights)[0]
 
     def _maxima(
         self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
@@ -131,7 +126,7 @@ class HistogramOfShifts:
         shifts, bins = jax.vmap(self._shifts)(matches), jax.vmap(self._bins)(matches)
         size = self.pairs_at_once(matches, weights.shape[1])
         maxima = jax.lax.map(lambda pair: self._maxima(*pair), (shifts, bins, weights), batch_size=size)
-        return jax.vmap(_where_usable)(maxima, matches, shifts, bins, weights)
+        return jax.vmap(_Bins.where_usable)(bins, maxima, matches, shifts, weights)
 
     def pairs_at_once(self, matches: Matches, num_weightings: int) -> int:
         """Pairs whose votes and bins are to exist at the same time."""
@@ -210,6 +205,7 @@ class HistogramOfShifts:
         return needed
 
     def _fit_to(self, matches: Matches) -> "HistogramOfShifts":
+        """With the capacity that one pair needs, before `jit` hides its sizes."""
         if is_concrete(matches) and not np.asarray(matches.mask).any():  # the sizes may be anything
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
@@ -314,6 +310,11 @@ class _Bins:
         numbers = ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate) & jnp.all(jnp.isfinite(shifts))
         return fits & numbers & jnp.all(jnp.isfinite(weights), axis=-1)
 
+    def where_usable(self, values: Array, matches: Matches, shifts: Array, weights: Array) -> Array:
+        """Values of one pair, for each weighting or of one; 0 without matches, NaN where not `are_usable`."""
+        usable = self.are_usable(shifts, weights)
+        return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
+
 
 def smooth_maximum(
     values: Float[Array, "*bins"], mask: Bool[Array, "*bins"], *, temperature: Array
@@ -329,18 +330,6 @@ def smooth_maximum(
     return jnp.where(is_near, temperature * jnp.log1p(jnp.mean(jnp.expm1(ratios), where=mask)), far)
 
 
-def _where_usable(
-    values: Float[Array, "*"],
-    matches: Matches,
-    shifts: Float[Array, "2 slots"],
-    bins: _Bins,
-    weights: Float[Array, "_ slots"],
-) -> Float[jax.Array, "*"]:
-    """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
-    usable = bins.are_usable(shifts, weights)
-    return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
-
-
 @partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
     scores, bins, shifts, weights = scorer._vote(matches)
@@ -352,7 +341,7 @@ def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool
             reach = jnp.asarray(scorer.shift_range, shift.dtype)
             shift = jnp.clip(shift, -reach, reach)
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
-    return _where_usable(shift, matches, shifts, bins, weights[None])
+    return bins.where_usable(shift, matches, shifts, weights[None])
 
 
 @compiled
