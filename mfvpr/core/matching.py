@@ -58,7 +58,7 @@ def match_prepared(query: Query, candidate: Features, *, cross_check: CrossCheck
         return replace(matches, **swapped)
     candidate = ready(at_least_one(candidate))
     neighbors = query.neighbors(candidate, cross_check, with_second=with_ratio)
-    ratio = _distance_ratio(query.features, candidate, neighbors) if with_ratio else None
+    ratio = distance_ratio(query.features, candidate, neighbors) if with_ratio else None
     return make_matches(query.features, candidate, neighbors.match, neighbors.real, ratio=ratio)
 
 
@@ -214,14 +214,13 @@ def _distance(
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
 
 
-def distance_ratio(features0: Features, features1: Features) -> Float[Array, " keypoints0"]:
-    """Ratio as in `match`, for features that are `ready`."""
-    return _distance_ratio(features0, features1, Query(features0).neighbors(features1, "none", with_second=True))
-
-
-def _distance_ratio(features0: Features, features1: Features, neighbors: Neighbors) -> Float[Array, " keypoints0"]:
-    closest, second = (
-        _distance(features0, features1, index, neighbors.has_second) for index in (neighbors.nearest, neighbors.second)
-    )
-    differ = neighbors.has_second & (closest < second)  # False if both are 0, or if rounding swaps equal distances
+def distance_ratio(
+    features0: Features, features1: Features, neighbors: Neighbors | None = None
+) -> Float[Array, " keypoints0"]:
+    """Ratio as in `match`, for features that are `ready`; `neighbors` if they are known."""
+    if neighbors is None:
+        neighbors = Query(features0).neighbors(features1, "none", with_second=True)
+    places, real = (neighbors.nearest, neighbors.second), neighbors.has_second
+    closest, second = (_distance(features0, features1, index, real) for index in places)
+    differ = real & (closest < second)  # False if both are 0, or if rounding swaps equal distances
     return jnp.where(differ, closest / jnp.where(differ, second, 1.0), 1.0)
