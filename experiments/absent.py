@@ -12,8 +12,8 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
-from mfvpr.cli.systems import load_system
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset

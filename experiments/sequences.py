@@ -23,8 +23,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
-from mfvpr.cli.systems import load_system
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr import HistogramOfShifts, Shortlist
+from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
-from mfvpr.cli.systems import load_system
 from mfvpr.datasets import folder
 from mfvpr.datasets.streets import TRUTH
 from mfvpr.datasets.streets.camera import LANE, SPACING, plan_drives

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float, UInt8
 
+from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
-from mfvpr.cli.systems import load_system
 from mfvpr.datasets.datasets import folder
 from mfvpr.localization import Map, Prediction
 from mfvpr.storage import FeatureCache

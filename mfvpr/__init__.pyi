@@ -46,8 +46,8 @@ from .datasets.positives import frame_positives, radius_positives
 from .core.metrics import recall_at_k
 
 # systems, by name or by parts; a whole data set, and one image at a time
-from .cli.systems import load_system
-from .cli.sweeps import sweep
+from .cli.command_line import load_system
+from .cli.sweeping import sweep
 from .evaluation.system import Pipeline, System
 from .utils.cluster import Cluster
 from .utils.runtime import Runtime

@@ -66,7 +66,7 @@ def test_settings_of_commands_are_valid(command, config):
         chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", each) for each in chosen]
     settings = programs.settings_of(*chosen, config=config)
     for name in ("also", "report"):
-        assert not getattr(settings, name, None) or compose_data_sets(name, getattr(settings, name))
+        assert not getattr(settings, name, None) or compose_data_sets(getattr(settings, name))
 
 
 def command_words(config):

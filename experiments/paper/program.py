@@ -11,9 +11,9 @@ from experiments.paper.pages import paper_figures, write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.checkpoints import how_to_install
-from mfvpr.cli import run_folder
+from mfvpr.cli import jobs
 from mfvpr.cli.console import tell
-from mfvpr.cli.inputs import cache_of, dataset_of, describe_truth
+from mfvpr.cli.jobs import cache_of, dataset_of, describe_truth
 from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
@@ -140,7 +140,7 @@ def evaluate_all(
                     fail(f"{run} on {place.name}: {error}")
                     continue
             if not (folder / PAGE).is_file():
-                run_folder.report_page(folder)
+                jobs.report_page(folder)
         if finished - before < len(names):
             write_tables(datasets)
     if finished:

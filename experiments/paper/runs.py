@@ -14,9 +14,9 @@ import numpy as np
 
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
-from mfvpr.cli import evaluation, run_folder
+from mfvpr.cli import evaluation, jobs
 from mfvpr.cli.command_line import checked, compose
-from mfvpr.cli.inputs import Inputs
+from mfvpr.cli.jobs import Inputs
 from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
@@ -117,16 +117,16 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
 
 def evaluate(settings: Evaluate, inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
-    with run_folder.claim(settings.out, settings.dataset["name"], own=True) as folder:
+    with jobs.claim(settings.out, settings.dataset["name"], own=True) as folder:
         outcome = evaluation.evaluation_of(settings)
 
         def write(new: Path) -> None:
             write_run_folder(new, outcome.report, outcome.description)
             write_json(new / INPUTS, dict(inputs))
             write_json(new / SIZES, bytes_of_an_image(outcome.inputs))
-            run_folder.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
+            jobs.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
 
-        run_folder.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
+        jobs.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 

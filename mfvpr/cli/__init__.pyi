@@ -3,5 +3,5 @@ __all__ = [
     "main",
 ]
 
+from .command_line import load_system
 from .programs import main
-from .systems import load_system

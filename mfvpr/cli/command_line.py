@@ -1,23 +1,30 @@
-"""Run a program with settings: Hydra composes them, a dataclass checks them, and the job gets them."""
+"""Settings and systems by their names: Hydra composes `conf/` and overrides, a dataclass checks, a job gets them."""
 
+import json
 import os
 import shlex
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.cli import schema
-from mfvpr.cli.console import one_line, tell
+from mfvpr.cli.console import explain, one_line, tell, warn
+from mfvpr.evaluation import System
+from mfvpr.systems import assembly
 from mfvpr.systems.choices import CONF, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
@@ -53,74 +60,14 @@ def run(program: str, find_job: Callable[[], Job], command: str) -> None:
             job(settings)
             return
         shown = shlex.join(argument for argument in typed if not argument.startswith("launcher="))
-        with _cluster(settings.cluster) as workers:
+        chosen = settings.cluster
+        starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
+        with starts[chosen["name"]](**without(chosen, "name")) if chosen else nullcontext() as workers:
+            if workers is not None:
+                tell(f"cluster: {workers}")
             job(replace(settings, command=f"{command} {shown}", multirun=multirun, workers=workers))
 
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
-
-
-def checked(program: str, composed: DictConfig) -> Any:
-    """Composed settings as the dataclass of the program, if they are allowed."""
-    values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-    return from_values(schema.PROGRAMS[program], values)
-
-
-@contextmanager
-def _cluster(settings: Mapping[str, Any]) -> Iterator[Cluster | None]:
-    """Connect to the cluster that the settings name, or start it, until the block ends."""
-    if not settings:
-        yield None
-        return
-    starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
-    with starts[settings["name"]](**without(settings, "name")) as started:
-        tell(f"cluster: {started}")
-        yield started
-
-
-def compose(program: str, overrides: list[str]) -> DictConfig:
-    """The settings of a program with overrides in Hydra's grammar, also while Hydra runs."""
-    schema.register()
-    running = GlobalHydra.instance().is_initialized()
-    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return hydra.compose(program, overrides)
-
-
-def compose_data_set(setting: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """The checked settings of a data set, by its choice and the values of some of its settings."""
-    config = compose("learn", [f"dataset={name}"]).dataset
-    for key, value in values.items():
-        if key not in [*config]:
-            raise InputError(f"{setting}: {name} has no setting {key}; it has {', '.join(map(str, config))}")
-        config[key] = value
-    if missing := sorted(OmegaConf.missing_keys(config)):
-        raise InputError(f"{setting}: dataset.{missing[0]}: expected a value of {name}")
-    settings: Any = OmegaConf.to_container(config, resolve=True)
-    schema.check_data_set(settings)
-    return settings
-
-
-def compose_data_sets(setting: str, data_sets: list[Any]) -> list[dict[str, Any]]:
-    """The checked settings of data sets such as `streets` or `{corridor: {root: DIR}}`."""
-    chosen = ({each: {}} if isinstance(each, str) else each for each in data_sets)
-    return [compose_data_set(setting, name, values or {}) for each in chosen for name, values in each.items()]
-
-
-def override(name: str, value: Any) -> str:
-    """An override of text in Hydra's grammar."""
-    escaped = str(value).replace("'", "\\'").replace("${", "\\${")
-    return f"{name}='{escaped}'"
-
-
-def aliked_or_sift() -> str:
-    """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, with a warning."""
-    if is_installed(entry_of(_STEERING_WEIGHTS)):
-        return "aliked"
-    warnings.warn(f"system=steering uses SIFT, because the weights {_STEERING_WEIGHTS} are not installed; with them it "
-                  "is more precise, see `mfvpr weights list`", stacklevel=2)  # fmt: skip
-    return "sift"
-
-
-OmegaConf.register_new_resolver("aliked_or_sift", aliked_or_sift, replace=True)
 
 
 def _set_up_jax(compiled: bool) -> None:
@@ -130,13 +77,107 @@ def _set_up_jax(compiled: bool) -> None:
     from mfvpr.utils.compiled_programs import VARIABLE, keep_compiled_programs
 
     os.environ[VARIABLE] = str(compiled).lower()  # which a map reads as well
-    keep_compiled_programs(lambda line: tell(f"warning: {line}"))
+    keep_compiled_programs(warn)
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
-        platforms = os.environ.get("JAX_PLATFORMS")
-        setting = f"JAX_PLATFORMS={platforms}" if platforms else "JAX"
-        reason = (str(error).splitlines() or ["no reason given"])[0]
-        raise InputError(
-            f"{setting}: expected a device that JAX can use here ({reason}); set JAX_PLATFORMS=cpu"
-        ) from error
+        platforms, reason = os.environ.get("JAX_PLATFORMS"), " ".join(str(error).split("\n")[:1])
+        expected = f"expected a device that JAX can use here ({reason}); set JAX_PLATFORMS=cpu"
+        raise InputError(f"JAX_PLATFORMS={platforms}: {expected}") from error
+
+
+def checked(program: str, composed: DictConfig) -> Any:
+    """Composed settings as the dataclass of the program, if they are allowed."""
+    values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+    return from_values(schema.PROGRAMS[program], values)
+
+
+def compose(program: str, overrides: list[str]) -> DictConfig:
+    """The settings of a program with overrides in Hydra's grammar, also while Hydra runs."""
+    schema.register()
+    running = GlobalHydra.instance().is_initialized()
+    try:
+        with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            return hydra.compose(program, overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(explain(error)) from error
+
+
+def compose_data_sets(data_sets: list[Any]) -> list[dict[str, Any]]:
+    """The checked settings of data sets such as `streets` or `{corridor: {root: DIR}}`."""
+    composed = []
+    for each in data_sets:
+        for name, values in ({each: {}} if isinstance(each, str) else each).items():
+            config = compose("learn", [f"dataset={name}", *_overrides(values or {}, "dataset.")]).dataset
+            if missing := sorted(OmegaConf.missing_keys(config)):
+                raise InputError(f"dataset.{missing[0]}: expected a value of {name}")
+            settings: Any = OmegaConf.to_container(config, resolve=True)
+            schema.check_data_set(settings)
+            composed.append(settings)
+    return composed
+
+
+def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
+    """A system by name, for `mfvpr.evaluate` and `mfvpr.Map`.
+
+        system = mfvpr.load_system("mfvpr")
+        system = mfvpr.load_system("mix_hist_50", candidates=20, scorer={"sigma": 15})
+        system = mfvpr.load_system("steering", features="sift")
+        system = mfvpr.load_system("runs/streets/2026-01-31_12-00-00/run.json")
+
+    Args:
+        name: as in `system=NAME` of the programs, or the run.json of a run.
+        settings: other values than the system's: the choice of a group (text), a value, or values by name.
+
+    Raises:
+        InputError: an unknown name or setting, a value that is not allowed, or weights that are not installed; one line
+            says what was expected.
+    """
+    if not str(name).endswith(".json"):
+        values: Any = OmegaConf.to_container(
+            compose("evaluate", [*_overrides({"system": str(name)} | settings)]), resolve=True
+        )
+    elif settings:
+        raise InputError(f"{name}: expected no other settings, got {', '.join(settings)}; load a system by name")
+    else:
+        try:
+            values = json.loads(Path(name).read_text(encoding="utf-8"))["settings"]
+            if not {"scorer", "previous_queries"} <= {*values}:
+                raise ValueError("another file")
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{name}: expected the run.json of a run of mfvpr evaluate, got {error}") from error
+    settings_of_run = from_values(schema.Evaluate, values)
+    return assembly.system(settings_of_run, settings_of_run.previous_queries, settings_of_run.sequence)
+
+
+def override(name: str, value: Any) -> str:
+    """An override of text in Hydra's grammar."""
+    escaped = str(value).replace("'", "\\'").replace("${", "\\${")
+    return f"{name}='{escaped}'"
+
+
+def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Settings in Hydra's grammar."""
+    for name, value in settings.items():
+        if f"{prefix}{name}" == "fusion.weights" and isinstance(value, Mapping):  # any names, but no group of settings
+            yield f"fusion.weights={{{','.join(f'{scorer}:{weight}' for scorer, weight in value.items())}}}"
+        elif isinstance(value, Mapping):
+            yield from _overrides(value, f"{prefix}{name}.")
+        elif isinstance(value, str):
+            yield override(f"{prefix}{name}", value)
+        else:
+            yield f"{prefix}{name}={json.dumps(value, default=np.generic.item)}"
+
+
+def aliked_or_sift() -> str:
+    """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, with a warning."""
+    if is_installed(entry_of(_STEERING_WEIGHTS)):
+        return "aliked"
+    reason = (
+        f"the weights {_STEERING_WEIGHTS} are not installed; with them it is more precise, see `mfvpr weights list`"
+    )
+    warnings.warn(f"system=steering uses SIFT, because {reason}", stacklevel=2)
+    return "sift"
+
+
+OmegaConf.register_new_resolver("aliked_or_sift", aliked_or_sift, replace=True)

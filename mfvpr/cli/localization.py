@@ -1,18 +1,18 @@
 """Maps: build one, add images, print what it holds; localize images, a line of JSON for each, with figures of some."""
 
 import json
-import stat
 import time
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.cli.console import tell, track
-from mfvpr.cli.inputs import dataset_of
+from mfvpr.cli.console import tell, track, warn
+from mfvpr.cli.jobs import dataset_of
 from mfvpr.cli.schema import Localize, MapBuild
 from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
@@ -27,13 +27,14 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable, used_bytes
 
 POLL = 0.2  # seconds between two looks at a folder
+Pixels = UInt8[np.ndarray, "height width channels"]
 
 
 def build_map(settings: MapBuild) -> None:
-    """Map the database of a data set."""
+    """Map the database of a data set: build map=DIR dataset=..., see `mfvpr map build --help`."""
     system = assembly.system(settings)
     images = dataset_of(settings.dataset).database
-    folder, warn = expand_user(settings.map), lambda line: tell(f"warning: {line}")
+    folder = expand_user(settings.map)
     robot_map = Map(folder, fit_to_map(folder, system, images, warn))
     added = robot_map.build(images, track=track("images"))
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
@@ -47,17 +48,20 @@ def print_map(folder: Path) -> None:
 
 
 def calibrate(folder: Path, database: Path, queries: Path) -> None:
-    """Fit the confidence of a map, which its folder then keeps."""
+    """Fit the confidence of a map on a drive: query i shows database image i, both folders of images along a path."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Map.open(folder).calibrate(database, queries)
     for warning in caught:
-        tell(f"warning: {warning.message}")
+        warn(str(warning.message))
     print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
 
 
-def add_images(folder: Path, images: list[Path], place: str | None) -> None:
-    """Add image files to a map, one by one."""
+def add_images(folder: Path, images: list[Path], *, place: str | None = None) -> None:
+    """Add image files to a map, one by one; other processes may localize meanwhile.
+
+    `place` is where they were taken, by default their names.
+    """
     robot_map = Map.open(folder)
     for path in images:
         robot_map.add(path, path.name if place is None else place)
@@ -70,59 +74,85 @@ def localize(settings: Localize) -> None:
     system = read_system(folder)
     confidence = _confidence(settings, system)
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
-    drive, figures, failed = _Drive(robot_map, settings), _LocalizationFigures(robot_map, settings), 0
+    drive, failed = _Drive(robot_map, settings), 0
     for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):
             tell(f"{len(robot_map):,} images in the map; the first image takes longer")
+        line: dict[str, Any] = {"image": name}
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
-            localized, line = drive.localize(name, pixels)
+            localized = drive.localize(name, pixels, line)
         except InputError as error:
             if not len(robot_map):
                 raise
-            failed += 1
-            localized, line = None, {"error": str(error)} | drive.entry_without_image()
+            failed, localized = failed + 1, None
+            line |= {"error": str(error)} | drive.entry_without_image()
         try:
             if localized is not None:
-                line |= drive.add(name, localized) | figures.draw(number, name, pixels, localized)
+                drive.add(name, localized, line)
+                drive.draw(number, name, pixels, localized, line)
         finally:  # the prediction must not be lost if its image cannot be added
-            print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
+            print(printable(json.dumps(line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
         raise InputError(f"{failed} of the images could not be localized; their lines say why")
-    figures.finish()
+    if drive.missing:
+        names = ",".join(sorted(map(str, drive.missing)))
+        raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
 
 
 class _Drive:
-    """One drive through a map: images are localized and added one by one."""
+    """One drive through a map: images are localized, added and drawn one by one."""
 
     def __init__(self, robot_map: Map, settings: Localize) -> None:
         self._map, self._settings = robot_map, settings
         advance = None if isinstance(settings.route, str) else settings.route
-        warn = lambda text: tell(f"warning: route={advance}: {text} (route=auto)")  # noqa: E731
-        self._route = None if settings.route is None else Route(Drive(advance), warn=warn)
+        tell_route = lambda text: warn(f"route={advance}: {text} (route=auto)")  # noqa: E731
+        self._route = None if settings.route is None else Route(Drive(advance), warn=tell_route)
+        figures = settings.figures
+        self._wanted = set(range(figures) if isinstance(figures, int) else figures)
+        self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
+        self._root = None if settings.root is None else expand_user(settings.root)
+        if self._root and not self._root.is_dir():
+            raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
-    def localize(
-        self, name: str, pixels: UInt8[np.ndarray, "height width channels"]
-    ) -> tuple[Localization, dict[str, Any]]:
-        """Localize an image and return its line; an image that is in the map sees only the images before it."""
-        start = time.perf_counter()
-        row, recent = self._map.row(name) if self._settings.add else None, self._settings.recent
-        localized = self._map.localize_with_evidence(pixels, recent=recent, before=row, route=self._route)
+    def localize(self, name: str, pixels: Pixels, line: dict[str, Any]) -> Localization:
+        """Localize an image and fill its line; one that is in the map sees the images before it."""
+        start, settings = time.perf_counter(), self._settings
+        row = self._map.row(name) if settings.add else None
+        localized = self._map.localize_with_evidence(pixels, recent=settings.recent, before=row, route=self._route)
         prediction = localized.prediction
-        line = prediction.as_json(self._settings.alternatives) | self._route_entry(prediction.located)
-        if (field_of_view := self._settings.field_of_view) is not None:
-            line |= {"shift_angles": prediction.shift_angles(field_of_view)}
-        return localized, line | {"seconds": round(time.perf_counter() - start, 4)}
+        line |= prediction.as_json(settings.alternatives) | self._route_entry(prediction.located)
+        if settings.field_of_view is not None:
+            line["shift_angles"] = prediction.shift_angles(settings.field_of_view)
+        line["seconds"] = round(time.perf_counter() - start, 4)
+        return localized
 
-    def add(self, name: str, localized: Localization) -> dict[str, Any]:
-        """Add an image to the end of the map, unless it has one of this name, and return the entry in its line."""
+    def add(self, name: str, localized: Localization, line: dict[str, Any]) -> None:
+        """Add an image to the end of the map if the settings say so, unless the map has one of this name."""
         if not self._settings.add:
-            return {}
+            return
         features, vector = localized.described
         is_new = self._map.row(name) is None
         if is_new:
             self._map.add_described([Entry(name, name, vector)], [features])
-        return {"added": is_new}
+        line["added"] = is_new
+
+    def draw(self, number: int, name: str, pixels: Pixels, localized: Localization, line: dict[str, Any]) -> None:
+        """Draw the figure of an image, `number` from 0, if the settings name it; warn if that fails."""
+        settings, names = self._settings, {number, name, PurePath(name).name}
+        if settings.out is None or not self._wanted & names:
+            return
+        self.missing -= names
+        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+        path = expand_user(settings.out) / f"{file}.png"
+        from mfvpr.report.query_figures import localization_figure  # here: Matplotlib takes 0.4 s
+
+        try:
+            localization_figure(path, self._map, name, pixels, localized, root=self._root)
+            line["figure"] = str(path)
+        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
+            line["figure"] = None
+            warn(f"{path}: not drawn ({error})")
 
     def entry_without_image(self) -> dict[str, Any]:
         """The route's entry in the line of an image that cannot be read: the robot has moved."""
@@ -137,63 +167,20 @@ class _Drive:
         return {"route": {"place": located.row if located.row is None else self._map.place(located.row)} | numbers}
 
 
-class _LocalizationFigures:
-    """Figures of the images that `figures=` names, each drawn as soon as the image is localized."""
-
-    def __init__(self, robot_map: Map, settings: Localize) -> None:
-        """Read the settings `figures`, `out` and `root`."""
-        figures, self._map, self._failed = settings.figures, robot_map, 0
-        self._wanted = set(range(figures) if isinstance(figures, int) else figures)
-        self._missing = set() if isinstance(figures, int) else {*self._wanted}  # there may be fewer images
-        self._out = Path() if settings.out is None else expand_user(settings.out)
-        self._root = None if settings.root is None else expand_user(settings.root)
-        if self._root and not self._root.is_dir():
-            raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
-
-    def draw(
-        self, number: int, name: str, pixels: UInt8[np.ndarray, "height width channels"], localized: Localization
-    ) -> dict[str, Any]:
-        """Draw the figure of an image, `number` from 0, and return its entry in the line; warn if that fails."""
-        names = {number, name, PurePath(name).name}
-        if not self._wanted & names:
-            return {}
-        self._missing -= names
-        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
-        path = self._out / f"{file}.png"
-        from mfvpr.report.query_figures import localization_figure  # here: Matplotlib takes 0.4 s
-
-        try:
-            localization_figure(path, self._map, name, pixels, localized, root=self._root)
-        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
-            self._failed += 1
-            tell(f"warning: {path}: not drawn ({error})")
-            return {"figure": None}
-        return {"figure": str(path)}
-
-    def finish(self) -> None:
-        """Raise a InputError if a figure could not be drawn, or if an image did not come."""
-        if self._failed:
-            raise InputError(f"{self._failed} of the figures could not be drawn; warnings say why")
-        if self._missing:
-            names = ",".join(sorted(map(str, self._missing)))
-            raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as "
-                                "the lines have them, or the last parts of these")  # fmt: skip
-
-
 def _confidence(settings: Localize, system: System) -> Confidence | None:
     """The confidence that the settings name, of the score that the map was made with."""
     if settings.confidence is None:
         return None
-    from mfvpr.cli import confidences  # here: it imports the reports
+    from mfvpr.cli.evaluation import ConfidenceFile  # here: it imports the reports
 
     map_settings, name = read_declaration(expand_user(settings.map)), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]
-    file, scorers = confidences.read_file(settings.confidence), system.final_scores[name].scorers
-    return confidences.confidence_of(file, name, scorers, map_settings, map_settings["candidates"])
+    file, scorers = ConfidenceFile.read(settings.confidence), system.final_scores[name].scorers
+    return file.of(name, scorers, map_settings, map_settings["candidates"])
 
 
-def images_of(settings: Localize) -> Iterator[tuple[str, Path | UInt8[np.ndarray, "height width channels"]]]:
+def images_of(settings: Localize) -> Iterator[tuple[str, Path | Pixels]]:
     """(name, file or pixels) in order; names do not depend on the spelling of a path."""
     paths = settings.images if isinstance(settings.images, list) else [settings.images]
     paths = [expand_user(path) for path in paths]
@@ -203,10 +190,9 @@ def images_of(settings: Localize) -> Iterator[tuple[str, Path | UInt8[np.ndarray
     if settings.watch and not (len(paths) == 1 and paths[0].is_dir()):
         raise InputError(f"watch=true: expected images=DIR, one folder, got {settings.images}")
     for path in paths:
-        if settings.watch:
-            yield from ((canonical_name(image), image) for image in _watch(path))
-        elif path.is_dir():
-            yield from ((canonical_name(image), image) for image in image_folder(path).paths)
+        if path.is_dir():
+            images = _watch(path) if settings.watch else image_folder(path).paths
+            yield from ((canonical_name(image), image) for image in images)
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             name = canonical_name(path)
             yield from ((f"{name}:{number}", image) for number, image in read_frames(path, every=settings.every))
@@ -219,24 +205,17 @@ def _watch(folder: Path) -> Iterator[Path]:
 
     An image whose file changes later, as when a camera writes slowly, comes again.
     """
-    done: dict[str, tuple[int, int]] = {}
-    before: dict[str, tuple[int, int]] = {}
+    done, before = dict[Path, tuple[int, int]](), dict[Path, tuple[int, int]]()
     tell(f"watching {folder}; end with Ctrl-C")
     while True:
-        paths = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES)
-        states = {path.name: state for path in paths if (state := _file_state(path)) is not None}
-        for name, state in states.items():
-            if before.get(name) == state != done.get(name):
-                done[name] = state
-                yield folder / name
+        states = {}
+        for path in sorted(folder.iterdir()):
+            with suppress(OSError):  # it has been removed
+                if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
+                    states[path] = (path.stat().st_size, path.stat().st_mtime_ns)
+        for path, state in states.items():
+            if before.get(path) == state != done.get(path):
+                done[path] = state
+                yield path
         before = states
         time.sleep(POLL)
-
-
-def _file_state(path: Path) -> tuple[int, int] | None:
-    """Size and modification time; None if there is no regular file, or it has been removed."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return (status.st_size, status.st_mtime_ns) if stat.S_ISREG(status.st_mode) else None

@@ -1,25 +1,23 @@
-"""The settings of each program as dataclasses, and of each data set and cluster; Hydra composes them with `conf/`."""
+"""The settings of each program as dataclasses, and of data sets and clusters; Hydra composes them with `conf/`."""
 
+import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.scorer import parameters_of
 from mfvpr.evaluation.drives import Method
 from mfvpr.evaluation.protocol import Split
-from mfvpr.systems.choices import GROUPS, SystemSettings, choices_of
+from mfvpr.systems.choices import GROUPS, KEYS, SystemSettings, choices_of, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
     COUNT,
     FLAG,
     INDEX,
-    NOT_NEGATIVE,
     PATH,
     POSITIVE,
     REQUIRED,
@@ -44,23 +42,19 @@ from mfvpr.utils.fields import (
 _SHARE = number(0, 1) | None
 _SEQUENCE = word_of(Method)
 _QUERIES = list_of(Rule(lambda value: INDEX.holds(value) or TEXT.holds(value), "a row or a name of a query"))
-_FIGURES = Rule(lambda value: INDEX.holds(value) or _QUERIES.holds(value),
-                "how many (at most 1000000), or a list of rows or names of queries")  # fmt: skip
-_DATA_SETS = list_of(Rule(lambda value: TEXT.holds(value) or (isinstance(value, Mapping) and len(value) == 1),
-                          "a data set, such as streets or {corridor: {root: DIR}}")) | None  # fmt: skip
-_MEMORY = "GB that features of the database may take while they are matched; null = a third of what is free"
+_NUMBER_OR_QUERIES = "how many (at most 1000000), or a list of rows or names of queries"
+_FIGURES = Rule(lambda value: INDEX.holds(value) or _QUERIES.holds(value), _NUMBER_OR_QUERIES)
+_A_DATA_SET = "a data set, such as streets or {corridor: {root: DIR}}"
+_DATA_SETS = list_of(Rule(lambda each: TEXT.holds(each) or (isinstance(each, Mapping) and len(each) == 1), _A_DATA_SET))
+_GRID = Rule(lambda value: isinstance(value, Mapping), "lists of values by parameter, such as {sigma: [10, 22.5]}")
 
 
 def _folder() -> str:
     return os.environ.get("MFVPR_CACHE") or "~/.cache/mfvpr"
 
 
-def _compiled() -> Any:
-    return setting(
-        lambda: (os.environ.get("MFVPR_COMPILED") or "true").lower() == "true",
-        FLAG,
-        "keep compiled programs on disk: the next process starts fast",
-    )
+def _is_compiled() -> bool:
+    return (os.environ.get("MFVPR_COMPILED") or "true").lower() == "true"
 
 
 @dataclass(frozen=True)
@@ -75,18 +69,32 @@ class RecallSettings:
 
 
 @dataclass(frozen=True)
-class Common(SystemSettings):
+class Resources:
+    """Settings that change no result."""
+
+    memory: float | None = setting(
+        None, POSITIVE | None, "GB that features may take while they are matched; null = a third of what is free"
+    )
+    compiled: bool = setting(_is_compiled, FLAG, "keep compiled programs on disk: the next process starts fast")
+
+
+@dataclass(frozen=True)
+class Shared(Resources):
+    """Settings of all programs that evaluate."""
+
+    devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
+    cache: str | None = setting(
+        lambda: f"{_folder()}/features", PATH | None, "features already taken from the same images; null = none"
+    )
+
+
+@dataclass(frozen=True)
+class Common(SystemSettings, Shared):
     """Settings that evaluate, sweep and learn share, and how the job was started."""
 
     dataset: Mapping[str, Any] = group()
     cluster: Mapping[str, Any] = group()
     recall: RecallSettings = field(default=RecallSettings())
-    memory: float | None = setting(None, POSITIVE | None, _MEMORY)
-    devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
-    cache: str | None = setting(
-        lambda: f"{_folder()}/features", PATH | None, "features already taken from the same images; null = none"
-    )
-    compiled: bool = _compiled()
     on_bad_image: str = setting("fail", one_of("fail", "skip"))
     out: str | None = setting(None, PATH | None, "run folder; null = runs/<data set>/<time>")
     command: str | None = None
@@ -140,29 +148,30 @@ class ChunkSettings:
 
 
 @dataclass(frozen=True)
-class Sweep(Common):
-    """Search the parameters of the re-ranking over a whole data set."""
+class Searched(Common):
+    """Settings that sweep and learn share."""
 
-    grid: Mapping[str, Any] = group()
-    search: str = setting("grid", one_of("grid", "optuna"))
-    trials: int = setting(200, whole(1, 100_000), "of optuna")
-    seed: int = setting(0, INDEX, "of optuna")
+    grid: Mapping[str, Any] = setting(dict, _GRID, "lists of values of the scorer's settings, of max_distance and of c")
     split: Split | None = setting(None, word_of(Split) | None, "choose on one half of the path, report on the other")
-    sequence: Method | None = setting(None, _SEQUENCE | None, "rank the queries of a drive together")
-    chunk: ChunkSettings = field(default=ChunkSettings())
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_values(_axes_of(self.scorer), self.grid, "grid.")
 
 
 @dataclass(frozen=True)
-class Learn(Common):
+class Sweep(Searched):
+    """Search the parameters of the re-ranking over a whole data set."""
+
+    search: str = setting("grid", one_of("grid", "optuna"))
+    trials: int = setting(200, whole(1, 100_000), "of optuna")
+    seed: int = setting(0, INDEX, "of optuna")
+    sequence: Method | None = setting(None, _SEQUENCE | None, "rank the queries of a drive together")
+    chunk: ChunkSettings = field(default=ChunkSettings())
+
+
+@dataclass(frozen=True)
+class Learn(Searched):
     """Learn the parameters of a score, and the weights of its matches."""
 
-    grid: Mapping[str, Any] = group()
-    also: Any = setting(None, _DATA_SETS, "further data sets to learn on, such as [{streets: {seed: 1}}]")
-    report: Any = setting(None, _DATA_SETS, "data sets to report on; null = the other half of the path")
+    also: Any = setting(None, _DATA_SETS | None, "further data sets to learn on, such as [{streets: {seed: 1}}]")
+    report: Any = setting(None, _DATA_SETS | None, "data sets to report on; null = the other half of the path")
     split: Split | None = setting("both", word_of(Split) | None, "where to learn")
     loss: str = setting("cross_entropy", one_of("cross_entropy", "recall", "average_precision"))
     steps: int = setting(200, COUNT)
@@ -179,22 +188,22 @@ class Learn(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_values(_axes_of(self.scorer), self.grid, "grid.")
         if self.also and not self.report:
             raise InputError("also: expected report=[...] as well, to learn on several data sets and report on others")
         if self.report and {self.features["name"], self.retrieval["name"], self.matching["name"]} & {"import", "pairs"}:
             raise InputError("report: expected no files of other programs, since they are of one data set")
         if self.report and self.split != "both":
             raise InputError(f"split={self.split}: expected none with report=, since the data sets are it")
+        if self.split is None:
+            raise InputError("split=null: expected first_half, second_half or both; the rest is reported on")
 
 
 @dataclass(frozen=True)
-class MapBuild(SystemSettings):
+class MapBuild(SystemSettings, Resources):
     """Build a map."""
 
     dataset: Mapping[str, Any] = group()
     map: str = setting(REQUIRED, PATH, "folder of the map")
-    compiled: bool = _compiled()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,7 +211,7 @@ class MapBuild(SystemSettings):
 
 
 @dataclass(frozen=True)
-class Localize:
+class Localize(Resources):
     """Localize images in a map; a line of JSON for each."""
 
     map: str = setting(REQUIRED, PATH, "folder of the map")
@@ -220,7 +229,6 @@ class Localize:
     field_of_view: float | None = setting(
         None, number(5, 179) | None, "of the camera, horizontal, degrees: lines have `shift_angles`"
     )
-    memory: float | None = setting(None, POSITIVE | None, "GB that features may take; null = a third of what is free")
     route: float | str | None = setting(
         None,
         number(-1000, 1000) | one_of("auto", None),
@@ -236,7 +244,6 @@ class Localize:
     figures: Any = setting(0, _FIGURES, "localizations that are drawn: how many, or which rows or names; needs out")
     out: str | None = setting(None, PATH | None, "folder of the figures")
     root: str | None = setting(None, PATH | None, "folder of the map's images, which figures then show")
-    compiled: bool = _compiled()
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -245,23 +252,18 @@ class Localize:
 
 
 @dataclass(frozen=True)
-class Paper:
+class Paper(Shared):
     """The paper's evaluation."""
 
     data: str | None = setting(None, PATH | None, "folder of data sets; null = the drawn one alone")
     datasets: list[str] | None = setting(None, list_of(TEXT) | None, "of these; null = all that are there")
     systems: list[str] | None = setting(None, list_of(TEXT) | None, "null = all whose weights are there")
     out: str = setting("runs/paper", PATH)
-    cache: str | None = setting(lambda: f"{_folder()}/features", PATH | None)
-    memory: float | None = setting(None, POSITIVE | None, _MEMORY)
-    devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
-    compiled: bool = _compiled()
 
     __post_init__ = check_fields
 
 
 DATA_SET_NAME = text(r"[\w-][\w.-]*", "letters, digits, - and _")
-_PLAIN = ("order", "index", "utm", "none", None)
 
 
 @dataclass(frozen=True)
@@ -272,7 +274,7 @@ class _Images:
     queries: Any = setting(REQUIRED, or_list(PATH))
     ground_truth: str | None = setting(
         None,
-        one_of(*_PLAIN, "label"),
+        one_of("order", "index", "utm", "none", "label", None),
         "order: query i shows database image i; index: a file of pairs; utm: @easting@northing@ names; label: two csv "
         "files of name,label; none: rankings only; nothing is assumed",
     )
@@ -322,21 +324,13 @@ class _Workers:
 
 OTHERS = (_Folder, _Drawn, _Published, _Workers)  # of data sets and clusters
 PROGRAMS: dict[str, type] = {
-    "evaluate": Evaluate, "sweep": Sweep, "learn": Learn, "map": MapBuild, "localize": Localize, "paper": Paper,
-}  # fmt: skip
-
-
-def axes() -> dict[str, Setting]:
-    """Lists of values of the parameters of all scorers that can be swept, and of `max_distance` and `c`."""
-    owners: dict[str, list[Setting]] = {}
-    for method, scorer in SCORERS.items():
-        for name in (name for name, parameter in parameters_of(scorer).items() if parameter.swept):
-            owners.setdefault(name, []).append(choices_of("scorer")[method][name])
-    # Those of one scorer first.
-    known = {name: each[-1] for name, each in sorted(owners.items(), key=lambda item: len(item[1]) > 1)}
-    known["c"] = Setting(None, NOT_NEGATIVE | "auto")
-    known["max_distance"] = choices_of("matching")["neighbors"]["max_distance"]  # of sweeps alone
-    return _lists(known)
+    "evaluate": Evaluate,
+    "sweep": Sweep,
+    "learn": Learn,
+    "map": MapBuild,
+    "localize": Localize,
+    "paper": Paper,
+}
 
 
 def register() -> None:
@@ -345,15 +339,13 @@ def register() -> None:
     setattr(ConfigStore, "__deepcopy__", lambda store, memo: store)  # noqa: B010
     store = ConfigStore.instance().store
     for program, owner in PROGRAMS.items():
-        store(name=f"{program}_settings", node=default_values(settings_of(owner)))
+        node = default_values(settings_of(owner))
+        if "grid" in node:  # any axis; `Axes` knows those of the scorer
+            node["grid"] = OmegaConf.create({}, flags={"struct": False})
+        store(name=f"{program}_settings", node=node)
     for choice in GROUPS:
         for name, known in choices_of(choice).items():
-            key = "method" if choice == "scorer" else "name"
-            store(group=choice, name=name, node={key: name, **default_values(known)})
-    axis_lists = default_values(axes())
-    store(name="sweep_axes", node={"grid": {**axis_lists}})
-    del axis_lists["max_distance"]
-    store(name="learn_axes", node={"grid": axis_lists})
+            store(group=choice, name=name, node={KEYS.get(choice, "name"): name, **default_values(known)})
     workers, drawn = default_values(settings_of(_Workers)), default_values(settings_of(_Drawn))
     store(group="cluster", name="local", node={"name": "local", "workers": workers["workers"]})
     store(group="cluster", name="slurm", node={"name": "slurm", "workers": 8, "options": workers["options"]})
@@ -363,17 +355,6 @@ def register() -> None:
     for name in ("streets", "streets_seasons"):
         store(group="dataset", name=name, node={"name": name, **drawn})
     OmegaConf.register_new_resolver("settings", _describe, replace=True)
-
-
-def _axes_of(scorer: Mapping[str, Any]) -> dict[str, Setting]:
-    """The axes of all scorers, with the allowed values of the chosen one."""
-    of_scorer = _lists(choices_of("scorer").get(scorer.get("method", ""), {}))
-    return {name: of_scorer.get(name, each) for name, each in axes().items()}
-
-
-def _lists(known: Mapping[str, Setting]) -> dict[str, Setting]:
-    """Settings that are lists of values of others."""
-    return {name: replace(each, default=None, rule=list_of(each.rule) | None) for name, each in known.items()}
 
 
 def _data_set_schema(settings: Mapping[str, Any]) -> dict[str, Setting]:
@@ -390,27 +371,23 @@ def check_data_set(settings: Mapping[str, Any]) -> None:
 
 def _describe(program: str, *, _root_: Any) -> str:
     """A line for each setting in `--help`, with its value, and what it means."""
-    settings: Any = OmegaConf.to_container(_root_)
-    settings = {name: value for name, value in settings.items() if name != "hydra"}
-    known: dict[str, Any] = settings_of(PROGRAMS[program])
-    for name in GROUPS:
-        known[name] = choices_of(name).get(settings.get(name, {}).get("method" if name == "scorer" else "name"), {})
-    known["grid"] = _axes_of(settings.get("scorer", {}))
-    known["dataset"], known["cluster"] = _data_set_schema(settings.get("dataset", {})), settings_of(_Workers)
-    text = "\n".join(_lines(known, settings))
+    values: Any = OmegaConf.to_container(_root_)
+    known: dict[str, Any] = settings_of(PROGRAMS[program]) | {"cluster": settings_of(_Workers)}
+    known["dataset"] = _data_set_schema(values.get("dataset", {}))
+    for name in GROUPS[:3]:
+        known[name] = choices_of(name).get(values.get(name, {}).get("name"), {})
+    text = "\n".join(_lines(known, without(values, "hydra")))
     return text.replace("$", "$$")  # Hydra fills in names behind $
 
 
-def _lines(known: Mapping[str, Any], settings: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+def _lines(known: Any, settings: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    known = choices_of("scorer").get(settings.get("method", ""), known)
     for name, value in settings.items():
-        about = known.get(name, {})
+        about = known.get(name, {}) if isinstance(known, Mapping) else {}
+        words = ""
+        if isinstance(about, Setting):
+            words = "; ".join(filter(None, [about.unit, about.note.replace("None", "null"), about.rule.expected]))
+        shown = json.dumps(value) if isinstance(value, bool | None) else "" if isinstance(value, Mapping) else value
+        yield f"{indent}{name}: {shown}" + f"  # {words}" * bool(words)
         if isinstance(value, Mapping):
-            about = choices_of("scorer").get(value.get("method", ""), about)
-            yield f"{indent}{name}:"
-            yield from _lines(about if isinstance(about, Mapping) else {}, value, f"{indent}  ")
-        else:
-            words = ""
-            if isinstance(about, Setting):
-                words = "; ".join(filter(None, [about.unit, about.note.replace("None", "null"), about.rule.expected]))
-            shown = "null" if value is None else str(value).lower() if isinstance(value, bool) else value
-            yield f"{indent}{name}: {shown}" + f"  # {words}" * bool(words)
+            yield from _lines(about, value, f"{indent}  ")

@@ -1,36 +1,50 @@
 """Sweep: matches -> scores of all settings -> the best setting, and its recall on other queries."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from mfvpr.cli import run_folder
-from mfvpr.cli.inputs import Inputs, prepare, truth_in_words, with_image_size
-from mfvpr.cli.schema import Learn, Sweep
-from mfvpr.core.scorer import parameters_of
+from mfvpr.cli import jobs
+from mfvpr.cli.jobs import Inputs, prepare, truth_in_words, with_image_size
+from mfvpr.cli.schema import Searched
+from mfvpr.cli.schema import Sweep as Settings
+from mfvpr.core import Scorer
+from mfvpr.core.scorer import numbers_by_name, static_names
+from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints, readings
+from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.drives import DriveFilter
+from mfvpr.evaluation.protocol import Split
+from mfvpr.evaluation.rankings import RETRIEVAL
+from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report import sweeps
 from mfvpr.report.run_files import matched_content
+from mfvpr.report.runs import LAST
+from mfvpr.report.sweeps import Sweep, axes_json
+from mfvpr.retrieval import Retrieval
+from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
-from mfvpr.tuning import sweeps as sweeping
-from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions
+from mfvpr.systems.choices import choices_of
+from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions, search_grid, search_optuna
 from mfvpr.tuning.sweeps.setting_rankings import forget_rankings
 from mfvpr.tuning.sweeps.setting_search import require_optuna
-from mfvpr.utils import Stopwatch
-from mfvpr.utils.errors import InputError
-from mfvpr.utils.fields import to_values
+from mfvpr.utils import InputError, Runtime, Stopwatch
+from mfvpr.utils.fields import NOT_NEGATIVE, check_values, list_of, to_values
+from mfvpr.utils.fields import Setting as Declared
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.versions import versions
 
 _MOST_SETTINGS = 1_000_000
 
 
-def sweep(settings: Sweep) -> None:
+def sweep_program(settings: Settings) -> None:
     """Search the settings, print the table, fill the run folder."""
     settings = with_image_size(settings)
-    if settings.final == "combined" and settings.grid["c"] is None and any(settings.grid.values()):
-        settings = replace(settings, grid={**settings.grid, "c": [_c(settings)]})  # the combined score is swept
-    with run_folder.claim(settings.out, settings.dataset["name"]) as folder:
+    if settings.final == "combined" and settings.grid.get("c") is None and any(settings.grid.values()):
+        settings = replace(settings, grid={**settings.grid, "c": [settings.fusion.c]})  # the combined score is swept
+    with jobs.claim(settings.out, settings.dataset["name"]) as folder:
         axes, watch = axes_of(settings), Stopwatch()
         if settings.search == "optuna":
             require_optuna()
@@ -39,7 +53,6 @@ def sweep(settings: Sweep) -> None:
         inputs = prepare(settings, watch)
         protocol = inputs.protocol(settings.split)
         matches, candidates = inputs.match(watch)
-        folder_of_rows = expand_user(settings.cache) if settings.cache else None
         method = settings.sequence
         options = SweepOptions(
             settings.recall.ks,
@@ -48,19 +61,30 @@ def sweep(settings: Sweep) -> None:
             method and DriveRanking.of(DriveFilter(method), inputs.dataset, protocol),
             settings.chunk.settings,
             settings.chunk.queries,
-            folder_of_rows,
+            expand_user(settings.cache) if settings.cache else None,
             inputs.cache.runtime,
         )
         with watch("sweep"):
             if settings.search == "grid":
                 axes.check(matches.image_sizes)
-                outcome = sweeping.search_grid(axes, protocol, matches, candidates, options)
+                outcome = search_grid(axes, protocol, matches, candidates, options)
             else:
                 trials = {"trials": settings.trials, "seed": settings.seed}
-                outcome = sweeping.search_optuna(axes, protocol, matches, candidates, options, **trials)
+                outcome = search_optuna(axes, protocol, matches, candidates, options, **trials)
         heading = _heading(settings, inputs, outcome)
-        results = _results(settings, inputs, outcome, watch.seconds)
-        run_folder.write_results(
+        values = to_values(settings)
+        names = ("scorer", "features", "retrieval", "matching", "candidates", "fusion", "final", "sequence")
+        results = {
+            "dataset": inputs.dataset.name,
+            "data_fingerprint": fingerprints(inputs.contents),
+            "reading": readings(inputs.contents),
+            **{name: values[name] for name in names},
+            "ground_truth": inputs.ground_truth,
+            **sweeps.sweep_json(outcome),
+            "seconds": watch.seconds,
+            "versions": versions(),
+        }
+        jobs.write_results(
             folder,
             settings,
             inputs.ground_truth,
@@ -71,49 +95,32 @@ def sweep(settings: Sweep) -> None:
         forget_rankings(axes.scorer, options)
 
 
-def axes_of(settings: Sweep | Learn) -> Axes:
+def axes_of(settings: Searched) -> Axes:
     """The axes of the chosen scorer from the settings `grid.`, checked."""
     chosen, values = settings.scorer, {name: axis for name, axis in settings.grid.items() if axis is not None}
     if "method" not in chosen:
-        raise InputError("scorer: a sweep takes one scorer at a time; choose with scorer=histogram, or several with "
-                         "-m scorer=sum,anchor,histogram")  # fmt: skip
+        raise InputError("scorer: a sweep takes one scorer at a time; choose one, or several with -m scorer=sum,anchor")
     if isinstance(chosen.get("weight"), list):
         raise InputError("scorer.weight: expected one weight, got a list; to compare weights, set grid.weight")
+    if settings.fusion.c == "zscore":
+        reason = "as sweeps and learning add retrieval to one score; fusion.c=auto ranks alike for weights of 1"
+        raise InputError(f"fusion.c=zscore: expected a number or auto, {reason}")
     if not values:
-        raise InputError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=; see "
-                         "--help")  # fmt: skip
+        raise InputError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=")
     [scorer] = assembly.scorers(chosen).values()
-    known = [name for name in settings.grid if name in {*parameters_of(scorer), "max_distance", "c"}]
-    if unknown := [name for name in values if name not in known]:
-        raise InputError(f"grid.{unknown[0]}: scorer={chosen['method']} has no such parameter; it has "
-                         f"{', '.join(known)}")  # fmt: skip
-    limit = settings.matching.get("max_distance")
+    matching, limit = choices_of("matching")["neighbors"], settings.matching.get("max_distance")
+    known = {name: each for name, each in choices_of("scorer")[chosen["method"]].items() if each.swept}
+    known |= {"max_distance": matching["max_distance"], "c": Declared(None, NOT_NEGATIVE | "auto")}
+    check_values({name: replace(each, rule=list_of(each.rule)) for name, each in known.items()}, values, "grid.")
     if limit is not None and any(value is None or value > limit for value in values.get("max_distance", [])):
-        raise InputError(
-            f"grid.max_distance={values['max_distance']}: expected values up to {limit}, as "
-            f"matching.max_distance={limit} leaves no other matches; set matching.max_distance=null"
-        )
-    defaults = {**chosen, "max_distance": limit}
-    if "c" in values:
-        defaults |= {"c": _c(settings) if settings.final == "combined" else 0}
+        expected = f"values up to {limit}, as matching.max_distance={limit} leaves no other matches"
+        raise InputError(f"grid.max_distance={values['max_distance']}: expected {expected}")
+    defaults = {**chosen, "max_distance": limit, "c": settings.fusion.c if settings.final == "combined" else 0}
     with assembly.in_group("grid", values):
         return Axes(scorer, values, defaults)
 
 
-def _c(settings: Sweep | Learn) -> Any:
-    """The setting fusion.c, which must not fuse several scores here."""
-    if settings.fusion.c == "zscore":
-        raise InputError("fusion.c=zscore: expected a number or auto, as sweeps and learning add retrieval to one "
-                         "score; fusion.c=auto ranks alike for weights of 1")  # fmt: skip
-    return settings.fusion.c
-
-
-def retrieval_weight(settings: Learn) -> float | None:
-    """The weight of the retrieval score, None = balanced."""
-    return None if _c(settings) == "auto" else float(_c(settings))
-
-
-def _heading(settings: Sweep, inputs: Inputs, outcome: Outcome) -> str:
+def _heading(settings: Settings, inputs: Inputs, outcome: Outcome) -> str:
     dataset, size = inputs.dataset, settings.features["image_size"]
     content = matched_content({"matching": settings.matching, "features": settings.features})
     content += " at {} x {} px".format(*size) if size and content.endswith("features") else ""
@@ -125,16 +132,96 @@ def _heading(settings: Sweep, inputs: Inputs, outcome: Outcome) -> str:
     )
 
 
-def _results(settings: Sweep, inputs: Inputs, outcome: Outcome, seconds: dict[str, float]) -> dict[str, Any]:
-    names = ("scorer", "features", "retrieval", "matching", "candidates", "fusion", "final", "sequence")
-    values = to_values(settings)
-    return {
-        "dataset": inputs.dataset.name,
-        "data_fingerprint": fingerprints(inputs.contents),
-        "reading": readings(inputs.contents),
-        **{name: values[name] for name in names},
-        "ground_truth": inputs.ground_truth,
-        **sweeps.sweep_json(outcome),
-        "seconds": seconds,
-        "versions": versions(),
-    }
+def sweep(
+    dataset: Dataset,
+    system: System | Scorer,
+    /,
+    *,
+    split: Split | None = None,
+    thresholds: Sequence[float] | None = None,
+    out: Path | str | None = None,
+    cache: FeatureCache | None = None,
+    runtime: Runtime | None = None,
+    **axes: Sequence[Any],
+) -> Sweep:
+    """Rank with every combination of parameter values, and choose the best.
+
+        sweep = mfvpr.sweep(data, MyScorer(), sigma=[5, 10, 22.5], weight=["fs", "ratio"], split="both", out="runs/s")
+        sweep.best, sweep.interval, sweep.plot("sigma", "weight")
+        print(sweep.table())
+
+    Args:
+        dataset: one query sequence with ground truth.
+        system: its only scorer is swept, and fused with the retrieval if the system ranks by that. If it has a sequence
+            of this ranking, the sequence ranks. Or a scorer, for the features and matches of `mfvpr sweep` (SIFT, VLAD,
+            50 candidates).
+        split: half of the path to choose on ("first_half", "second_half"), or "both" in turn; the result is reported
+            on the other half. None = choose and report on all queries.
+        thresholds: largest distances of a correct prediction, in the unit of the ground truth. The middle one decides.
+            None = 1, 2 and 5 frames, or 25 m.
+        out: folder of the result, also of the rankings by finished settings: the same call continues a sweep.
+        cache: where features and matches are kept; None = in memory.
+        runtime: devices, memory, progress and messages; None = those of the cache.
+        axes: lists of values by parameter: fields of the scorer (words stand for weights, `inner.sigma` is passed as
+            `**{"inner.sigma": [...]}`), `max_distance` of matches, and `c` of the fusion with the retrieval.
+
+    Raises:
+        InputError: an axis that the scorer does not have, no ground truth, a folder of something else, or images that
+            cannot be used.
+    """
+    if not isinstance(system, System):
+        sift, scorer = Sift(), system
+        pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
+        system = System(pipeline, {getattr(scorer, "__name__", type(scorer).__name__): scorer})
+    name, scorer, c = _only_scorer(system)
+    if clash := {*numbers_by_name(scorer), *static_names(scorer)} & {"split", "thresholds", "out", "cache", "runtime"}:
+        raise InputError(f"{name}.{min(clash)}: mfvpr.sweep means something else by {min(clash)}; rename the field")
+    if not axes:
+        raise InputError("sweep: expected at least one axis, such as sigma=[5, 10, 22.5]")
+    swept = Axes(scorer, axes if c is None else {"c": [c], **axes}, {} if c is None else {"c": c})
+    sequence = dataset.only
+    if sequence.truth is None:
+        raise InputError(f"{dataset.name}: expected a ground truth to choose by, got none")
+    if thresholds is None:
+        thresholds = sequence.truth.thresholds()
+    protocol, cache = evaluation_protocol(sequence.truth, thresholds, split), cache or FeatureCache()
+    filters = system.sequences.get(system.headline, ())
+    if len(filters) > 1:
+        raise InputError(f"sequences: expected at most one of {system.headline}, got {len(filters)}; sweep each")
+    options = SweepOptions(
+        ties=system.ties,
+        retrieval_score=system.fused[name].retrieval_score if name in system.fused else "cosine",
+        sequence=DriveRanking.of(filters[0], dataset, protocol) if filters else None,
+        folder=None if out is None else _block_folder(Path(out), swept),
+        runtime=runtime or cache.runtime,
+    )
+    matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=options.runtime)
+    result = Sweep(dataset.name, name, search_grid(swept, protocol, matched.by_scale, matched.candidates, options))
+    if out is not None:
+        result.save(out)
+    return result
+
+
+def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
+    """Name and value of the scorer, and the c of its fusion with the retrieval; None if the score alone ranks."""
+    if len(system.scorers) == 1:
+        [(name, scorer)] = system.scorers.items()
+        if system.headline == name:
+            return name, scorer, None
+        fusion = system.fused.get(name)
+        if system.headline == f"{name} + {RETRIEVAL}" and fusion and not fusion.weights:
+            return name, scorer, fusion.c if isinstance(fusion.c, float | int) else "auto"
+    expected = f"one that ranks by its only scorer, alone or + {RETRIEVAL}"
+    got = f"one of {', '.join(system.scorers)} that ranks by {system.headline}"
+    raise InputError(f"system: expected {expected}, got {got}; sweep mfvpr.System(system.pipeline, {{name: scorer}})")
+
+
+def _block_folder(out: Path, axes: Axes) -> Path:
+    """The folder of finished blocks, in a new or empty folder or in one of this sweep."""
+    blocks, results = out / "blocks", out / LAST
+    if not blocks.is_dir() and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"out={out}: expected a new or empty folder, or one of a sweep; name another")
+    if results.exists() and json.loads(results.read_text("utf-8"))["axes"] != axes_json(axes):
+        raise InputError(f"out={out}: has the result of a sweep of other axes; name another folder")
+    blocks.mkdir(parents=True, exist_ok=True)
+    return blocks

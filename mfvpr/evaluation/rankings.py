@@ -1,4 +1,4 @@
-"""Matches and rankings of a sequence of queries."""
+"""Matches and rankings of a sequence of queries, and scores of shortlists: of the retrieval, fused, and ranked."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

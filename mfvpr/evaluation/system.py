@@ -75,7 +75,13 @@ class Pipeline:
             expected = "a function of the features of two images that returns Matches"
             raise InputError(f"matcher: expected {expected}, got {got}; see mfvpr.Matcher")
         if isinstance(self.matcher, LightGlueMatcher):
-            _check_lightglue(self.matcher, self.extractor)
+            dimensions = [scale.dimension for scale in self.extractor.scales if scale.dimension]  # 0 = not known
+            if isinstance(self.extractor, Sift) or {*dimensions} - {self.matcher.dimension}:
+                got = f"{type(self.extractor).__name__} of {', '.join(map(str, dimensions))}"
+                expected = f"ALIKED's features, of {self.matcher.dimension} dimensions"
+                raise InputError(
+                    f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors"
+                )
 
     @property
     def image_source(self) -> PairSource | None:
@@ -240,11 +246,3 @@ def _with_part(whole: Any, part: Any, new: Any) -> Any:
     if whole is part or (type(whole) is type(part) and whole == part):
         return new
     return with_parts(whole, lambda each: _with_part(each, part, new))
-
-
-def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:
-    dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
-    if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
-        got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
-        expected = f"ALIKED's features, of {matcher.dimension} dimensions"
-        raise InputError(f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors")

@@ -30,26 +30,12 @@ from mfvpr.retrieval import (
 )
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
-from mfvpr.systems.choices import SystemSettings, without
+from mfvpr.systems.choices import NETWORKS, SystemSettings, by_scorer, without
 from mfvpr.utils import recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import fingerprint
-
-# Classes of mfvpr.features, which imports each when it is used: Flax takes half a second.
-_NETWORK_EXTRACTORS = {
-    "features": {
-        "aliked": "AlikedFeatures",
-        "d2net": "D2NetFeatures",
-        "ssm": "SsmCells",
-        "patch_netvlad": "PatchNetVladFeatures",
-        "selavpr": "SelaVprFeatures",
-        "dinov2": "Dinov2Features",
-    },
-    "retrieval": {"mixvpr": "MixVprDescriptor", "ssm": "SsmWindows"}
-    | dict.fromkeys(["netvlad", "gem", "dinov2"], "GlobalDescriptor"),
-}
 
 
 def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
@@ -84,51 +70,52 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
     if name != "same":
         return Retrieval(_network_extractor("retrieval", name, options), search)
     if isinstance(local, FeatureFiles) or not local.vector_size:
-        raise InputError("retrieval=same: expected features with a global descriptor, such as patch_netvlad, "
-                            "selavpr or dinov2; choose another retrieval")  # fmt: skip
+        expected = "features with a global descriptor, such as patch_netvlad, selavpr or dinov2"
+        raise InputError(f"retrieval=same: expected {expected}; choose another retrieval")
     return Retrieval(local, search)
 
 
-def _network_extractor(group: str, name: str, options: dict[str, Any]) -> Any:
-    """An extractor with a network; the options are fields of the extractor or of its fitting."""
-    extractor_class = getattr(features, _NETWORK_EXTRACTORS[group][name])
-    options = {option: tuple(value) if isinstance(value, list) else value for option, value in options.items()}
-    names = {field.name for field in fields(extractor_class)}
-    if "image_size" in options.keys() - names and (size := options.pop("image_size")) != extractor_class.image_size:
-        title = {"mixvpr": "MixVPR", "ssm": "SSM-VPR's retrieval"}[name]
-        expected = list(extractor_class.image_size)
-        raise InputError(f"{group}.image_size={list(size)}: {title} takes {expected} only")
+def _network_extractor(group: str, name: str, settings: Mapping[str, Any]) -> Any:
+    """An extractor with a network; the settings are of its fields, of its network, and of its fitting."""
+    extractor_class: Any = getattr(features, NETWORKS[group][name][0])
+    options: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()
+    }
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
-    model = _network(group, networks, options.pop("weights", None))
-    if (group, name) == ("retrieval", "dinov2"):
+    model = _network(group, networks, options["weights"])
+    if "pooling" in options:
         from mfvpr.networks.vit import TokenDescriptor
 
-        model = TokenDescriptor(model, options.pop("pooling"), options.pop("power"))
+        model = TokenDescriptor(model, options["pooling"], options["power"])
+    names = {field.name for field in fields(extractor_class)}
     if "whitening" in names:
         published = extractor_class.whitening
-        replaced = {field.name for field in fields(published)} & options.keys()
-        options["whitening"] = replace(published, **{option: options.pop(option) for option in replaced})
-    return extractor_class(model, **options)
+        fitting = {field.name: options[field.name] for field in fields(published) if field.name in options}
+        options["whitening"] = replace(published, **fitting)
+    return extractor_class(model, **{option: value for option, value in options.items() if option in names})
+
+
+def _network(group: str, names: tuple[str, ...], weights: str) -> Any:
+    """A network of one of these names, with its converted weights."""
+    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
+    if weights not in known:
+        raise InputError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
+    return load_model(weights)
 
 
 def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | MatchFiles:
     """The matcher of an image pair, or the match files of another program."""
-    name, options = settings["name"], without(settings, "name")
-    if name == "import":
-        return _match_files(options, data)
-    weights = options.pop("weights", None)
-    if name == "neighbors":
-        return NearestNeighborMatcher(**options)
-    return LightGlueMatcher.of(_network("matching", ("lightglue",), weights), **options)
-
-
-def _match_files(settings: Mapping[str, Any], data: Dataset | None) -> MatchFiles:
-    files = {"database": None, "queries": settings["matches"], **settings}
-    features = {"database": settings["features"], "queries": settings["query_features"] or settings["features"]}
+    if settings["name"] == "neighbors":
+        return NearestNeighborMatcher(**without(settings, "name"))
+    if settings["name"] == "lightglue":
+        model = _network("matching", ("lightglue",), settings["weights"])
+        return LightGlueMatcher.of(model, **without(settings, "name", "weights"))
+    queries = settings["query_features"] or settings["features"]
+    feature_files = {**settings, "database": settings["features"], "queries": queries}
     return MatchFiles(
-        _files("matching", files, data),
+        _files("matching", {"database": None, "queries": settings["matches"], **settings}, data),
         settings["database_prefix"],
-        {} if features["queries"] is None else _files("matching", {**settings, **features}, data),
+        {} if queries is None else _files("matching", feature_files, data),
         None if settings["image_size"] is None else tuple(settings["image_size"]),
         **{name: settings[name] for name in ("verified", "confidences", "lengths")},
     )
@@ -139,20 +126,19 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
     if data is None:
         raise InputError(f"{group}: files of other programs belong to a data set; choose others")
     queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
-    if len(queries) not in (1, len(data.sequences)):
-        raise InputError(f"{group}.queries: expected one file, or one for each of {len(data.sequences)} sequences, "
-                            f"got {len(queries)}")  # fmt: skip
-    files = {} if settings["database"] is None else {
-        data.database.root: File(expand_user(settings["database"]), settings["database_prefix"])
-    }  # fmt: skip
+    if len(queries) not in (1, count := len(data.sequences)):
+        raise InputError(
+            f"{group}.queries: expected one file, or one for each of {count} sequences, got {len(queries)}"
+        )
+    files = {}
+    if settings["database"] is not None:
+        files[data.database.root] = File(expand_user(settings["database"]), settings["database_prefix"])
     for index, sequence in enumerate(data.sequences):
         root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
-            raise InputError(
-                f"{group}.queries={path}: expected the file and the prefix of {group}.database, since the queries and "
-                f"the database are one folder, {root}; give one file with all of its images for both"
-            )
+            same = f"since the queries and the database are one folder, {root}"
+            raise InputError(f"{group}.queries={path}: expected the file and the prefix of {group}.database, {same}")
     return files
 
 
@@ -203,19 +189,6 @@ def rankings(
     }
 
 
-def _network(group: str, names: tuple[str, ...], weights: str | None) -> Any:
-    """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
-    if weights not in known:
-        raise InputError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
-    return load_model(weights)
-
-
-def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings of the chosen scorer, or of several, by name."""
-    return {settings["method"]: settings} if "method" in settings else settings
-
-
 def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Settings by scorer; a list of weights makes a scorer of each, such as `histogram_fs` and `histogram_ratio`."""
     variants: dict[str, Mapping[str, Any]] = {}
@@ -240,20 +213,18 @@ def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
-    """The chosen scorer, or several, by name."""
-    return {name: _scorer(name, values) for name, values in expand_weights(settings).items()}
-
-
-def _scorer(name: str, values: Mapping[str, Any]) -> Scorer:
-    """A scorer from plain values by field: a weight is a word, null is no limit, a list a tuple of numbers."""
-    scorer = SCORERS[values["method"]]
-    parameters = parameters_of(scorer)
-    fields: dict[str, Any] = {
-        name: named_weight(plain) if name == "weight" else parameters[name].value(plain)
-        for name, plain in without(values, "method").items()
-    }
-    with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
-        return scorer(**fields)
+    """The chosen scorer, or several, by name: a weight is a word, null is no limit, a list a tuple of numbers."""
+    made = {}
+    for name, values in expand_weights(settings).items():
+        scorer, plain = SCORERS[values["method"]], without(values, "method")
+        known = parameters_of(scorer)
+        options: dict[str, Any] = {
+            field: named_weight(value) if field == "weight" else known[field].value(value)
+            for field, value in plain.items()
+        }
+        with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
+            made[name] = scorer(**options)
+    return made
 
 
 @contextmanager

@@ -44,21 +44,33 @@ from mfvpr.utils.fields import (
 _INSTALLED = Path(__file__).parent / "conf"  # in a wheel; in a clone, it stands beside the package
 CONF = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[2] / "conf"
 GROUPS = ("features", "retrieval", "matching", "scorer")
+KEYS = {"scorer": "method"}  # the setting of a group that is its choice; otherwise `name`
 
-_WHITEN = Setting(
-    None,
-    whole(1, 4096) | None,
-    "principal components that are kept, each of unit variance, fitted on the database; null = as they are",
-)
+NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and weights, by group and choice
+    "features": {
+        "aliked": ("AlikedFeatures", "aliked-n16"),
+        "d2net": ("D2NetFeatures", "d2_tf"),
+        "ssm": ("SsmCells", "vgg16_places365"),
+        "patch_netvlad": ("PatchNetVladFeatures", "patchnetvlad_mapillary_512"),
+        "selavpr": ("SelaVprFeatures", "selavpr_msls"),
+        "dinov2": ("Dinov2Features", "dinov2_vitl14"),
+    },
+    "retrieval": {
+        "mixvpr": ("MixVprDescriptor", "mixvpr_4096"),
+        "netvlad": ("GlobalDescriptor", "netvlad_pitts30k"),
+        "gem": ("GlobalDescriptor", "cosplace_resnet50_2048"),
+        "dinov2": ("GlobalDescriptor", "dinov2_vitl14"),
+        "ssm": ("SsmWindows", "vgg16_places365"),
+    },
+}
+_WHITEN = "principal components that are kept, each of unit variance, fitted on the database; null = as they are"
 _SHAPED = SIZE | whole(10_000, 4096**2) | "auto"  # a number of pixels; fewer than 10,000 are a side that was meant
 
 
 @dataclass(frozen=True)
-class _Files:
+class _Imported:
     """Settings of files of another program."""
 
-    database: str = setting(REQUIRED, PATH, "file or folder")
-    queries: str = setting(REQUIRED, or_list(PATH), "likewise; [FILE,FILE,...] of several sequences")
     database_prefix: str = setting("", TEXT | "", "what stands before the images' names in the file, such as database/")
     query_prefix: str = setting("", TEXT | "")
     lengths: Lengths = setting("unit", word_of(Lengths), "of descriptors")
@@ -66,16 +78,16 @@ class _Files:
 
 
 @dataclass(frozen=True)
-class _Matches:
-    """Settings of matches of another program."""
+class _Files(_Imported):
+    database: str = setting(REQUIRED, PATH, "file or folder")
+    queries: str = setting(REQUIRED, or_list(PATH), "likewise; [FILE,FILE,...] of several sequences")
 
+
+@dataclass(frozen=True)
+class _Matches(_Imported):
     matches: str = setting(REQUIRED, or_list(PATH), "file or folder; [FILE,FILE,...] of several sequences")
     features: str | None = setting(None, PATH | None, "hloc's feats*.h5 that were matched")
     query_features: str | None = setting(None, PATH | None, "those of the queries, if they are in another file")
-    database_prefix: str = setting("", TEXT | "", "what stands before the images' names in the files")
-    query_prefix: str = setting("", TEXT | "")
-    lengths: Lengths = setting("unit", word_of(Lengths), "of the features' descriptors")
-    image_size: list[int] | None = setting(None, SIZE | None, "width, height of the images that the points are in")
     verified: bool = setting(False, FLAG, "true: matches that fit a geometric model, of COLMAP or vismatch")
     confidences: bool = setting(True, FLAG, "false: all matches count alike")
 
@@ -85,97 +97,75 @@ def without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _network(weights: str, owner: type, **more: Any) -> dict[str, Any]:
-    """Settings of a network: of its weights, of its extractor, and further ones."""
-    note = "`mfvpr weights list` has all weights"
-    return {"weights": Setting(weights, TEXT, note), **without(settings_of(owner), "whitening"), **more}
+def _network(group: str, name: str) -> dict[str, Any]:
+    """Settings of a network: of its weights, and of its extractor."""
+    owner, weights = NETWORKS[group][name]
+    known = settings_of(getattr(features, owner))
+    return {"weights": Setting(weights, TEXT, "`mfvpr weights list` has all weights"), **without(known, "whitening")}
 
 
 def _features() -> dict[str, dict[str, Any]]:
-    files = settings_of(_Files)
-    known = {
-        "sift": settings_of(features.Sift),
-        "aliked": _network("aliked-n16", features.AlikedFeatures),
-        "d2net": _network("d2_tf", features.D2NetFeatures),
-        "ssm": _network("vgg16_places365", features.SsmCells, **settings_of(WindowFitting)),
-        "patch_netvlad": _network("patchnetvlad_mapillary_512", features.PatchNetVladFeatures),
-        "selavpr": _network("selavpr_msls", features.SelaVprFeatures),
-        "dinov2": _network("dinov2_vitl14", features.Dinov2Features),
-        "import": files,
-    }
+    known = {"sift": without(settings_of(features.Sift), "batch_size")}
+    known |= {name: _network("features", name) for name in NETWORKS["features"]}
+    known["ssm"] |= settings_of(WindowFitting)
     for name in ("sift", "aliked", "d2net"):  # of images of any shape
         known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
-    del known["sift"]["batch_size"]
-    return known
+    return {**known, "import": settings_of(_Files)}
 
 
 def _retrieval() -> dict[str, dict[str, Any]]:
-    files, whiten = settings_of(_Files), {"whiten": _WHITEN}
-    descriptor = features.GlobalDescriptor
-    fitting: dict[str, Any] = settings_of(WindowFitting)
-    fitting["dimension"] = replace(fitting["dimension"], default=125)
-    pooling = {
+    files, known = settings_of(_Files), {name: _network("retrieval", name) for name in NETWORKS["retrieval"]}
+    known |= {"vlad": settings_of(features.VladFitting), "same": {}, "import": without(files, "image_size")}
+    for name in ("gem", "dinov2"):
+        del known[name]["components"]
+    for name, side in (("mixvpr", 320), ("ssm", 224)):
+        rule = Rule(lambda size, side=side: [*size] == [side, side], f"[{side}, {side}], as its network takes no other")
+        known[name]["image_size"] = Setting([side, side], rule, "width, height")
+    known["dinov2"] |= {
+        "image_size": Setting([224, 224], SIZE, "width, height, multiples of 14"),
         "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),
         "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
     }
-    small = {"image_size": Setting([224, 224], SIZE, "width, height, multiples of 14")}
-    mixvpr = {"image_size": Setting([320, 320], SIZE, "width, height: the only one that its weights are for")}
-    windows = {"image_size": Setting([224, 224], SIZE, "width, height: the only one that it takes")}
-    without_components = without(_network("", descriptor), "components", "weights")
-    return {
-        "vlad": {**settings_of(features.VladFitting), **whiten},
-        "mixvpr": _network("mixvpr_4096", features.MixVprDescriptor, **mixvpr, **whiten),
-        "netvlad": _network("netvlad_pitts30k", descriptor, **whiten),
-        "gem": {**_weights("cosplace_resnet50_2048"), **without_components, **whiten},
-        "dinov2": {**_weights("dinov2_vitl14"), **without_components, **small, **pooling, **whiten},
-        "ssm": _network("vgg16_places365", features.SsmWindows, **windows, **fitting),
-        "same": whiten,
-        "import": {**without(files, "image_size"), **whiten},
-        "pairs": without(files, "database", "lengths", "image_size"),
-    }
-
-
-def _weights(name: str) -> dict[str, Setting]:
-    return {"weights": Setting(name, TEXT, "`mfvpr weights list` has all weights")}
+    for name in known.keys() - {"ssm"}:
+        known[name]["whiten"] = Setting(None, whole(1, 4096) | None, _WHITEN)
+    known["ssm"] |= settings_of(WindowFitting)
+    known["ssm"]["dimension"] = replace(known["ssm"]["dimension"], default=125)
+    return {**known, "pairs": without(files, "database", "lengths", "image_size")}
 
 
 def _matching() -> dict[str, dict[str, Any]]:
+    weights = Setting("aliked_lightglue", TEXT, "`mfvpr weights list` has all weights")
     return {
         "neighbors": settings_of(NearestNeighborMatcher),
-        "lightglue": {**_weights("aliked_lightglue"), **settings_of(LightGlueMatcher)},
+        "lightglue": {"weights": weights, **settings_of(LightGlueMatcher)},
         "import": settings_of(_Matches),
     }
 
 
-def _scorer(scorer: type) -> dict[str, Setting]:
-    """Settings of a scorer from its fields; a match weight may also be one that is named, or a file."""
-    known = settings_of(scorer)
-    if "weight" in known:
-        files = text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
-        rule, note = one_of(*NAMED_WEIGHTS) | files, "a list: a scorer of each"
-        known["weight"] = replace(known["weight"], rule=rule, note=note)
-    return known
+def _scorers() -> dict[str, dict[str, Any]]:
+    """Settings of each scorer; a match weight may also be one that is named, or a file."""
+    all_known = {name: settings_of(scorer) for name, scorer in SCORERS.items()}
+    rule = one_of(*NAMED_WEIGHTS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
+    for known in all_known.values():
+        if "weight" in known:
+            known["weight"] = replace(known["weight"], rule=rule, note="a list: a scorer of each")
+    return all_known
 
 
 @cache
 def choices_of(group: str) -> dict[str, dict[str, Any]]:
     """Settings of a group by choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
-    if group == "scorer":
-        return {name: _scorer(scorer) for name, scorer in SCORERS.items()}
-    return {"features": _features, "retrieval": _retrieval, "matching": _matching}[group]()
+    return {"features": _features, "retrieval": _retrieval, "matching": _matching, "scorer": _scorers}[group]()
 
 
-def check_group(group: str, values: Any) -> None:
+def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings of the chosen scorer, or of several, by name."""
+    return {settings["method"]: settings} if "method" in settings else settings
+
+
+def _check_choice(group: str, prefix: str, values: Any) -> None:
     """Raise an InputError for a value of a choice that is not allowed, or a setting that the choice does not have."""
-    if group == "scorer" and isinstance(values, Mapping) and "method" not in values:
-        for name, each in values.items():
-            _check_choice("scorer", f"scorer.{name}", each, "method")
-    else:
-        _check_choice(group, group, values, "method" if group == "scorer" else "name")
-
-
-def _check_choice(group: str, prefix: str, values: Any, key: str) -> None:
-    choices = choices_of(group)
+    choices, key = choices_of(group), KEYS.get(group, "name")
     choice = values.get(key) if isinstance(values, Mapping) else values
     if not isinstance(values, Mapping) or choice not in choices:
         raise InputError(f"{prefix}.{key}={choice}: expected one of {', '.join(choices)}")
@@ -227,33 +217,25 @@ class SystemSettings:
     def __post_init__(self) -> None:
         """Raise an InputError for settings that are not allowed, by themselves or together."""
         check_fields(self)
-        for name in GROUPS:
-            check_group(name, getattr(self, name))
-        self._check_grid_scorer()
-        self._check_places_of_patches()
-
-    def _check_grid_scorer(self) -> None:
-        """The scorer `grid` takes the cells of features in a square grid."""
-        local, matching = self.features, self.matching
-        if self.scorer.get("method") != "grid":
-            return
-        if local["name"] not in ("ssm", "import") and matching["name"] != "import":
-            raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
-        if (check := matching.get("cross_check", matching["name"])) != "candidate":
-            raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
-        sides = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
-        if local["name"] == "ssm" and sides != [self.scorer["side"]] * 2:
-            cells = f"the {sides[0]} x {sides[1]} cells of features.image_size={local['image_size']}"
-            raise InputError(f"scorer.side={self.scorer['side']}: expected {cells}")
-
-    def _check_places_of_patches(self) -> None:
-        """The scorer `rapid` divides by the largest place of a patch, which depends on the patches' size."""
-        local = self.features
-        if local["name"] != "patch_netvlad":
-            return
-        sizes = [[16 * (pixels // 16 - patch) for pixels in local["image_size"]] for patch in local["patch_sizes"]]
-        for values in (self.scorer,) if "method" in self.scorer else self.scorer.values():
-            reach = values.get("size")
-            if reach is not None and min(map(min, sizes)) >= 0 and [[*reach]] != sizes:
-                words = f"{sizes[0]}, the largest place of these patches, or null" if len(sizes) == 1 else "null"
-                raise InputError(f"scorer.size={reach}: expected {words}")
+        for name in ("features", "retrieval", "matching"):
+            _check_choice(name, name, getattr(self, name))
+        for name, values in by_scorer(self.scorer).items():
+            _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
+        local, sides = self.features, self.features["image_size"]
+        if self.scorer.get("method") == "grid":  # which takes the cells of features in a square grid
+            if local["name"] not in ("ssm", "import") and self.matching["name"] != "import":
+                raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
+            check = self.matching.get("cross_check", self.matching["name"])
+            if check != "candidate":
+                raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
+            cells = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in sides or []]
+            if local["name"] == "ssm" and cells != [self.scorer["side"]] * 2:
+                expected = f"the {cells[0]} x {cells[1]} cells of features.image_size={sides}"
+                raise InputError(f"scorer.side={self.scorer['side']}: expected {expected}")
+        if local["name"] == "patch_netvlad":  # of whose patches the scorer `rapid` takes the largest place
+            largest = [[16 * (pixels // 16 - patch) for pixels in sides] for patch in local["patch_sizes"]]
+            for values in by_scorer(self.scorer).values():
+                size = values.get("size")
+                if size is not None and [[*size]] != largest:
+                    expected = f"{largest[0]}, the largest place of these patches, or null"
+                    raise InputError(f"scorer.size={size}: expected {expected}")

@@ -68,15 +68,10 @@ def test_mistakes_are_one_line_and_exit_code_2(refused, folder, arguments, words
     assert not folder.exists()
 
 
-def test_a_pipe_is_not_waited_for(program, refused, folder, tmp_path):
+def test_a_pipe_is_not_waited_for(refused, folder, tmp_path):
     for name, options in (("d2_tf.pth", []), ("mine.safetensors", ["--as", "d2_tf", "--own", "mine"])):
         os.mkfifo(tmp_path / name)
         refused(f"{name}: expected a", "add", tmp_path / name, *options)
-    folder.mkdir()
-    os.mkfifo(folder / REGISTRY["aliked-n16"].file)
-    code, stdout, _ = program("verify")
-    assert code == 2
-    assert "got a pipe or device" in stdout
 
 
 def test_list(program, folder):
@@ -100,7 +95,7 @@ def test_convert_list_verify(program, folder, tiny_checkpoint, monkeypatch):
     for arguments in ([], ["tiny"]):
         code, stdout, stderr = program("verify", *arguments)
         assert (code, stderr) == (0, "")
-        source = f"from tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..., which nobody published"
+        source = f"from tiny.pth of sha256 {file_sha256(tiny_checkpoint)[:12]}..."
         assert stdout == f"tiny: good, {PARAMETERS} parameters as converted, {source}\n"
     tensors = random_checkpoint(SOURCE_SHAPES)
     code, stdout, _ = program("add", write_zip(tiny_checkpoint, tensors))
@@ -151,7 +146,7 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
     assert program("add", converted, "--own", "mine", "--as", "tiny")[0] == 0
     refused("own/mine: expected a name that is free", "add", converted, "--own", "mine", "--as", "tiny")
     for arguments in ([], ["own/mine"]):
-        source = f"from converted.safetensors of sha256 {file_sha256(converted)[:12]}..., which is your own"
+        source = f"from converted.safetensors of sha256 {file_sha256(converted)[:12]}..."
         assert program("verify", *arguments)[1] == f"own/mine: good, {PARAMETERS} parameters as converted, {source}\n"
     published, listed = (line.split() for line in program("list")[1].splitlines()[-2:])
     assert (published[0], published[-2], listed[0], listed[2:5], listed[-2]) == (
@@ -189,17 +184,6 @@ def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path):
     path.with_suffix(".json").unlink()
     assert "there is no manifest" in program("verify")[1]
     assert program("list")[1].splitlines()[-1].split()[-2:] == ["no", "-"]
-
-
-def test_what_is_not_converted_is_verified_by_its_published_hash(program, folder, monkeypatch):
-    name, file = "patchnetvlad_pitts_128", "pitts_WPCA128.pth.tar"
-    folder.mkdir()
-    (folder / file).write_bytes(b"other")
-    code, stdout, _ = program("verify")
-    assert code == 2
-    assert f"{name}: BAD, {folder / file}: expected the sha256 of {name}, 74bb0e0113c0..., got " in stdout
-    monkeypatch.setitem(REGISTRY, name, tiny_entry(name, file=file, sha256=hashlib.sha256(b"other").hexdigest()))
-    assert program("verify") == (0, f"{name}: good, {file} has the published hash\n", "")
 
 
 class Site(BaseHTTPRequestHandler):

@@ -1,10 +1,6 @@
 """Command lines as they are typed: help, flags of Hydra, mistakes, and Ctrl-C."""
 
 import re
-import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
@@ -98,15 +94,3 @@ def test_a_device_that_is_not_there_is_one_line():
         assert done.returncode == 2
         assert f"error: JAX_PLATFORMS={name}: expected a device" in done.stderr
         assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize("seconds", [1, 4])
-def test_ctrl_c_is_one_line(tmp_path, seconds):
-    command = [sys.executable, "-m", "experiments.evaluate", f"out={tmp_path}/out", f"cache={tmp_path}/cache"]
-    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    time.sleep(seconds)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode in (130, -signal.SIGINT), stderr[-2000:]  # a shell sees 130 both times
-    assert stderr.splitlines()[-1].startswith("interrupted")
-    assert "Traceback" not in stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mfvpr.cli import evaluation
-from mfvpr.cli.inputs import dataset_of
+from mfvpr.cli.jobs import dataset_of
 from mfvpr.io import read_shortlist
 from tests.programs import csv_rows, output_of, settings_of, shared, small
 

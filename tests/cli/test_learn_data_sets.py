@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from mfvpr.cli import evaluation, learning
-from mfvpr.cli.command_line import compose_data_set, compose_data_sets
+from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.datasets.streets import streets_folder
 from tests.programs import QUERIES, results, settings_of, small
 
@@ -25,8 +25,7 @@ def as_text(street, name):
 
 def read(text):
     """The settings of a data set of such a list."""
-    [(name, values)] = yaml.safe_load(text).items()
-    return compose_data_set("report", name, values)
+    return compose_data_sets([yaml.safe_load(text)])[0]
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +67,10 @@ def test_results_and_tables_name_the_sets(learned):
 
 
 def test_several_sets_as_they_are_typed():
-    [corridor, drawn] = compose_data_sets("report", [{"corridor": {"root": "/a,b:c"}}, {"streets": {"seed": 4}}])
+    [corridor, drawn] = compose_data_sets([{"corridor": {"root": "/a,b:c"}}, {"streets": {"seed": 4}}])
     assert corridor["database"] == "/a,b:c/ref"
     assert (drawn["name"], learning.label(drawn)) == ("streets", "streets 4")
-    assert compose_data_sets("report", ["streets"])[0]["seed"] == 0
+    assert compose_data_sets(["streets"])[0]["seed"] == 0
 
 
 def test_images_that_were_learned_on_are_not_reported_on_and_queries_count_once(root, streets, tmp_path, refuse):

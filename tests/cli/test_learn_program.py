@@ -91,7 +91,7 @@ def test_pictures_and_weights(learned):
 
 def test_hand_set_and_searched_rows_are_those_of_a_sweep(root, learned, tmp_path):
     grid = ("scorer=sum", "split=first_half", "grid.weight=[fs,dmf,ratio,unit]")
-    sweeping.sweep(settings_of(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
+    sweeping.sweep_program(settings_of(*small(root), *grid, f"out={tmp_path}/out", config="sweep"))
     swept = results(tmp_path / "out")
     rows = rows_of(learned[1])
     assert [rows["grid search"]["halves"]["first_half"]["values"]] == swept["chosen"]
@@ -197,7 +197,7 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     (["recall.tolerances=[30]"], "smaller tolerances or radius"),
     (["also=[streets]"], "expected report=[...] as well"),
     (["report=[streets]", "split=first_half"], "split=first_half: expected none with report="),
-    (["report=[{streets: {sed: 1}}]"], "streets has no setting sed"),
+    (["report=[{streets: {sed: 1}}]"], "Could not override 'dataset.sed'"),
     (["report=[{streets: {seed: -1}}]"], "dataset.seed=-1: expected a whole number from 0"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mfvpr.cli import console, evaluation, run_folder
+from mfvpr.cli import console, evaluation, jobs
 from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test
@@ -258,7 +258,7 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
 @pytest.fixture
 def limited(monkeypatch):
     """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
-    before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), run_folder.write_results
+    before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), jobs.write_results
 
     def limit(size):
         def limited(*arguments, **named):
@@ -268,7 +268,7 @@ def limited(monkeypatch):
             finally:  # at once: the log of the tests is a file, too
                 resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-        monkeypatch.setattr(run_folder, "write_results", limited)
+        monkeypatch.setattr(jobs, "write_results", limited)
 
     return limit
 
@@ -279,7 +279,7 @@ def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, limited):
     assert code == 2
     assert "\nhistogram + retrieval " in stdout
     last = stderr.splitlines()[-1]
-    assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large); they are printed")
+    assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large)")
     assert "with out=DIR" in last
     assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []

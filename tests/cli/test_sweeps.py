@@ -157,7 +157,7 @@ class Clashing(MyScorer):
     (MyScorer(), {"sigma": [1], "out": __file__}, "out=.*: expected a new or empty folder"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_before_any_work(dataset, monkeypatch, scorer, options, words):
-    monkeypatch.setattr("mfvpr.cli.sweeps.match_sequence", lambda *_, **__: pytest.fail("begun"))
+    monkeypatch.setattr("mfvpr.cli.sweeping.match_sequence", lambda *_, **__: pytest.fail("begun"))
     with pytest.raises(mfvpr.InputError, match=words) as error:
         mfvpr.sweep(dataset, scorer, **options)
     assert "\n" not in str(error.value)

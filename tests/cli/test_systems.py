@@ -8,7 +8,7 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, load_system
-from mfvpr.cli import evaluation, inputs, programs
+from mfvpr.cli import evaluation, jobs, programs
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.choices import CONF
@@ -70,7 +70,7 @@ def test_a_system_evaluates_and_localizes_as_the_program(small_street, tmp_path)
     system = load_system("steering", **SMALL)
     again = load_system(tmp_path / "run" / "run.json")
     assert recipe_of(again.pipeline) == recipe_of(system.pipeline)
-    data = inputs.dataset_of(composed(*small(tmp_path))["dataset"])
+    data = jobs.dataset_of(composed(*small(tmp_path))["dataset"])
     result = mfvpr.evaluate(data, system, cache=FeatureCache(tmp_path / "features"))
     names = np.array(data.database.names)[result.only.systems["histogram"][0].rows[:, 0]]
     rows = [row for row in csv_rows(tmp_path / "run" / "predictions.csv") if row["rank"] == "1"]

@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr import HistogramOfShifts
 from mfvpr.cli import evaluation
-from mfvpr.cli.inputs import prepare
+from mfvpr.cli.jobs import prepare
 from mfvpr.evaluation.stages import SHIFT_FLOOR, dominant_shifts
 from mfvpr.matchers import MatchSet
 from mfvpr.report.run_files import SHIFTS

@@ -1,0 +1,317 @@
+"""Commands on weights, published data and predictions: `mfvpr weights`, `data`, `convert` and `report`."""
+
+import json
+import shlex
+from collections.abc import Sequence
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any, Literal
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import numpy as np
+import yaml
+
+from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
+from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_manifest
+from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.registry import how_to_install
+from mfvpr.cli.command_line import compose_data_sets
+from mfvpr.cli.console import Progress, refuse, track
+from mfvpr.cli.jobs import dataset_of
+from mfvpr.datasets import Dataset, QuerySequence, image_folder
+from mfvpr.datasets.contents import own_rows
+from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.datasets.published import PUBLISHED, published_differences
+from mfvpr.io import read_stamps, stamps_in_names
+from mfvpr.io.containers import reading
+from mfvpr.report import Table, prediction_files
+from mfvpr.report.evaluations import sequence_folder
+from mfvpr.report.figures import contact_sheet
+from mfvpr.report.pages.one_run import write_report
+from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.prediction_files import LocalizedImage
+from mfvpr.report.runs import file_names
+from mfvpr.storage import FeatureCache
+from mfvpr.utils import InputError
+from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.threads import ordered_map
+
+_CHUNK = 1 << 18  # bytes
+_UNPUBLISHED = {
+    "grief_season": "a park path in summer, and in snow (Krajnik et al., ECMR 2015): database/ and queries/",
+    "corridor": "an indoor corridor, 111 + 111 frames, as VPR-Bench has it: ref/ and query/",
+    "streets_seasons": "drawn: a street by day, and on seven other days; it needs no folder",
+}
+_TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
+_CANDIDATES = ("preds", "hloc", "kapture")  # layouts
+
+# --- weights -----------------------------------------------------------------------------------------------------
+
+
+def list_weights() -> None:
+    """Print all checkpoints with licenses and whether they are installed."""
+    header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
+    rows = []
+    for entry in (*REGISTRY.values(), *own_entries()):
+        installed, size = "yes" if is_installed(entry) else "no", f"{entry.size / 1e6:.1f}" if entry.size else "-"
+        file = f"yours, as {entry.like}" if entry.like else entry.file
+        rows.append([entry.name, entry.network, file, entry.code_license, entry.weights_license, installed, size])
+    print(Table(header, rows, text_columns=6).text(), end="")
+
+
+def add_weights(file: Path, *, as_: str | None = None, own: str | None = None) -> None:
+    """Install an official checkpoint, or weights of your own.
+
+    The file has its official name, or --as says which of the known weights it has. --own NAME: your own weights with
+    the official file's keys, which are then weights=own/NAME. Each of the known weights has its own license.
+    """
+    official = {entry.file: entry.name for entry in REGISTRY.values()}
+    if as_ is None and file.name not in official:
+        expected = f"an official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}"
+        raise InputError(f"{file}: expected {expected}" if file.exists() else f"{file}: no such file")
+    entry = entry_of(as_ or official[file.name])
+    path = install(file, entry.name, own=own)
+    manifest = read_manifest(entry.name if own is None else f"own/{own}")
+    origin = "" if entry.sha256 else f", from a file of sha256 {manifest.source_sha256[:12]}..., which nobody published"
+    origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={manifest.name}"
+    print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{origin}")
+
+
+def verify_weights(names: list[str] = ()) -> None:  # pyright: ignore[reportArgumentType]
+    """Check what is installed, byte by byte, against its manifests; by default all that is there."""
+    folder, known = weights_folder(), (*REGISTRY.values(), *own_entries())
+    present = [
+        entry for entry in known if any((folder / f"{entry.name}.{end}").exists() for end in ("safetensors", "json"))
+    ]
+    entries = [installed_entry(name) for name in names] or present
+    if not entries:
+        print(f"nothing is installed in {folder}")
+    bad = 0
+    for entry in entries:
+        try:
+            load_model(entry.name)
+            manifest, expected = read_manifest(entry.name), blueprint(entry).parameters
+            if manifest.parameters != expected:
+                raise InputError(f"{entry.name}: expected {expected:,} parameters, got {manifest.parameters:,}")
+            origin = f", from {manifest.source_file} of sha256 {manifest.source_sha256[:12]}..." * (not entry.sha256)
+            print(f"{entry.name}: good, {manifest.parameters:,} parameters as converted{origin}")
+        except InputError as error:
+            print(f"{entry.name}: BAD, {str(error).removeprefix(f'{entry.name}: ')}")
+            bad += 1
+    if bad:
+        refuse(f"{bad} of {len(entries)} could not be verified")
+
+
+def download_weights(name: str) -> None:
+    """Download an official checkpoint into the weights folder, under its name only if its hash is the published one."""
+    entry = entry_of(name)
+    if entry.sha256 is None:
+        remedy = f"get {entry.file} from {entry.source}, then: {how_to_install(entry)}"
+        raise InputError(f"{name}: no hash is published, so it cannot be fetched safely; {remedy}")
+    target = weights_folder() / entry.file
+    size = f"{entry.size:,} bytes" if entry.size else "size not published"
+    print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
+    if target.is_file() and file_sha256(target) == entry.sha256:
+        print(f"{target}: is there already, with the published hash")
+    else:
+        try:
+            with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
+                with temporary.open("wb") as file, Progress(entry.file, entry.size or 0) as progress:
+                    while (chunk := response.read(_CHUNK)) and not (entry.size and progress.n > entry.size):
+                        progress.reach(progress.n + file.write(chunk), entry.size or 0)
+                check_sha256(file_sha256(temporary), entry, entry.source)
+        except (OSError, HTTPException) as error:
+            if isinstance(error, HTTPError):
+                error.close()  # it is the server's response
+            reason = getattr(error, "reason", None) or error
+            raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
+        print(f"{target}: downloaded, with the published hash")
+    print(f"to install it: mfvpr weights add {shlex.quote(str(target))}")
+
+
+# --- data --------------------------------------------------------------------------------------------------------
+
+
+def list_data(names: list[str] = ()) -> None:  # pyright: ignore[reportArgumentType]
+    """Print a table of all data sets, or details of those that are named."""
+    about = {entry.name: f"{entry.title}\n{entry.layout}\nfrom {entry.source}" for entry in PUBLISHED.values()}
+    for name in names:
+        if name not in (known := about | _UNPUBLISHED):
+            raise InputError(f"{name}: expected one of {', '.join(known)}")
+        print(f"{name}: {known[name]}")
+    if not names:
+        rows = [
+            [entry.name, entry.title, f"{entry.database:,}", f"{sum(entry.queries.values()):,}"]
+            for entry in PUBLISHED.values()
+        ]
+        print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
+        print("\n".join(f"{name}: {description}" for name, description in _UNPUBLISHED.items()))
+
+
+def check_data_set(
+    name: str,
+    settings: list[str] = (),  # pyright: ignore[reportArgumentType]
+    *,
+    sheet: Path | None = None,
+) -> None:
+    """Print image counts beside the published ones and the ground truth's extent; draw image pairs.
+
+    `name` is as in dataset=NAME; settings of the data set, such as root=DIR, stand without `dataset.`; `sheet` is where
+    pairs are drawn, by default NAME.png.
+    """
+    if wrong := [each for each in settings if "=" not in each]:
+        raise InputError(f"{wrong[0]}: expected name=value")
+    values = {key: yaml.safe_load(value) for key, value in (each.split("=", 1) for each in settings)}
+    [chosen] = compose_data_sets([{name: values}])
+    dataset, contents, entry = dataset_of(chosen), FeatureCache(None).recipes.contents, PUBLISHED.get(name)
+    folders = {"database": (dataset.database, entry and entry.database)}
+    for sequence in dataset.sequences:
+        side = f"queries {sequence.name}" if len(dataset.sequences) > 1 else "queries"
+        folders[side] = sequence.images, entry and entry.queries.get(sequence.name)
+    rows, unreadable = [], []
+    for side, (folder, published) in folders.items():
+
+        def read_error(row: int, folder: Any = folder) -> str | None:
+            try:
+                folder.read(row)
+            except InputError as error:
+                return str(error)
+            return None
+
+        reasons = ordered_map(read_error, range(len(folder)), workers=available_cpus())
+        bad = [reason for reason in track(f"reading {side}")(reasons, len(folder)) if reason]
+        rows.append([side, f"{len(folder):,}", "-" if published is None else f"{published:,}", f"{len(bad):,}"])
+        unreadable += bad
+    print(Table(["images of", "there", "published", "unreadable"], rows).text())
+    print("".join(f"unreadable: {reason}\n" for reason in unreadable[:10]), end="")
+    database = contents(dataset.database)
+    for sequence in dataset.sequences:
+        print(f"{sequence.name}: {_truth_in_words(sequence)}")
+        if num_same := sum(map(bool, own_rows(contents(sequence.images), database))):
+            print(f"{sequence.name}: {num_same:,} queries are images of the database")
+    target = sheet or Path(f"{dataset.name}.png")
+    contact_sheet(target, dataset)
+    print(f"pairs of images: {target}")
+    unread = [f"{len(unreadable):,} images cannot be read"] if unreadable else []
+    if wrong := [*published_differences(dataset), *unread]:
+        refuse(f"{dataset.name}: {'; '.join(wrong)}")
+
+
+def _truth_in_words(sequence: QuerySequence) -> str:
+    """Extent of a sequence's ground truth."""
+    if sequence.truth is None:
+        return "no ground truth"
+    [threshold] = sequence.truth.thresholds(tolerances=[_TOLERANCE], radius=_RADIUS)
+    counts = sequence.truth.positives(threshold).counts
+    within = threshold_words(sequence.truth.unit, threshold).strip()
+    extent = f"{counts.min()} to {counts.max()}, median {np.median(counts):g}"
+    within = f" ({within})" if within else ""
+    return f"correct images of a query{within}: {extent}; {(counts == 0).sum():,} queries have none"
+
+
+# --- predictions -------------------------------------------------------------------------------------------------
+
+
+def write_page(runs: list[Path], *, out: Path | None = None) -> None:
+    """Write one HTML file that needs no network: of one run folder or multirun, or of several evaluations compared.
+
+    `out` is by default RUN/report.html of one run, and comparison.html here of several.
+    """
+    if len(runs) == 1:
+        path = write_report(runs[0], out)
+    else:
+        path = out or Path("comparison.html")
+        write_comparison(runs, path)
+    print(printable(f"report: {path}"))
+
+
+def convert(
+    source: Path,
+    out: Path,
+    *,
+    layout: Literal["preds", "hloc", "kapture", "tum", "kitti", "shifts"],
+    poses: Path | None = None,
+    times: Path | None = None,
+    database: Path | None = None,
+    query_prefix: str = "",
+    database_prefix: str = "",
+) -> None:
+    """Write predictions as files of other programs.
+
+    Queries without a place are left out of candidates and of TUM, have an empty place among shifts, and are an error
+    for KITTI.
+
+    source: run folder of mfvpr evaluate, or file of the lines that mfvpr localize prints.
+    out: a file; for preds, and for several query sequences, a new folder.
+    layout: candidates for VPR-methods-evaluation (preds), hloc or kapture; trajectory of TUM or KITTI; shifts with
+        ROS's times.
+    poses: for tum and kitti: poses of the database images in this layout, a line for each.
+    times: for tum and shifts: times of the queries, a line for each; by default the names of their files.
+    database: for tum and kitti of mfvpr localize: the folder of the map's images.
+    query_prefix, database_prefix: for hloc and kapture: what stands before the names of images, such as queries/.
+    """
+    is_run, is_trajectory, prefixes = source.is_dir(), layout in ("tum", "kitti"), (query_prefix, database_prefix)
+    if layout in _CANDIDATES and not is_run:
+        raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got no folder")
+    if is_trajectory and (poses is None or (database is None and not is_run)):
+        missing = "--poses" if poses is None else "--database"
+        raise InputError(f"{missing}: expected a path for --layout {layout} of {source}, got none")
+    unused = {
+        "--poses": poses is not None and not is_trajectory,
+        "--times": times is not None and layout not in ("tum", "shifts"),
+        "--database": database is not None and (is_run or not is_trajectory),
+        "--query-prefix, --database-prefix": prefixes != ("", "") and layout not in ("hloc", "kapture"),
+    }
+    if names := [name for name, is_unused in unused.items() if is_unused]:
+        raise InputError(f"{names[0]}: expected none for --layout {layout} of {source}; remove it")
+    if not is_run:
+        names = image_folder(database).names if database else ()
+        _write_localized(out, layout, prediction_files.read_lines(source), poses, names, times)
+        return
+    dataset, thresholds = _dataset_of_run(source)
+    if times and len(dataset.sequences) > 1:
+        raise InputError(f"--times: expected one query sequence, got {len(dataset.sequences)}; name images by time")
+    names = [sequence.name for sequence in dataset.sequences]
+    for place, sequence in enumerate(dataset.sequences):
+        target = out / file_names(names)[sequence.name] if len(names) > 1 else out
+        queries = sequence_folder(source, names, place)
+        images = prediction_files.read_run_images(queries, sequence.images.names)
+        if layout not in _CANDIDATES:
+            _write_localized(target, layout, images, poses, dataset.database.names, times)
+            continue
+        shortlist = prediction_files.shortlist_of(images, dataset.database.names)
+        positives = sequence.truth.positives(middle(thresholds)) if sequence.truth and thresholds else None
+        sides = sequence.images, dataset.database
+        prediction_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
+        print(printable(f"{target}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
+
+
+def _dataset_of_run(folder: Path) -> tuple[Dataset, Sequence[float]]:
+    """The data set of a run, and the thresholds of a correct prediction, if its truth says which images are correct."""
+    with reading(folder / "run.json", mend="expected the folder of an evaluation"):
+        about: Any = json.loads((folder / "run.json").read_text("utf-8"))
+        settings, thresholds = about["settings"]["dataset"], about["ground_truth"].get("thresholds", [])
+        thresholds = [] if settings.get("exclude_neighbors") is not None else thresholds  # they are not correct
+    if "recall" not in about["settings"]:
+        raise InputError(f"{folder}: expected a run of mfvpr evaluate, got one of Python; use Result.write_predictions")
+    return dataset_of(settings), thresholds
+
+
+def _write_localized(
+    path: Path,
+    layout: str,
+    images: Sequence[LocalizedImage],
+    poses: Path | None,
+    database: Sequence[str],
+    times: Path | None,
+) -> None:
+    names = [image.name for image in images]
+    stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
+    if layout == "shifts":
+        prediction_files.write_shift_table(path, images, stamps)
+    elif poses is not None:
+        prediction_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
+    num_places = sum(image.place is not None for image in images)
+    print(printable(f"{path}: {num_places} images with a place, {len(images) - num_places} without"))

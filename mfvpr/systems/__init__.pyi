@@ -1,6 +1,0 @@
-__all__ = [
-    "assembly",
-    "choices",
-]
-
-from . import assembly, choices
