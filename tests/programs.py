@@ -24,14 +24,16 @@ from mfvpr.systems.choices import CONF
 from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent
+MFVPR = (sys.executable, "-c", "from mfvpr.cli.programs import main; main()")  # the command `mfvpr` of this clone
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
 QUERIES, CANDIDATES = 24, 8  # of the small data set
 
 
 def run(*arguments, program="evaluate", cwd=ROOT, **environment):
     """A command line in a process of its own, which takes seconds to import what it needs: see `typed`."""
+    command = [*MFVPR, program] if program in programs.COMMANDS else [sys.executable, "-m", f"experiments.{program}"]
     return subprocess.run(
-        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
+        [*command, *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=280,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
     )  # fmt: skip

@@ -70,6 +70,11 @@ def duration(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
+def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
+    """Call of JAX that waits for its result."""
+    return lambda: jax.block_until_ready(function(*inputs, **options))
+
+
 def write_report(out: Path, title: str, parts: Iterable[Table | str], content: Mapping[str, Any]) -> None:
     """Print tables and remarks below a title, and write the remarks and `content` as JSON to `out`."""
     parts = list(parts)

@@ -145,7 +145,7 @@ class _Drive:
         self.missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = expand_user(settings.out) / f"{file}.png"
-        from mfvpr.report.query_figures import localization_figure  # here: Matplotlib takes 0.4 s
+        from mfvpr.report.figures import localization_figure  # here: Matplotlib takes 0.4 s
 
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)

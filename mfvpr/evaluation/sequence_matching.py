@@ -13,8 +13,7 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.system import Pipeline, folders_of
 from mfvpr.matchers.host_matcher import Side
-from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import RetrievalResult
+from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils.errors import InputError

@@ -23,11 +23,9 @@ from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matchers.host_matcher import PairSource
-from mfvpr.matchers.lightglue_matcher import LightGlueMatcher
 from mfvpr.matchers.match_set import Scales
-from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.retrieval.fitting import with_parts
-from mfvpr.retrieval.retriever import Retriever
+from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
+from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.features.extractor import Aggregation, Description, Extractor
-from mfvpr.features.feature_extraction import describe_images
+from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.packing import round_as_stored
 from mfvpr.utils.errors import InputError

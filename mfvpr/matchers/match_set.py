@@ -86,7 +86,11 @@ class MatchSet:
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
-        rows = [self._row(by_query[query], query, place) for query, place in pairs]
+        rows = []
+        for query, place in pairs:  # views
+            end = self._ends[query, place]
+            part = slice(end - self.counts[query, place], end)
+            rows.append({name: values[part] for name, values in per_match(by_query[query]).items()})
         entries, mask = ragged.pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
             values = [getattr(by_query[query], name) for query, _ in pairs]
@@ -100,18 +104,14 @@ class MatchSet:
         """End of each candidate's matches among the matches of its query."""
         return np.cumsum(self.counts, axis=1)
 
-    def _row(self, matches: Matches, query: int, place: int) -> ragged.Row:
-        """Views of the matches of one pair, out of the matches of its query."""
-        end = self._ends[query, place]
-        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(matches).items()}
-
     @cached_property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Sizes of query and database images, in all combinations."""
-        sizes = [
-            [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
-        ]
-        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
+        sizes = ([query.image_size0, query.image_size1] for query in self.matches)
+        sizes0, sizes1 = (
+            np.unique(np.concatenate([np.reshape(size, (-1, 2)) for size in side]), axis=0)
+            for side in zip(*sizes, strict=True)
+        )
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
@@ -135,10 +135,8 @@ class Scales:
         shapes = {match_set.counts.shape for match_set in self.match_sets}
         if len(shapes) != 1:
             raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
-        if self.weights is not None and len(self.weights) != len(self.match_sets):
-            raise InputError(
-                f"scales: expected a weight for each of {len(self.match_sets)} scales, got {len(self.weights)}"
-            )
+        if self.weights is not None and len(self.weights) != (number := len(self.match_sets)):
+            raise InputError(f"scales: expected a weight for each of {number} scales, got {len(self.weights)}")
 
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
@@ -199,8 +197,8 @@ def batches(
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
     """Number of queries, at least 1, with matches and scores that fit into BLOCK_BYTES."""
-    bytes_of_query = block_bytes(match_set, num_settings, 1)
-    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
+    fitting = BLOCK_BYTES // max(block_bytes(match_set, num_settings, 1), 1)
+    return max(1, min(len(scales(match_set)[0]), fitting))
 
 
 def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:

@@ -22,8 +22,7 @@ from jaxtyping import Float, Int
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source
-from mfvpr.features.feature_extraction import describe_folder
+from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source, describe_folder
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.packing import pack_features, unpack_features

@@ -57,12 +57,6 @@ def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: in
     return Whitening(mean.astype(sample.dtype), (vectors * scale).T.astype(sample.dtype))
 
 
-def fit_bytes(count: int, size: int, itemsize: int) -> int:
-    """Memory of a sample of `count` vectors and of their fit, about, in bytes."""
-    matrix = 8 * min(count, size) ** 2
-    return itemsize * count * size + 2 * matrix + 2 * 8 * min(_BLOCK, count * size)
-
-
 def _largest(products: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
     """The largest eigenvalues `[number]` of a symmetric matrix, descending, and their vectors in columns."""
     order = len(products)

@@ -61,11 +61,12 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
         dataset.only.without_neighbors(6, rows, 2)
 
 
-@pytest.mark.parametrize("memory, rows", [(None, 6), (1e-9, 6), (1e-9, 4), (None, 1)])
-def test_the_shortlist_leaves_out_excluded_images(memory, rows, monkeypatch):
+@pytest.mark.parametrize("share, rows", [(1.0, 6), (0.0, 6), (0.0, 4), (1.0, 1)])
+def test_the_shortlist_leaves_out_excluded_images(share, rows, monkeypatch):
     """However much is searched at a time: all, two queries, several rows of the database, one."""
     monkeypatch.setattr(retrieval, "ROWS", rows)
-    rng, search = np.random.default_rng(0), ExactSearch(memory)
+    monkeypatch.setattr(retrieval, "SHARE", share)
+    rng, search = np.random.default_rng(0), ExactSearch()
     descriptors = unit(rng.normal(size=(6, 8)))
     complete = search.shortlist(descriptors, descriptors, 6)
     np.testing.assert_array_equal(complete.indices[:, 0], np.arange(6))

@@ -4,7 +4,6 @@ import json
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
-from tests.programs import ROOT, output_of, settings_of
+from tests.programs import MFVPR, ROOT, output_of, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -402,7 +401,7 @@ def test_a_map_is_calibrated(folder, small_street, call_program, localize):
 
 @pytest.mark.slow
 def test_new_images_of_a_folder_are_localized(folder, small_street, queries):
-    command = [sys.executable, "-m", "experiments.localize", f"map={folder}", f"images={queries}", "watch=true"]
+    command = [*MFVPR, "localize", f"map={folder}", f"images={queries}", "watch=true"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         assert running.stderr.readline() == f"watching {queries}; end with Ctrl-C\n"
         for row in (3, 5):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.conversion import NETVLAD_MATLAB, convert
 from mfvpr.checkpoints.networks import NETWORKS, plan_network
-from mfvpr.checkpoints.tables import NETVLAD_MATLAB
 from mfvpr.networks import VggNetVlad
 from mfvpr.utils import InputError
 from tests.io.checks import one_line_error
