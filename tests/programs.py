@@ -18,12 +18,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, schema
-from mfvpr.cli.jobs import prepare
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.storage.match_files import MatchStore
 from mfvpr.systems.choices import CONF
-from mfvpr.utils import Stopwatch
 from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent
@@ -90,13 +87,6 @@ def job_of(root, config, job, figures):
         return results(out)
 
     return call
-
-
-def matches_path(settings):
-    """The folder in which a program keeps the matches of its data set, and their recipe."""
-    inputs = prepare(settings, Stopwatch())
-    recipe = inputs.matches_recipe()
-    return MatchStore(inputs.cache.root, recipe | {"scale": 0}, len(inputs.dataset.queries)).folder, recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

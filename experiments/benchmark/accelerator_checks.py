@@ -19,7 +19,7 @@ from mfvpr.core.types import Features, Matches
 from mfvpr.networks.layers import preprocess
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 from tests import oracles
 
 SIZE, CANDIDATES, DIMENSION = 336, 8, 128  # px

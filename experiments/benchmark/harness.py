@@ -13,8 +13,8 @@ import numpy as np
 from mfvpr.cli.console import Progress
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
 Entry = tuple[str, str, Callable[[], Any]]  # step, implementation, the call that is timed
 Seconds = Mapping[tuple[str, str], list[float]]  # (step, implementation) -> seconds of every call

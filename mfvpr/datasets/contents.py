@@ -19,7 +19,7 @@ from typing import Any
 from mfvpr.datasets.datasets import ImageFolder, OwnRows
 from mfvpr.datasets.image_reading import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
 FORMAT = 2  # of the record files: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds

@@ -28,8 +28,7 @@ from mfvpr.evaluation.system import System, folders_of
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import Runtime
+from mfvpr.utils.runtime import Runtime, Stopwatch
 
 KS = (1, 5, 10)  # depths of recall, by default
 Reason = Literal[  # why there is no place

@@ -36,11 +36,10 @@ from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.storage.match_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 

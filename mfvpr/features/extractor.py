@@ -15,8 +15,7 @@ from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet, FeatureSource, check_features, without_padding
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.progress import Track, no_progress
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import Track, no_progress, ordered_map
 
 
 class Scale(NamedTuple):

@@ -14,12 +14,11 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int, Shaped
 
 from mfvpr.core.types import Array, Features, per_keypoint
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, compiled, free_bytes, round_up
+from mfvpr.utils.numerics import Device, compiled, free_bytes, repeat_last, round_up
 
 SHARE = 1 / 3  # of the free memory, by default
 STEP = 32  # capacities are multiples of it
@@ -150,9 +149,9 @@ class Slots:
         self._features, self._device = features, device
         counts = features.counts
         # The capacity that fits all counts, and a smaller one for half of the images if it saves a quarter.
-        half, most = ragged.sizes(counts[wanted], (0.5, 1.0), STEP)[[0, -1]].tolist()
+        half, most = few_capacities(counts[wanted], (0.5, 1.0), STEP)[[0, -1]].tolist()
         capacities = [half, most] if half <= 0.75 * most else [most]
-        self._capacity = ragged.smallest_capacities(np.array(capacities), np.minimum(counts, most))
+        self._capacity = np.array(capacities)[np.searchsorted(capacities, np.minimum(counts, most))]
         wanted = wanted[counts[wanted] > 0]
         rows = {capacity: int(np.sum(self._capacity[wanted] == capacity)) for capacity in capacities}
         size = features.keypoint_bytes if len(wanted) else 1
@@ -215,11 +214,11 @@ def _write_slots(arrays: Features, slots: Int[Array, " rows"], rows: Features) -
 
 
 def stack_features(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
-    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `ragged.pad_rows`."""
+    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `pad_rows`."""
     rows = [{name: values for name, values in per_keypoint(image).items() if name != "mask"} for image in images]
-    arrays, mask = ragged.pad_rows(rows, capacity, total=total)
+    arrays, mask = pad_rows(rows, capacity, total=total)
     sizes = np.stack([image.image_size for image in images])
-    return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.repeat_last(sizes, total))
+    return Features(**arrays, mask=mask, image_size=sizes if total is None else repeat_last(sizes, total))
 
 
 def without_padding(image: Features) -> Features:
@@ -243,3 +242,27 @@ def check_features(image: Features, name: str, *, unit_length: bool) -> None:
             f"{name}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
             "divide them by their Euclidean length, or say unit_length=False"
         )
+
+
+def pad_rows(
+    rows: Sequence[Mapping[str, np.ndarray]], capacity: int, *, total: int | None = None
+) -> tuple[dict[str, Shaped[np.ndarray, "rows slots ..."]], Bool[np.ndarray, "rows slots"]]:
+    """At least one row as `total` padded arrays by name, 0 beyond the ends of the rows, and the mask."""
+    total = len(rows) if total is None else total
+    arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
+    counts = np.zeros(total, int)
+    for place, row in enumerate(rows):
+        counts[place] = len(next(iter(row.values())))
+        for name, values in row.items():
+            arrays[name][place, : counts[place]] = values
+    return arrays, np.arange(capacity) < counts[:, None]
+
+
+def few_capacities(
+    counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int
+) -> Int[np.ndarray, " capacities"]:
+    """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts`: quantiles of those above 0."""
+    lengths = counts[counts > 0]
+    if not lengths.size:
+        return np.array([step])
+    return np.unique(np.ceil(np.quantile(lengths, quantiles) / step).astype(int) * step)

@@ -14,11 +14,10 @@ from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale
 from mfvpr.networks.layers import Images, Pixels, of_unit_length
 from mfvpr.networks.mixvpr import IMAGE_SIZE
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import SIZE, Rule, check_fields, setting, whole, word_of
-from mfvpr.utils.numerics import device_bytes, knows_own_context
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
+from mfvpr.utils.runtime import ordered_map
 
 TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
 
@@ -183,7 +182,7 @@ def in_batches(
 
     def run(start: int) -> list[Any]:
         batch = images[start : start + size]
-        outputs = jax.tree.map(np.asarray, program(ragged.repeat_last(batch, size)))
+        outputs = jax.tree.map(np.asarray, program(repeat_last(batch, size)))
         return [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
 
     starts = range(0, len(images), size)

@@ -11,11 +11,11 @@ from jaxtyping import Float, Num
 
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
+from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
 from mfvpr.networks.layers import Preprocessing
 from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
 from mfvpr.utils.fields import SIZE, setting, whole, word_of
-from mfvpr.utils.whitening import Whitening
 
 _CHANNELS = 512
 _STRIDES = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}

@@ -16,10 +16,10 @@ from jaxtyping import Float, Int
 
 from mfvpr.core.types import Array
 from mfvpr.features.extractor import Extractor
+from mfvpr.features.whitening import Whitening, fit_whitening
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.whitening import Whitening, fit_whitening
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,10 @@ from jaxtyping import Int, Num
 
 from mfvpr.core.types import Features, Matches, Shortlist, per_match
 from mfvpr.features.feature_set import FeatureSet, Slots, Staged, memory_budget
-from mfvpr.matchers.match_set import QueryMatches, split_pairs
+from mfvpr.matchers.match_set import QueryMatches, Row, split_pairs
 from mfvpr.matchers.matcher import Matcher, match_pairs
-from mfvpr.utils import ragged
-from mfvpr.utils.numerics import Device, holds_function
-from mfvpr.utils.ragged import Row
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import Device, holds_function, repeat_last
+from mfvpr.utils.runtime import ordered_map
 
 QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
 PAIRS = 128  # per call
@@ -125,7 +123,7 @@ def _begin(sides: Sides, staged: Sequence[Staged], match: Callable[..., Matches]
         features = [of_side[int(capacity)] for of_side, capacity in zip(arrays, shape, strict=True)]
         for start in range(0, len(members), PAIRS):
             positions = members[start : start + PAIRS]
-            pairs = ragged.repeat_last(slots[positions], PAIRS)
+            pairs = repeat_last(slots[positions], PAIRS)
             calls.append((positions, match(*features, pairs, np.int32(len(positions)))))
     return calls
 
@@ -135,7 +133,8 @@ def join_candidates(
 ) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
     """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]
-    rows = ragged.join_rows([pair.matches for pair in matched_pairs] or [no_matches])
+    parts = [pair.matches for pair in matched_pairs] or [no_matches]
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     unknown = np.ones(2, np.float32)
     matches = Matches(
         **rows,

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.core.types import Matches, per_match, per_pair
-from mfvpr.utils import ragged
+from mfvpr.features.feature_set import few_capacities, pad_rows
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import available_cpus, round_up
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import available_cpus, repeat_last, round_up
+from mfvpr.utils.runtime import ordered_map
 
 BATCH_SLOTS = 2**14  # slots of a batch of pairs: its votes stay in the cache
 PAIRS_STEP = 8
@@ -24,6 +24,7 @@ QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
 
+Row = Mapping[str, np.ndarray]  # matches [n, ...] by field
 Normalize = Literal["zscore", "none"]
 
 
@@ -91,12 +92,12 @@ class MatchSet:
             end = self._ends[query, place]
             part = slice(end - self.counts[query, place], end)
             rows.append({name: values[part] for name, values in per_match(by_query[query]).items()})
-        entries, mask = ragged.pad_rows(rows, capacity, total=total)
+        entries, mask = pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
             values = [getattr(by_query[query], name) for query, _ in pairs]
             if name.endswith("1"):  # of all candidates
                 values = [of_query[place] for of_query, (_, place) in zip(values, pairs, strict=True)]
-            entries[name] = ragged.repeat_last(np.stack(values), len(mask))
+            entries[name] = repeat_last(np.stack(values), len(mask))
         return Matches(**entries, mask=mask)
 
     @cached_property
@@ -155,10 +156,10 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
 
     Few settings or a small set have fewer sizes: padding then costs less time than compiling for another size.
     """
-    sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
+    sizes = few_capacities(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
-    sizes = ragged.prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
-    return ragged.smallest_capacities(sizes, match_set.counts)
+    sizes = prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
+    return sizes[np.searchsorted(sizes, match_set.counts)]
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
@@ -213,4 +214,27 @@ def split_pairs(matches: Matches) -> list[dict[str, np.ndarray]]:
     """Real matches of each of the pairs `[P, K, ...]`, by field. NumPy."""
     mask = np.asarray(matches.mask)
     flat = {name: np.asarray(values)[mask] for name, values in per_match(matches).items()}
-    return ragged.split(flat, mask.sum(axis=1))
+    return split_rows(flat, mask.sum(axis=1))
+
+
+def split_rows(flat: Row, counts: Int[np.ndarray, " rows"]) -> list[dict[str, np.ndarray]]:
+    """Rows of lengths `counts`, as views of arrays that hold one row after the other."""
+    ends = np.cumsum(counts)
+    return [
+        {name: values[end - count : end] for name, values in flat.items()}
+        for count, end in zip(counts.tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def prune_capacities(
+    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
+) -> Int[np.ndarray, " _"]:
+    """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
+    lengths = counts[counts > 0]
+    while len(capacities) > 1:
+        rows = np.bincount(np.searchsorted(capacities, lengths), minlength=len(capacities))
+        saved = rows[:-1] * np.diff(capacities)
+        if saved.min() >= saving:
+            break
+        capacities = np.delete(capacities, saved.argmin())
+    return capacities

@@ -11,11 +11,11 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
+from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.whitening import Whitening
 
 if TYPE_CHECKING:  # Flax takes half a second
     from mfvpr.features.ssm_features import SsmWindows

@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.positives import Positives
+from mfvpr.features.whitening import Whitening, fit_whitening
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked
-from mfvpr.utils.ragged import repeat_last
-from mfvpr.utils.whitening import Whitening, fit_whitening
+from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked, repeat_last
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
 ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it

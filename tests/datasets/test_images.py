@@ -17,7 +17,7 @@ from mfvpr import InputError
 from mfvpr.datasets import image_folder, read_image, resize
 from mfvpr.datasets.contents import contents
 from mfvpr.datasets.image_reading import MAX_PIXELS, read_header, read_size, shape_size
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 from tests.builders import read_golden
 from tests.golden import make_resize
 from tests.io.checks import one_line_error

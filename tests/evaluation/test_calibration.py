@@ -23,8 +23,7 @@ from mfvpr.evaluation import (
     write_confidences,
 )
 from mfvpr.evaluation.confidence import absent_rankings, chance_calibration_error
-from mfvpr.report.confidences import recalls_by_share
-from mfvpr.report.evaluations import EvaluationReport
+from mfvpr.report.evaluations import EvaluationReport, recalls_by_share
 from mfvpr.utils import InputError
 
 NAMES = ("margin", "height", "retrieval", "score")

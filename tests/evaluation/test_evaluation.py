@@ -17,11 +17,12 @@ from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.run_files import differences, write_gains
+from mfvpr.report.run_files import write_gains
+from mfvpr.report.tables import read_table
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import InputError, progress
+from mfvpr.utils import InputError, runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
 from tests.programs import typed
@@ -70,7 +71,7 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     evaluation = EvaluationReport(parts, [0, 1], [1])
-    table = recall_table(evaluation)
+    table = recall_table(evaluation.rows())
     assert [line[:2] for line in table.rows[:4]] == [
         ["retrieval", name] for name in ("first", "second", "mean", "pooled")
     ]
@@ -82,9 +83,9 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     hits = {
         name: np.concatenate([evaluation.is_correct(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems
     }
-    for first, second, counts, path in differences(evaluation):
-        assert counts.only_first == (hits[first] > hits[second]).sum()
-        assert path == path_test(hits[first], hits[second])
+    for first, second, only_first, _, _, *path in read_table(tmp_path / "differences.csv").rows:
+        assert int(only_first) == (hits[first] > hits[second]).sum()
+        assert [float(value) for value in path] == pytest.approx(path_test(hits[first], hits[second]), rel=1e-6)
     with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match=r"queries: expected folders of different names.* got first, first"):
@@ -124,7 +125,7 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
 
     def only_scores(label):
         assert label == "scores"
-        return progress.no_progress
+        return runtime.no_progress
 
     again = evaluate_parts(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,

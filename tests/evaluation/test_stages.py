@@ -16,7 +16,7 @@ from mfvpr.matchers import match_set as match_sets
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.match_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore, StoredMatches
 from mfvpr.tuning.sweeps import rank_settings
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches

@@ -14,10 +14,10 @@ from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
 from mfvpr.retrieval.retriever import vote
 from tests.baselines.test_grid_anchors import cells
-from tests.core.batches import score
 from tests.golden import make_ssm
 from tests.golden.make_ssm import CANDIDATES, DIMENSIONS, IMAGES, MAPS, made_up_map, picture
 from tests.networks.test_ssm_maps import published
+from tests.scorers import score
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 

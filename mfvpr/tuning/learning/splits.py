@@ -16,10 +16,8 @@ from mfvpr.evaluation.protocol import EvaluationProtocol, Half, separate
 from mfvpr.evaluation.rankings import RetrievalScore, retrieval_scores
 from mfvpr.evaluation.stages import score
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import round_up
-from mfvpr.utils.ragged import repeat_last
+from mfvpr.utils.numerics import repeat_last, round_up
 
 VALIDATION = 0.25  # of the queries to learn on, the end of each path
 
@@ -72,7 +70,7 @@ class TrainingSplit:
 
     def batch(self, queries: Int[np.ndarray, " batch"], size: int) -> Batch:
         """A batch of queries, padded to `size` with queries without candidates."""
-        padded = ragged.repeat_last(queries, size)
+        padded = repeat_last(queries, size)
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
         take = partial(np.take_along_axis, indices=places, axis=1)
         mask = take(self.usable[padded]) & (np.arange(size) < len(queries))[:, None]

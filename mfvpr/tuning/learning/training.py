@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 from mfvpr.core.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import lock_folder
-from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.runtime import Track, no_progress
 
 
 @contextmanager

@@ -33,10 +33,9 @@ from mfvpr.evaluation.stages import PaddedBatch, all_batches, fuse_all, require_
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of
+from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of, versions
 from mfvpr.utils.numerics import Device, compiled
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.versions import versions
 
 Setting = Mapping[str, Any]
 

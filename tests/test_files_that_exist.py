@@ -1,7 +1,6 @@
-"""Functions that take a path take it as text as well, and replace no file of others."""
+"""Functions that write files replace none of others; those that read say what is no file."""
 
 import os
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,32 +8,11 @@ import pytest
 
 from mfvpr import InputError, Shortlist, io
 from mfvpr.baselines.learned_weight import LearnedWeight, read_weight, write_weight
-from mfvpr.datasets import ImageFolder, IndexFile, LabelFiles, datasets
 from mfvpr.evaluation import Confidence, read_confidences, write_confidences
-from mfvpr.retrieval import DescriptorFiles, FeatureFiles
-from mfvpr.retrieval.precomputed import File
-from tests.builders import fill, random_matches
+from tests.builders import random_matches
 from tests.io.other_programs import feature
 
 WEIGHT = LearnedWeight.create(jax.random.key(1), random_matches(np.random.default_rng(0), 30), 3)
-
-
-def test_files_of_other_programs(tmp_path):
-    names, path = ["1.jpg", "2.jpg"], str(tmp_path / "all.npz")
-    io.write_features(path, names, [(row, feature(row, count=4)) for row in range(2)])
-    assert io.open_features(path, names).counts.tolist() == [4, 4]
-    folder = ImageFolder(str(tmp_path), tuple(names))  # type: ignore[arg-type]
-    files = FeatureFiles({str(tmp_path): File(path)})  # type: ignore[dict-item]
-    assert files.open(folder, partial=False).counts.tolist() == [4, 4]
-    assert File(path) == File(Path(path))  # type: ignore[arg-type]
-    assert folder.paths == [tmp_path / name for name in names]
-    path = str(tmp_path / "g.npy")
-    io.write_global_descriptors(path, names, np.eye(2))
-    np.testing.assert_array_equal(io.read_global_descriptors(path, names), np.eye(2))
-    np.testing.assert_array_equal(DescriptorFiles({str(tmp_path): File(path)})._read(folder), np.eye(2))  # type: ignore
-    path = str(tmp_path / "pairs.txt")
-    io.write_shortlist(path, Shortlist(np.zeros((2, 1), int), np.ones((2, 1)), np.ones((2, 1), bool)), names, names)
-    assert io.read_shortlist(path, names, names).indices.tolist() == [[0], [0]]
 
 
 def test_files_that_exist_stay(tmp_path):
@@ -73,20 +51,6 @@ def test_files_that_exist_stay(tmp_path):
         else:
             with pytest.raises(InputError, match="expected a new file"):
                 write(path)
-
-
-def test_data_sets(tmp_path):
-    database, queries = (str(fill(tmp_path / name, ["0.png", "1.png"])) for name in ("db", "q"))
-    index = tmp_path / "q/pairs.csv"
-    index.write_text("query,database\n0,0\n1,1\n")
-    labels = tmp_path / "labels.csv"
-    labels.write_text("name,label\n0.png,a\n1.png,b\n")
-    for truth in (IndexFile(str(index)), LabelFiles(str(labels), str(labels))):
-        dataset = datasets.folder(database, queries, ground_truth=truth)
-        assert dataset.truth.positives(0).counts.tolist() == [1, 1]
-    dataset = datasets.folder(database, [queries], ground_truth=IndexFile("pairs.csv"))
-    assert dataset.only.name == "q"
-    assert datasets.folder(database, queries, ground_truth=dataset.only.truth).truth is dataset.only.truth
 
 
 def test_confidences_and_weights(tmp_path):

@@ -5,7 +5,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr.utils import ragged
+from mfvpr.features.feature_set import few_capacities, pad_rows
+from mfvpr.matchers.match_set import prune_capacities, split_rows
 
 
 def rows_of(counts, seed=0):
@@ -22,7 +23,7 @@ COUNTS = st.lists(st.integers(0, 7), min_size=1, max_size=6)
 @given(COUNTS, st.integers(0, 3), st.integers(0, 2))
 def test_padding_keeps_every_row_and_holds_zeros(counts, more_slots, more_rows):
     rows, capacity, total = rows_of(counts), max(counts) + more_slots, len(counts) + more_rows
-    arrays, mask = ragged.pad_rows(rows, capacity, total=total)
+    arrays, mask = pad_rows(rows, capacity, total=total)
     assert arrays["points"].shape == (total, capacity, 2)
     assert arrays["index"].shape == mask.shape == (total, capacity)
     assert [values.dtype for values in arrays.values()] == [np.float32, np.int32]
@@ -35,34 +36,30 @@ def test_padding_keeps_every_row_and_holds_zeros(counts, more_slots, more_rows):
 
 
 @given(COUNTS)
-def test_split_reverses_join(counts):
+def test_rows_are_split_where_they_were_joined(counts):
     rows = rows_of(counts)
-    flat = ragged.join_rows(rows)
-    assert len(flat["points"]) == sum(counts)
-    jax.tree.map(np.testing.assert_array_equal, ragged.split(flat, np.array(counts)), rows)
+    flat = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    jax.tree.map(np.testing.assert_array_equal, split_rows(flat, np.array(counts)), rows)
 
 
 @given(st.lists(st.integers(0, 500), max_size=40), st.sampled_from([8, 32]))
 def test_capacities_are_few_and_hold_every_row(counts, step):
     counts = np.array(counts, int)
-    capacities = ragged.sizes(counts, (0.25, 0.5, 1.0), step)
+    capacities = few_capacities(counts, (0.25, 0.5, 1.0), step)
     assert 1 <= len(capacities) <= 3
     assert (capacities % step == 0).all()
     assert (np.diff(capacities) > 0).all()
     assert capacities[0] > 0
-    fitting = ragged.smallest_capacities(capacities, counts)
-    for count, capacity in zip(counts, fitting, strict=True):
-        assert capacity == min(size for size in capacities if size >= count)
     if counts.any():
         assert capacities[-1] < counts.max() + step
 
 
 def test_a_capacity_is_worth_what_it_saves():
     capacities, counts = np.array([8, 16]), np.array([8, 7, 0, 16, 5])
-    assert ragged.prune_capacities(capacities, counts, 3 * 8).tolist() == [8, 16]
-    assert ragged.prune_capacities(capacities, counts, 3 * 8 + 1).tolist() == [16]
+    assert prune_capacities(capacities, counts, 3 * 8).tolist() == [8, 16]
+    assert prune_capacities(capacities, counts, 3 * 8 + 1).tolist() == [16]
 
 
 def test_empty_rows_make_no_capacity_smaller():
     for empty in (0, 50):
-        assert ragged.sizes(np.array([0] * empty + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]
+        assert few_capacities(np.array([0] * empty + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]

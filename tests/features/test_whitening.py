@@ -5,9 +5,10 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
+from mfvpr.features import whitening
+from mfvpr.features.whitening import fit_whitening
 from mfvpr.retrieval import WhitenedSearch
-from mfvpr.utils import InputError, whitening
-from mfvpr.utils.whitening import fit_whitening
+from mfvpr.utils import InputError
 
 
 def samples(count, size, dtype=np.float64, rank=None):
