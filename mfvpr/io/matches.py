@@ -189,19 +189,17 @@ def open_matches(
             and a database image; or features are missing.
     """
     path = Path(path)
-    if path.is_dir():
-        if KapturePairs.fits(path):
-            kind = KapturePairs
-        else:
-            kind = PredictionPairs if PredictionPairs.fits(path) else ResultFiles
-    else:
+    if not path.is_dir():
         kind = choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})
-    if verified and kind in (HlocPairs, KapturePairs):
-        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
-    if kind is ResultFiles:
-        reader = ResultFiles(path, (queries.names, database.names), verified)
+        reader = ColmapPairs(path, verified) if kind is ColmapPairs else HlocPairs(path)
+    elif KapturePairs.fits(path):
+        reader = KapturePairs(path)
+    elif PredictionPairs.fits(path):
+        reader = PredictionPairs(path, verified)
     else:
-        reader = kind(path, verified) if kind in (ColmapPairs, PredictionPairs) else kind(path)
+        reader = ResultFiles(path, (queries.names, database.names), verified)
+    if verified and isinstance(reader, HlocPairs | KapturePairs):
+        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
     if reader.by_number and not isinstance(reader, ColmapPairs | KapturePairs):
         if queries.features is None or database.features is None:
             raise InputError(f"{path}: expected the features that were matched, got none; give hloc's feats*.h5")

@@ -85,7 +85,8 @@ class HlocPairs(PairReader):
                 "matches*.h5, not feats*.h5, or match again"
             )
         self.by_number = "keypoints0" not in arrays
-        super().__init__(path, {tuple(map(self.spelling, group.split("/"))): group for group in groups})
+        pairs = [[self.spelling(name) for name in group.split("/")] for group in groups]
+        super().__init__(path, {(query, image): group for (query, image), group in zip(pairs, groups, strict=True)})
         if len(self.places) < len(groups):
             raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
 
