@@ -164,6 +164,15 @@ def test_finished_runs_are_not_repeated(finished, paper):
     assert files(out) == before
 
 
+def test_sizes_count_what_an_earlier_process_extracted(copy, paper):
+    path = copy / RUN / "sizes.json"
+    before = path.read_text()
+    for _ in range(2):  # the first fills the cache, the second reads matches alone
+        shutil.rmtree(copy / RUN)
+        paper(copy, "systems=[sift_hist_10]")
+    assert path.read_text() == before
+
+
 def test_runs_of_other_inputs_in_the_same_folder_are_errors(copy, data, tmp_path, paper):
     other = shutil.copytree(data, tmp_path / "data")
     queries = other / "grief_season/queries"
