@@ -14,7 +14,7 @@ from PIL import Image
 
 from mfvpr.cli import localization
 from mfvpr.cli.schema import Localize
-from mfvpr.datasets import read_image
+from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
@@ -22,7 +22,7 @@ from mfvpr.localization.map_settings import read_settings
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
-from tests.programs import MFVPR, ROOT, output_of
+from tests.programs import MFVPR, ROOT, output_of, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -193,6 +193,18 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
     changes = [setting.replace("STREET", str(small_street)) for setting in more]
     _, stderr = build_map(folder, small_street, *changes, code=2)
     assert words in stderr
+
+
+def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
+    common = (f"map={tmp_path}/map", *QUICK[:-1])
+    settings = [settings_of(*common, f"candidates={number}", config="map") for number in (5, 6)]
+    systems = map(assembly.system, settings)
+    first, second = (Map(tmp_path / "map", system) for system in systems)
+    images = image_folder(small_street / "database")
+    second.build(images)
+    with pytest.raises(InputError, match="was made with other candidates"):
+        first.build(replace(images, root=small_street, names=("queries/0000.png",)))
+    assert read_settings(tmp_path / "map")["candidates"] == 6
 
 
 @pytest.mark.slow
