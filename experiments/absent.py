@@ -19,7 +19,7 @@ from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.localization.map_calibration import data_of_drive
+from mfvpr.localization.map_settings import data_of_drive
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer

@@ -9,10 +9,8 @@ from .retrieval.search import retrieve
 
 # matches of two images, and of a query with its candidates
 from .matchers.host_matcher import HostMatcher
-from .matchers.lightglue_matcher import LightGlueMatcher
-from .matchers.matcher import Matcher, NearestNeighborMatcher, match_pairs
+from .matchers.matcher import LightGlueMatcher, Matcher, NearestNeighborMatcher, match_pairs, soft_match
 from .core.matching import compact, filter_matches, match, match_candidates
-from .matchers.soft import soft_match
 
 # weights of matches
 from .core.weights import (

@@ -18,23 +18,22 @@ import pytest
 from omegaconf import OmegaConf
 
 from mfvpr.cli import programs, schema
-from mfvpr.cli.jobs import prepare
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.storage.match_files import MatchStore
 from mfvpr.systems.choices import CONF
-from mfvpr.utils import Stopwatch
 from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent
+MFVPR = (sys.executable, "-c", "from mfvpr.cli.programs import main; main()")  # the command `mfvpr` of this clone
 QUICK = ("figures=0", "features.max_keypoints=100", "retrieval.num_words=8")
 QUERIES, CANDIDATES = 24, 8  # of the small data set
 
 
 def run(*arguments, program="evaluate", cwd=ROOT, **environment):
     """A command line in a process of its own, which takes seconds to import what it needs: see `typed`."""
+    command = [*MFVPR, program] if program in programs.COMMANDS else [sys.executable, "-m", f"experiments.{program}"]
     return subprocess.run(
-        [sys.executable, "-m", f"experiments.{program}", *map(str, arguments)],
+        [*command, *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=280,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
     )  # fmt: skip
@@ -88,13 +87,6 @@ def job_of(root, config, job, figures):
         return results(out)
 
     return call
-
-
-def matches_path(settings):
-    """The folder in which a program keeps the matches of its data set, and their recipe."""
-    inputs = prepare(settings, Stopwatch())
-    recipe = inputs.matches_recipe()
-    return MatchStore(inputs.cache.root, recipe | {"scale": 0}, len(inputs.dataset.queries)).folder, recipe
 
 
 def typed(monkeypatch, capsys, program, *arguments):

@@ -62,8 +62,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     settings = {"out": HOSTILE[5], "a": {}, "dataset": {}}
     write_json(folder / "run.json", {"command": HOSTILE[3], "commit": None, "settings": settings})
     for number, name in enumerate(sequences):
-        places = [*range(len(HOSTILE))] if several else [""] * len(HOSTILE)
-        _write_answers(sequence_folder(folder, sequences, number), ranks, truth, places)
+        _write_answers(sequence_folder(folder, sequences, number), ranks, truth)
         for outcome, query in (("correct", 0), ("incorrect", 6)):
             _write_figure(folder / "figures" / (name if several else "") / f"{outcome}_{number:04d}.png", name, query)
     if truth:
@@ -71,7 +70,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     return folder
 
 
-def _write_answers(folder, ranks, truth, places):
+def _write_answers(folder, ranks, truth):
     files = file_names([*ranks])
     for system, first in ranks.items():
         correct = np.array(first)[:, None] == np.arange(1, CANDIDATES + 1)
@@ -85,7 +84,7 @@ def _write_answers(folder, ranks, truth, places):
         lines = []
         for query, name in enumerate(HOSTILE):
             first = [column[query] for column in ranks.values()]
-            lines.append([name, places[query], *(cell for rank in first for cell in (int(rank == 1), rank or ""))])
+            lines.append([name, query, *(cell for rank in first for cell in (int(rank == 1), rank or ""))])
         write_csv(folder / "gains.csv", header, lines)
 
 

@@ -1,4 +1,4 @@
-"""Scorers as users write them, beside the library's own: every test of scoring runs over all of them."""
+"""Scorers as users write them, beside the library's own, for every test of scoring; compiled scores of one pair."""
 
 import jax
 import jax.numpy as jnp
@@ -106,3 +106,15 @@ def one_of_each_class(scorers):
         pytest.param(scorer, marks=[pytest.mark.slow] if type(scorer) in classes[:place] else [])
         for place, scorer in enumerate(scorers)
     ]
+
+
+score = jax.jit(lambda scorer, matches: scorer(matches))
+
+
+def pair_of(batch, row=0):
+    return jax.tree.map(lambda leaf: leaf[row], batch)
+
+
+def each_scorer(scorers):
+    """Parametrize a test by scorers."""
+    return pytest.mark.parametrize("scorer", scorers, ids=lambda scorer: type(scorer).__name__)

@@ -72,7 +72,7 @@ def test_metadata_is_complete(wheel):
         names = archive.namelist()
         [path] = (name for name in names if name.endswith("METADATA"))
         metadata = email.message_from_bytes(archive.read(path))
-    assert {"mfvpr/py.typed", "mfvpr/systems/conf/evaluate.yaml", "mfvpr/report/pages/templates/page.html"} <= {*names}
+    assert {"mfvpr/py.typed", "mfvpr/systems/conf/evaluate.yaml", "mfvpr/report/templates/page.html"} <= {*names}
     assert not [name for name in names if name.startswith(("tests", "experiments", "notebooks"))]
     assert (metadata["License-Expression"], metadata["License-File"]) == ("MIT", "LICENSE")
     assert metadata["Project-URL"].startswith("Article, https://doi.org/")

@@ -1,11 +1,13 @@
-"""The core imports no other package but small helpers, and packages do not import each other in a circle."""
+"""The core imports no other package but small helpers, and packages do not import each other in a circle; versions."""
 
 import ast
 import graphlib
+import re
 import sys
 from pathlib import Path
 
 import mfvpr
+from tests.needs import ROOT as CLONE
 
 ROOT = Path(mfvpr.__file__).parent
 
@@ -36,3 +38,12 @@ def test_core_imports_helpers_of_arrays_and_errors_alone():
 def test_packages_do_not_import_each_other_in_a_circle():
     packages = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     graphlib.TopologicalSorter({package: imported_packages(package) for package in packages}).prepare()
+
+
+def test_the_oldest_versions_are_the_lower_bounds():
+    lines = (CLONE / "tests" / "oldest.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if "==" in line)
+    bounds = dict(re.findall(r'"([\w-]+)>=([\d.]+)', (CLONE / "pyproject.toml").read_text()))
+    del pinned["jaxlib"]  # follows from jax
+    assert len(pinned) > 30
+    assert [name for name in pinned if not f"{pinned[name]}.".startswith(f"{bounds[name]}.")] == []

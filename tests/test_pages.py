@@ -13,6 +13,7 @@ from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
 from mfvpr.systems.choices import CONF, GROUPS, choices_of
 from mfvpr.utils.fields import settings_of
+from notebooks.draw_results import candidate_times, draw, query_times, real_recall
 from tests import programs
 from tests.needs import needs
 from tests.programs import QUICK, ROOT, run, typed
@@ -25,6 +26,7 @@ PAGES = {
     for pattern in (README, "conf/*.md", "experiments/*.md", "mfvpr/*/README.md")
     for path in sorted(ROOT.glob(pattern))
 }
+RESULTS = PAGES.get("experiments/results.md", "")
 CONFIGS = {"mfvpr evaluate": "evaluate", "mfvpr sweep": "sweep", "mfvpr learn": "learn", "mfvpr map build": "map",
            "mfvpr localize": "localize", "python -m experiments.paper": "paper"}  # fmt: skip
 PLACEHOLDERS = r"\b(?:DIR|FILE|IMAGE|RUN|NAME)\b"
@@ -147,3 +149,22 @@ def test_settings_that_pages_name_exist():
 
 def test_pages_name_no_machine_path():
     assert not re.search(r"/(work|tmp|root|home)/", "".join(PAGES.values()))
+
+
+def test_tables_have_rows_of_one_length():
+    blocks = re.findall(r"(?:^\|.*\|\n)+", RESULTS, flags=re.MULTILINE)
+    assert len(blocks) > 20
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1, block
+
+
+def test_pictures_are_drawn_from_the_tables(tmp_path):
+    recall, times = real_recall(RESULTS), query_times(RESULTS)
+    assert len(recall) == 12
+    assert recall["system=mfvpr"] == {"SIFT": [53.5, 71.2], "ALIKED": [90.1, 86.5]}
+    assert all({*by_features} == {"SIFT", "ALIKED"} for by_features in recall.values())
+    assert [len(points) for points in times.values()] == [4, 2, 2, 2, 2]
+    assert times["map, SIFT, candidates from memory"] == [[1000.0, 62.6], [10_000.0, 67.6]]
+    draw(RESULTS, tmp_path)
+    assert all(len(points) == 5 for points in candidate_times(RESULTS).values())
+    assert {path.name for path in tmp_path.iterdir()} == {"recall.png", "database_size.png", "candidates.png"}

@@ -13,7 +13,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
 
 PROGRAM = "python -m experiments.benchmark"
-# Module -> what it measures. A module's `run(rounds, out)` prints tables and writes them as JSON to `out`.
+# Name -> what it measures. Its function `(rounds, out)` prints tables and writes them as JSON to `out`.
 BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "search": "nearest global descriptors of 1, 20 and 100 queries among 10,000 and 100,000 (5 rounds; 6 GB)",
@@ -22,6 +22,7 @@ BENCHMARKS = {
     "accelerator": "correct and fast on a GPU? All steps beside torch there (30 rounds; 5 minutes, 1 with --quick)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
 }
+_FUNCTIONS = {"search": ("scores", "run_search"), "sweeps": ("scores", "run_sweeps")}  # the others: NAME.run
 
 
 def main() -> None:
@@ -44,15 +45,16 @@ def add_arguments(parser: Parser) -> None:
 def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None, *, is_quick: bool) -> None:
     """Run a benchmark."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
-    module = import_module(f"experiments.benchmark.{benchmark}")
+    module, function = _FUNCTIONS.get(benchmark, (benchmark, "run"))
+    run_benchmark = getattr(import_module(f"experiments.benchmark.{module}"), function)
     out = out or Path(f"runs/benchmark_{benchmark}.json")
     require_replaceable(out, b'{\n "machine": {')
     if benchmark == "accelerator":
-        module.run(rounds, out, groups, is_quick=is_quick)
+        run_benchmark(rounds, out, groups, is_quick=is_quick)
     elif groups or is_quick:
         raise InputError(f"{benchmark} has no groups and no --quick, which belong to accelerator")
     else:
-        module.run(rounds, out)
+        run_benchmark(rounds, out)
 
 
 def positive_int(text: str) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 import mfvpr
 from experiments.benchmark import networks
 from experiments.benchmark.accelerator_checks import checks
-from experiments.benchmark.harness import duration, write_report
+from experiments.benchmark.harness import duration, ready, write_report
 from mfvpr.core.types import Features, Matches
 from mfvpr.report import Table
 from mfvpr.utils.errors import InputError
@@ -46,11 +46,6 @@ class Case(NamedTuple):
     sizes: tuple[Any, ...]
     small: tuple[Any, ...]
     is_quick: bool = False
-
-
-def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
-    """Call of JAX that waits for its result."""
-    return lambda: jax.block_until_ready(function(*inputs, **options))
 
 
 def with_torch(function: str, *arrays: jax.Array, **options: Any) -> Calls:
@@ -128,8 +123,8 @@ def product_rate(side: int) -> Timed:
     """Product of square matrices."""
     left = right = jax.random.normal(jax.random.key(3), (side, side))
     product, rounded = jax.jit(jnp.matmul, static_argnames="precision"), left.astype(jnp.bfloat16)
-    calls = {"float32": ready(product, left, right, precision=EXACT), "JAX's default": ready(product, left, right),
-             "bfloat16": ready(product, rounded, rounded)}  # fmt: skip
+    calls = {"float32": ready(product, left, right, precision=EXACT), "JAX's default": ready(product, left, right)}
+    calls["bfloat16"] = ready(product, rounded, rounded)
     return calls | with_torch("product", left, right), 2 * side**3 / 1e12, "TFLOP"
 
 
@@ -154,8 +149,12 @@ def matching(candidates: int, keypoints: int, dimension: int, *, with_ratio: boo
 
 def scoring(pairs: int, *, name: str) -> Timed:
     """Scores of matches, which a device has to read once."""
-    scorer = {"histogram": mfvpr.HistogramOfShifts(max_bins=BINS), "anchor": mfvpr.AnchorPoints(),
-              "sum": mfvpr.AggregatedScore()}[name]  # fmt: skip
+    histogram, anchor, aggregated = (
+        mfvpr.HistogramOfShifts(max_bins=BINS),
+        mfvpr.AnchorPoints(),
+        mfvpr.AggregatedScore(),
+    )
+    scorer = {"histogram": histogram, "anchor": anchor, "sum": aggregated}[name]
     m, score = matches_of(pairs), partial(mfvpr.score_candidates, scorer)
     arrays = m.points0, m.points1, m.scores0, m.scores1, m.distance, m.mask
     read = jax.jit(lambda *arrays: [jnp.sum(array) for array in arrays])
@@ -178,9 +177,10 @@ def searching(queries: int, images: int, dimension: int) -> Timed:
     database = database_of(images, dimension)
     vectors = database[:queries] + 0.02 * jax.random.normal(jax.random.key(4), (queries, dimension))
     product = jax.jit(partial(jnp.einsum, "qd,nd->qn", precision=EXACT))
-    calls = {"mfvpr": ready(mfvpr.retrieve, vectors, database, num_candidates=NEAREST),
-             "bare product": ready(product, vectors, database)}  # fmt: skip
-    calls |= with_torch("search", vectors, database, candidates=NEAREST)
+    calls = {"mfvpr": ready(mfvpr.retrieve, vectors, database, num_candidates=NEAREST)}
+    calls |= {"bare product": ready(product, vectors, database)} | with_torch(
+        "search", vectors, database, candidates=NEAREST
+    )
     return calls, 2 * queries * images * dimension / 1e12, "TFLOP"
 
 
@@ -252,8 +252,8 @@ def run(rounds: int | None, out: Path, groups: Sequence[str] = (), *, is_quick: 
     if unknown := {*groups} - {*SECONDS}:
         raise InputError(f"groups: expected some of {', '.join(SECONDS)}, got {', '.join(sorted(unknown))}")
     on_cpu, end, group_reports = jax.default_backend() == "cpu", time.monotonic(), {}
-    report = {"torch": version("torch") if find_spec("torch") else None, "is_quick": is_quick, "groups": group_reports,
-              "matmul_precision": jax.config.values["jax_default_matmul_precision"]}  # fmt: skip
+    report = {"torch": version("torch") if find_spec("torch") else None, "is_quick": is_quick, "groups": group_reports}
+    report["matmul_precision"] = jax.config.values["jax_default_matmul_precision"]
     for group in groups or SECONDS:
         start, end = time.monotonic(), end + (QUICK_SECONDS if is_quick else SECONDS[group])
         if group == "correct":
@@ -299,9 +299,8 @@ def time_calls(title: str, calls: Calls, work: float, unit: str, rounds: int) ->
     medians = {name: float(np.median(seconds)) for name, seconds in times.items()}
     for name, seconds in times.items():
         low, high = (1e3 * float(np.quantile(seconds, share)) for share in (0.25, 0.75))
-        rows[name] |= {"ms": 1e3 * medians[name], "25 %": low, "75 %": high, "calls": len(seconds),
-                      "/ first": medians[name] / next(iter(medians.values())),
-                      "rate": float(work / medians[name]), "per s": unit}  # fmt: skip
+        rows[name] |= {"ms": 1e3 * medians[name], "25 %": low, "75 %": high, "calls": len(seconds), "per s": unit}
+        rows[name] |= {"/ first": medians[name] / next(iter(medians.values())), "rate": float(work / medians[name])}
     yield from rows.values()
 
 

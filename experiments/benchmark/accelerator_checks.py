@@ -16,10 +16,10 @@ from experiments.benchmark import networks
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.nearest import products
 from mfvpr.core.types import Features, Matches
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 from tests import oracles
 
 SIZE, CANDIDATES, DIMENSION = 336, 8, 128  # px
@@ -78,8 +78,8 @@ def check(task: Task, end: float) -> dict[str, Any]:
         return row | {"exact": f"failed: {error!r}"[:80]}
     got, expected = (np.asarray(values, np.float64) for values in (got, expected))
     deviation = float(np.max(np.abs(got - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
-    return row | {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries,
-                  "exact": "yes" if deviation <= task.allowed and not differ else "NO"}  # fmt: skip
+    row |= {"deviation": deviation, "allowed": task.allowed, "differ": differ, "entries": entries}
+    return row | {"exact": "yes" if deviation <= task.allowed and not differ else "NO"}
 
 
 def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:

@@ -13,8 +13,8 @@ import numpy as np
 from mfvpr.cli.console import Progress
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
 Entry = tuple[str, str, Callable[[], Any]]  # step, implementation, the call that is timed
 Seconds = Mapping[tuple[str, str], list[float]]  # (step, implementation) -> seconds of every call
@@ -68,6 +68,11 @@ def duration(call: Callable[[], Any]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
+
+
+def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
+    """Call of JAX that waits for its result."""
+    return lambda: jax.block_until_ready(function(*inputs, **options))
 
 
 def write_report(out: Path, title: str, parts: Iterable[Table | str], content: Mapping[str, Any]) -> None:

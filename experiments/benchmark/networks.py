@@ -5,7 +5,6 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +29,7 @@ from mfvpr.features import (
 )
 from mfvpr.features.network import TOGETHER, compile_network
 from mfvpr.networks.d2net import extract
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 
 BATCHES = (1, 8)
 D2NET_SIZE, MIXVPR_SIZE, ALIKED_SIZE = 336, 320, 320  # px
@@ -50,7 +49,7 @@ class Contest(NamedTuple):
     checkpoint: str
     size: tuple[int, int]  # (width, height) px
     extractor: Callable[..., Callable]  # takes the model and `batch_size`; the result takes a batch of images
-    peer: str | None  # torch's function: module.function
+    peer: str | None  # function of `torch_networks`
     options: dict[str, Any] | None = None  # keyword arguments of torch's function
     note: str = ""
 
@@ -67,8 +66,9 @@ def run(rounds: int | None, out: Path) -> Results:
             entries.append((f"{contest.step}, batch {count}", "mfvpr", partial(extractor, batch[:count])))
         if contest.peer and find_spec("torch"):
             entries += torch_entries(contest, arrays, batch, BATCHES)
-    sizes = (f"D2-Net at {D2NET_SIZE} px, MixVPR at {MIXVPR_SIZE} px, ALIKED at {ALIKED_SIZE} px, SelaVPR at "
-             f"{SELAVPR_SIZE[0]} px, others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px")  # fmt: skip
+    sides = {"D2-Net": D2NET_SIZE, "MixVPR": MIXVPR_SIZE, "ALIKED": ALIKED_SIZE, "SelaVPR": SELAVPR_SIZE[0]}
+    sizes = ", ".join(f"{name} at {side} px" for name, side in sides.items())
+    sizes += f", others at {PLACES_SIZE[0]} x {PLACES_SIZE[1]} px"
     published = [name for name in (D2NET, MIXVPR, *ALIKED, *PATCHES, GEM, SELAVPR) if is_installed(entry_of(name))]
     weights = f"published weights of {', '.join(published)}, others random" if published else "random weights"
     title = f"images of the synthetic street, {sizes}, {weights}"
@@ -79,26 +79,26 @@ def run(rounds: int | None, out: Path) -> Results:
 def contests() -> Iterator[Contest]:
     """All steps; features and descriptors are timed from host to host."""
     size = (D2NET_SIZE, D2NET_SIZE)
-    yield Contest(MAP, D2NET, size, partial(_program, lambda model, batch: model(preprocess(batch, "caffe"))),
-                  "torch_networks.d2net_map")  # fmt: skip
+    dense = partial(_program, lambda model, batch: model(preprocess(batch, "caffe")))
+    yield Contest(MAP, D2NET, size, dense, "d2net_map")
     yield Contest(ON_DEVICE, D2NET, size, partial(_program, partial(extract, share=0.3)), None)
-    yield Contest(FEATURES, D2NET, size, partial(D2NetFeatures, image_size=size), "torch_networks.d2net")
+    yield Contest(FEATURES, D2NET, size, partial(D2NetFeatures, image_size=size), "d2net")
     size = (MIXVPR_SIZE, MIXVPR_SIZE)
-    yield Contest("MixVPR descriptor", MIXVPR, size, MixVprDescriptor, "torch_networks.mixvpr")
+    yield Contest("MixVPR descriptor", MIXVPR, size, MixVprDescriptor, "mixvpr")
     size = (ALIKED_SIZE, ALIKED_SIZE)
     for name in ALIKED:
         extractor = partial(AlikedFeatures, image_size=size, threshold=THRESHOLD)
-        yield Contest(f"{name} features", name, size, extractor, "torch_aliked.aliked", {"threshold": THRESHOLD},
-                      note=" (deformable convolution in Python)")  # fmt: skip
+        note = " (deformable convolution in Python)"
+        yield Contest(f"{name} features", name, size, extractor, "aliked", {"threshold": THRESHOLD}, note)
     vector = partial(GlobalDescriptor, image_size=PLACES_SIZE)
-    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "torch_networks.netvlad")
+    yield Contest("NetVLAD descriptor", next(iter(PATCHES)), PLACES_SIZE, vector, "netvlad")
     for name, sizes in PATCHES.items():
         step = f"Patch-NetVLAD features, sizes {', '.join(map(str, sizes))}, {name.rpartition('_')[2]} dimensions"
         extractor = partial(PatchNetVladFeatures, patch_sizes=sizes, image_size=PLACES_SIZE)
-        yield Contest(step, name, PLACES_SIZE, extractor, "torch_networks.patch_netvlad", {"sizes": sizes})
-    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "torch_networks.gem")
+        yield Contest(step, name, PLACES_SIZE, extractor, "patch_netvlad", {"sizes": sizes})
+    yield Contest("generalized mean of ResNet-50", GEM, PLACES_SIZE, vector, "gem")
     extractor = partial(SelaVprFeatures, image_size=SELAVPR_SIZE)
-    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "torch_networks.selavpr", {"blocks": BLOCKS})
+    yield Contest("SelaVPR features", SELAVPR, SELAVPR_SIZE, extractor, "selavpr", {"blocks": BLOCKS})
 
 
 def _program(function: Callable[[Any, Any], Any], model: Any, batch_size: int) -> Callable[[np.ndarray], Any]:
@@ -161,17 +161,16 @@ def torch_entries(
     """Torch in both memory layouts, in float32 on a GPU; on a CPU also one image after the other, as in mfvpr."""
     import torch
 
-    from experiments.benchmark.torch_networks import run_network, torch_weights
+    from experiments.benchmark import torch_networks
 
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
-    module, _, function = str(contest.peer).partition(".")
-    network = partial(getattr(import_module(f"experiments.benchmark.{module}"), function), **(contest.options or {}))
+    network = partial(getattr(torch_networks, str(contest.peer)), **(contest.options or {}))
     device, table = "cuda" if torch.cuda.is_available() else "cpu", NETWORKS[contest.checkpoint].table
 
     def run_with(layout: torch.memory_format) -> Callable[[list[np.ndarray]], list[Any]]:
-        weights = torch_weights(arrays, table, device, layout)
-        return partial(run_network, network, weights=weights, device=device, layout=layout)
+        weights = torch_networks.torch_weights(arrays, table, device, layout)
+        return partial(torch_networks.run_network, network, weights=weights, device=device, layout=layout)
 
     default, channels_last = run_with(torch.contiguous_format), run_with(torch.channels_last)
     entries: list[Entry] = []

@@ -1,10 +1,15 @@
-"""Matching and scoring in mfvpr, and in other libraries as their users would write it.
+"""Scores, sweeps and search in mfvpr, and in other libraries as their users would write them.
 
-Each `*_entries` function returns the calls to time, none where its library is not installed.
+`run` times matching and scoring, `run_search` the exact search of global descriptors (in the memory of each library
+beforehand), `run_sweeps` grids of the scores' parameters, in NumPy on one process and on several. Each `*_entries`
+function returns the calls to time, none where its library is not installed.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mfvpr
-from experiments.benchmark.harness import Entry, Results, Seconds, compete
+from experiments.benchmark.harness import Entry, Results, Seconds, compete, ready
 from mfvpr.core.types import Features, Matches
+from mfvpr.core.weights import match_weights
+from mfvpr.utils.numerics import available_cpus
 
 CANDIDATES, KEYPOINTS, DIMENSION = 50, 700, 512
 COMMON = 300  # keypoints that a candidate shares with the query
@@ -28,6 +35,18 @@ BOTH = "matching + histogram"
 SLOTS = 384  # of 700; these pairs need no more
 CENTERS = np.arange(-SIZE + BIN / 2, SIZE, BIN, dtype=np.float32)
 BIN_X, BIN_Y = np.meshgrid(CENTERS, CENTERS)
+# Of searches.
+SEARCH_SIZES = ((10_000, 512), (10_000, 4096), (100_000, 512), (100_000, 4096))  # rows and dimensions of the database
+QUERIES = (1, 20, 100)
+# Of sweeps.
+SIGMAS, BIN_SIZES = (5.0, 10.0, 15.0, 22.5, 30.0, 45.0), (5.0, 10.0, 15.0, 20.0)  # px
+WEIGHTS = (mfvpr.FeatureScoreWeight(), mfvpr.DescriptorDistanceWeight(), mfvpr.UnitWeight())
+DISTANCE_SHARES = (0.25, 0.5, 0.75, 1.0)  # shares of the matches that are nearer than the four distances
+WINDOWS, TOLERANCES = (4.0, 6.0, 8.0, 10.0, 12.0), (1.0, 2.0, 3.0, 4.0, 5.0)  # cells
+SWEEP_SLOTS = 256
+GRID, WEIGHTED_GRID, ANCHOR_GRID = "6 x 4 histograms", "6 x 4 x 3 weights x 4 distances", "5 x 5 anchors"
+
+Team = Callable[[np.ndarray, np.ndarray], np.ndarray]  # `tallest_bins` in some processes
 
 
 @dataclass(frozen=True)
@@ -111,28 +130,20 @@ def mfvpr_entries(data: Data) -> list[Entry]:
 
         return jax.lax.map(product, candidates.descriptors)
 
-    def wait(function: Callable, *inputs: Any, **options: Any) -> Callable[[], Any]:
-        return lambda: jax.block_until_ready(function(*inputs, **options))
-
     score = mfvpr.score_candidates
     return [
-        (MATCHING, "bare product (JAX)", wait(jax.jit(product), *images)),
-        (MATCHING, "bare product (JAX), not stored", wait(jax.jit(sum_of_product), *images)),
-        (MATCHING, "bare product (JAX), bfloat16", wait(jax.jit(rounded_product), *images)),
-        (MATCHING, "mfvpr", wait(mfvpr.match_candidates, *images)),
-        (MATCHING, "mfvpr, float32", wait(mfvpr.match_candidates, *images, product="float32")),
-        (MATCHING, "mfvpr, under jit", wait(jax.jit(mfvpr.match_candidates), *images)),
-        (MATCHING, "mfvpr, with ratio", wait(mfvpr.match_candidates, *images, with_ratio=True)),
-        (
-            MATCHING,
-            "mfvpr, with ratio, float32",
-            wait(mfvpr.match_candidates, *images, with_ratio=True, product="float32"),
-        ),
-        (BOTH, "mfvpr", wait(jax.jit(both), *images)),
-        (HISTOGRAM, "mfvpr", wait(score, mfvpr.HistogramOfShifts(), data.matches)),
-        (ANCHOR, "mfvpr", wait(score, mfvpr.AnchorPoints(), data.matches)),
-        (SUM, "mfvpr", wait(score, mfvpr.AggregatedScore(), data.matches)),
-        (SHIFT, "mfvpr", wait(mfvpr.HistogramOfShifts().dominant_shift, pair, refine=True)),
+        (MATCHING, "bare product (JAX)", ready(jax.jit(product), *images)),
+        (MATCHING, "bare product (JAX), not stored", ready(jax.jit(sum_of_product), *images)),
+        (MATCHING, "bare product (JAX), bfloat16", ready(jax.jit(rounded_product), *images)),
+        (MATCHING, "mfvpr", ready(mfvpr.match_candidates, *images)),
+        (MATCHING, "mfvpr, float32", ready(mfvpr.match_candidates, *images, product="float32")),
+        (MATCHING, "mfvpr, under jit", ready(jax.jit(mfvpr.match_candidates), *images)),
+        (MATCHING, "mfvpr, with ratio", ready(mfvpr.match_candidates, *images, with_ratio=True)),
+        (BOTH, "mfvpr", ready(jax.jit(both), *images)),
+        (HISTOGRAM, "mfvpr", ready(score, mfvpr.HistogramOfShifts(), data.matches)),
+        (ANCHOR, "mfvpr", ready(score, mfvpr.AnchorPoints(), data.matches)),
+        (SUM, "mfvpr", ready(score, mfvpr.AggregatedScore(), data.matches)),
+        (SHIFT, "mfvpr", ready(mfvpr.HistogramOfShifts().dominant_shift, pair, refine=True)),
     ]
 
 
@@ -258,3 +269,156 @@ def _histogram_loop(shifts: np.ndarray, weights: np.ndarray) -> float:
 def _histogram_broadcast(shifts: np.ndarray, weights: np.ndarray) -> float:
     squared = (BIN_X - shifts[:, 0, None, None]) ** 2 + (BIN_Y - shifts[:, 1, None, None]) ** 2
     return float((weights[:, None, None] * np.exp(-squared / (2 * SIGMA**2))).sum(0).max())
+
+
+def run_search(rounds: int | None, out: Path) -> None:
+    """Time all libraries on random descriptors."""
+    entries = [entry for rows, dimensions in SEARCH_SIZES for entry in search_entries(rows, dimensions)]
+    setting = {"sizes": SEARCH_SIZES, "queries": QUERIES, "candidates": CANDIDATES}
+    title = f"the {CANDIDATES} nearest of random descriptors, exact"
+    compete(entries, rounds or 5, out, title=title, setting=setting, remarks=lambda *_: [])
+
+
+def search_entries(rows: int, dimensions: int) -> Iterator[Entry]:
+    """Calls that return the rows of the nearest descriptors `[Q, CANDIDATES]`."""
+    rng = np.random.default_rng(0)
+    shapes = (rows, dimensions), (max(QUERIES), dimensions)
+    database, queries = (rng.standard_normal(shape, dtype=np.float32) for shape in shapes)
+    calls: dict[str, Callable[[np.ndarray], Any]] = {
+        "mfvpr": partial(_search_mfvpr, jax.device_put(database)),
+        "NumPy": partial(_search_numpy, database),
+    }
+    if find_spec("faiss"):
+        import faiss
+
+        index = faiss.IndexFlatIP(dimensions)
+        index.add(database)  # pyright: ignore[reportCallIssue]
+        calls["FAISS"] = partial(_search_faiss, index)
+    for count in QUERIES:
+        step = f"{count} of {rows:,} x {dimensions}"
+        yield from ((step, name, partial(call, queries[:count])) for name, call in calls.items())
+
+
+def _search_mfvpr(database: jax.Array, queries: np.ndarray) -> np.ndarray:
+    return np.asarray(mfvpr.retrieve(queries, database, num_candidates=CANDIDATES).indices)
+
+
+def _search_numpy(database: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    products = queries @ database.T
+    nearest = np.argpartition(-products, CANDIDATES, axis=1)[:, :CANDIDATES]
+    order = np.argsort(-np.take_along_axis(products, nearest, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(nearest, order, axis=1)
+
+
+def _search_faiss(index: Any, queries: np.ndarray) -> np.ndarray:
+    return index.search(queries, CANDIDATES)[1]
+
+
+def run_sweeps(rounds: int | None, out: Path) -> None:
+    """Time all grids on the same pairs."""
+    teams = {f"NumPy, {count} process{'es' * (count > 1)}": make_team(count) for count in sorted({1, available_cpus()})}
+    same = _full_matches()
+    flushed = "flushed for all" if flush_denormals() else "flushed for mfvpr only (NumPy needs torch for it)"
+    entries = [
+        *_histogram_entries("same place", same, teams),  # nearly all matches agree
+        *_histogram_entries("other place", _shuffle(same), teams),  # none agree
+        *_anchor_entries(same),
+    ]
+    setting = {"pairs": CANDIDATES, "matches_per_pair": SWEEP_SLOTS, "sigma": SIGMAS, "bin_size": BIN_SIZES}
+    setting |= {"denormals": flushed}
+    title = f"{CANDIDATES} pairs with {SWEEP_SLOTS} matches each; denormal floats {flushed}"
+    compete(entries, rounds or 7, out, title=title, setting=setting, remarks=_sweep_remarks)
+
+
+def _sweep_remarks(seconds: Seconds, results: Results) -> Iterable[str]:
+    for (step, name), taken in seconds.items():
+        ours = np.asarray(results[step, "mfvpr"])
+        rate = f"{step}, {name}: {ours.size / np.median(taken):,.0f} pair-scores per second"
+        theirs = np.asarray(results[step, name]).reshape(ours.shape)
+        yield rate if name == "mfvpr" else f"{rate}, scores differ by {np.max(abs(theirs / ours - 1)):.1e} at most"
+
+
+def _full_matches() -> Matches:
+    """The first matches of the pairs of `scores`, which fill all slots."""
+    matches = jax.vmap(lambda pair: mfvpr.compact(pair, SWEEP_SLOTS))(make_data().matches)
+    return jax.device_put(replace(matches, mask=jnp.ones_like(matches.mask)))
+
+
+def _shuffle(matches: Matches) -> Matches:
+    """Points that do not correspond, as in images of different places, which most pairs of a sweep show."""
+    order = np.random.default_rng(0).permuted(np.tile(np.arange(SWEEP_SLOTS), (CANDIDATES, 1)), axis=1)
+    return replace(matches, points1=jnp.take_along_axis(matches.points1, order[..., None], axis=1))
+
+
+def _histogram_entries(place: str, matches: Matches, teams: dict[str, Team]) -> list[Entry]:
+    distances = np.quantile(np.asarray(matches.distance), DISTANCE_SHARES).astype(np.float32)
+    near = (np.asarray(matches.distance)[:, None] <= distances[:, None]).astype(np.float32)  # [C, 4, K]
+    weights = [np.asarray(jax.vmap(partial(match_weights, weight))(matches)) for weight in WEIGHTS]
+    near_weights = np.concatenate([weight[:, None] * near for weight in weights], axis=1)
+    shifts = np.asarray(matches.points1 - matches.points0)
+    entries = []
+    for name, axes, team_weights in (
+        (GRID, {}, weights[0][:, None]),
+        (WEIGHTED_GRID, {"weight": WEIGHTS, "max_distance": distances}, near_weights),
+    ):
+        step, axes = f"{name}, {place}", {"sigma": SIGMAS, "bin_size": BIN_SIZES} | axes
+        entries.append((step, "mfvpr", ready(mfvpr.score_grid, mfvpr.HistogramOfShifts(), matches, **axes)))
+        entries += [(step, title, partial(team, shifts, team_weights)) for title, team in teams.items()]
+    return entries
+
+
+def _anchor_entries(matches: Matches) -> list[Entry]:
+    axes = {"window": WINDOWS, "tolerance": TOLERANCES}
+    return [
+        (
+            f"{ANCHOR_GRID}, {cells} cells a side",
+            "mfvpr",
+            ready(mfvpr.score_grid, mfvpr.AnchorPoints(num_bins=cells), matches, **axes),
+        )
+        for cells in (10, 15, 20)
+    ]
+
+
+def make_team(count: int) -> Team:
+    """Run `tallest_bins` in `count` processes of one thread each, every process on its share of the pairs."""
+    # BLAS reads these variables when it is loaded: in the new processes, no longer in this one.
+    os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=flush_denormals)
+
+    def team(shifts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        parts = pool.map(tallest_bins, np.array_split(shifts, count), np.array_split(weights, count))
+        return np.concatenate(list(parts), axis=-1)
+
+    return team
+
+
+def flush_denormals() -> bool:
+    """Count denormal floats of this thread as zero, as XLA does; False without torch, since NumPy has no switch."""
+    if find_spec("torch") is None:
+        return False
+    import torch
+
+    return torch.set_flush_denormal(True)
+
+
+def tallest_bins(shifts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Scores `[sigmas, bin sizes, W, C]` as users of NumPy would write it, one pair and setting after the other.
+
+    The Gaussians are separable, and the same for all weights, which are one matrix product.
+
+    Args:
+        shifts: `[C, K, 2]` px.
+        weights: `[C, W, K]`.
+    """
+    num_pairs, num_weights, slots = weights.shape
+    tallest = np.empty((len(SIGMAS), len(BIN_SIZES), num_weights, num_pairs), np.float32)
+    for j, size in enumerate(BIN_SIZES):
+        centers = np.arange(-SIZE + size / 2, SIZE + size / 2, size, dtype=np.float32)
+        x, y = (np.square(centers[:, None] - shifts[:, None, :, axis]) for axis in (0, 1))  # [C, B, K]
+        for i, sigma in enumerate(SIGMAS):
+            scale = np.float32(-0.5 / sigma**2)
+            for pair in range(num_pairs):
+                votes_x, votes_y = np.exp(x[pair] * scale), np.exp(y[pair] * scale)
+                weighted = (weights[pair][:, None] * votes_y[None]).reshape(-1, slots)
+                tallest[i, j, :, pair] = (weighted @ votes_x.T).reshape(num_weights, -1).max(1)
+    return tallest

@@ -82,9 +82,9 @@ def score(
     if scorer == "anchor":
         return anchor(points0, points1, weights)
     shifts = points1 - points0
-    return aggregate(shifts, weights, mask) if scorer == "sum" else histogram(
-        shifts, weights, bin_centers(BIN, mask.device), SIGMA
-    )  # fmt: skip
+    if scorer == "sum":
+        return aggregate(shifts, weights, mask)
+    return histogram(shifts, weights, bin_centers(BIN, mask.device), SIGMA)
 
 
 def grid(

@@ -11,21 +11,30 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from experiments.paper.tables import TOLERANCES, Evaluations, average, printed_tables
-from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets import Dataset, ImageFolder
 from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import Table
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import with_longest_side
-from mfvpr.report.pages import one_run
-from mfvpr.report.pages.charts import Chart, bar_chart
-from mfvpr.report.pages.rendering import MOST_PICTURES, Gallery, Section, embed, pictures, values_table, write_page
-from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.pages import write_comparison
 from mfvpr.report.plots import panels, save_figure
+from mfvpr.report.rendering import (
+    MOST_PICTURES,
+    PAGE,
+    Chart,
+    Gallery,
+    Section,
+    bar_chart,
+    embed,
+    pictures,
+    values_table,
+    write_page,
+)
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import read_csv
-from mfvpr.utils.files import clip_middle, printable, replacing
-from mfvpr.utils.versions import versions
+from mfvpr.utils.files import clip_middle, printable
+from mfvpr.utils.fingerprints import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
 _MIDDLE = 1  # of the tolerances: the paper's figure
@@ -49,14 +58,12 @@ def paper_figures(evaluations: Evaluations) -> Iterator[Figure]:
     }
     histograms = (path for folder in folders.values() for path in sorted((folder / "figures").rglob("correct_*.png")))
     if histogram := next(histograms, None):
-        yield "histogram.png", partial(_copy, source=histogram)
+        yield "histogram.png", partial(shutil.copyfile, histogram)
     if groups := mean_recalls(evaluations):
         titles = [row.title for row in evaluations.rows if any(row.title in group for group in groups.values())]
         yield "averages.png", partial(_draw_averages, titles=titles, groups=groups)
     if evaluations.seconds:
         yield "speed.png", partial(_draw_speed, evaluations=evaluations)
-    if evaluations.growth:
-        yield "growth.png", partial(_draw_growth, growth=evaluations.growth)
     if folders:
         cases = [case for name, folder in folders.items() for case in _failures(folder, evaluations.datasets[name])]
         yield "failures.png", partial(_draw_failures, cases=cases)
@@ -108,19 +115,6 @@ def _save_bars(figure: Canvas, path: Path, titles: Sequence[str], label: str, li
     save_figure(figure, path)
 
 
-def _draw_growth(path: Path, growth: Mapping[str, Mapping[int, float]]) -> None:
-    """Draw the seconds of a query as the database grows: the search grows, the rest stays."""
-    figure, [axes] = panels(1, 7, 4.2)
-    for title, by_size in growth.items():
-        axes.loglog([*by_size], [*by_size.values()], marker="o", markersize=3, label=title)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
-    axes.set(xlabel="images of a database, whose descriptors are made up", ylabel="seconds of a query")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    save_figure(figure, path)
-
-
 def _draw_failures(path: Path, cases: Sequence[Sequence[_Image]]) -> None:
     """Draw query, prediction, and the best ranked correct image side by side."""
     heights = [0.35 + 3.1 * max(image.shape[0] / image.shape[1] for image, _ in case) for case in cases] or [1.0]
@@ -138,8 +132,12 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
     """Query, prediction and correct image of the clearest failures that retrieval did not cause."""
     names, failures = [sequence.name for sequence in dataset.sequences], []
     for place, sequence in enumerate(dataset.sequences):
+        is_of_frames = sequence.truth is not None and sequence.truth.unit == "frames"
+        positives = sequence.truth.positives(TOLERANCES[-1]) if sequence.truth and is_of_frames else None
         for row in read_csv(sequence_folder(run, names, place) / "failures" / "histogram.csv"):
-            if row["correct_image"] and _is_far(sequence, dataset.database, row):
+            predicted = dataset.database.names.index(row["prediction"])
+            near = () if positives is None else positives.of(sequence.images.names.index(row["query"]))
+            if row["correct_image"] and predicted not in near:  # also within the widest of the paper's tolerances
                 failures.append((sequence, row))
     failures.sort(key=lambda failure: -float(failure[1]["margin"] or 0))  # empty between two infinite scores
     for sequence, row in failures[:_FAILURES]:
@@ -149,19 +147,6 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
             _image(dataset.database, row["prediction"], "prediction"),
             _image(dataset.database, row["correct_image"], "correct"),
         ]
-
-
-def _is_far(sequence: QuerySequence, database: ImageFolder, row: Mapping[str, str]) -> bool:
-    """Whether a prediction is incorrect within the widest of the paper's tolerances, too; True for positions."""
-    if sequence.truth is None or sequence.truth.unit != "frames":
-        return True
-    correct = sequence.truth.positives(TOLERANCES[-1]).of(sequence.images.names.index(row["query"]))
-    return database.names.index(row["prediction"]) not in correct
-
-
-def _copy(path: Path, source: Path) -> None:
-    with replacing(path) as temporary:
-        shutil.copyfile(source, temporary)
 
 
 def _image(folder: ImageFolder, name: str, words: str) -> _Image:
@@ -183,7 +168,7 @@ def write_pages(
         if len(folders) > 1:
             links.append((f"{dataset}: all side by side", out / "comparisons" / f"{dataset}.html"))
             write_comparison([*folders.values()], links[-1][1])
-        links += [(f"{dataset}: {run}", folder / one_run.PAGE) for run, folder in folders.items()]
+        links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
     recalls = dict(table for name, table in tables.items() if name not in (*_COSTS, *_ABOUT))
@@ -194,8 +179,7 @@ def write_pages(
     about["Versions"] = values_table(versions())
     paths = {path.stem: path for path in (out / "figures").glob("*.png")}
     averages = {"Mean recall at 1 within 2 frames": embed(paths["averages"])} if "averages" in paths else {}
-    titles = {"speed": "Seconds of a query", "growth": "As a database grows"}
-    speed = {title: embed(paths[name]) for name, title in titles.items() if name in paths}
+    speed = {"Seconds of a query": embed(paths["speed"])} if "speed" in paths else {}
     words = "In %. Where the paper prints a number, that and the difference stand beside ours."
     sections = [Section("recall", "Recall", words, [*_by_sequence(evaluations)], recalls, images=averages)]
     words = "Their own pages, and all of a data set side by side, with tests and intervals."
@@ -207,7 +191,7 @@ def write_pages(
     sections.append(Section("settings", "Data sets and settings", tables=about))
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
-    write_page(out / one_run.PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
+    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
 
 
 def _by_sequence(evaluations: Evaluations) -> Iterator[Chart]:

@@ -1,7 +1,7 @@
 """The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report import Table, write_json, write_table
-from mfvpr.report.pages.one_run import PAGE
+from mfvpr.report.rendering import PAGE
 from mfvpr.report.runs import LAST
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
@@ -66,10 +66,7 @@ def _names(rows: Sequence[Row]) -> list[str]:
 def _evaluate_and_report(
     rows: Sequence[Row], places: Sequence[Place], settings: Paper, out: Path, left_out: Sequence[str]
 ) -> None:
-    def write_tables(datasets: Mapping[str, Dataset]) -> None:
-        _write_tables(out, _read_evaluations(rows, datasets, settings))
-
-    datasets, failures = evaluate_all(rows, places, settings, write_tables)
+    datasets, failures = evaluate_all(rows, places, settings)
     if not datasets:
         raise InputError(f"nothing was evaluated: {failures[0]}")
     evaluations = _read_evaluations(rows, datasets, settings)
@@ -83,9 +80,9 @@ def _evaluate_and_report(
     times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
     leading = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
     evaluations = replace(evaluations, seconds=leading)
-    evaluations = replace(evaluations, growth=_measure_growth(evaluations, out))
     for name in ("figures", "comparisons"):  # they may have those of other rows and data sets
         shutil.rmtree(out / name, ignore_errors=True)
+    (out / "figures").mkdir()
     tables = _write_tables(out, evaluations)
     for name, draw in paper_figures(evaluations):
         draw(out / "figures" / name)
@@ -95,13 +92,8 @@ def _evaluate_and_report(
         raise InputError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
 
 
-def evaluate_all(
-    rows: Sequence[Row],
-    places: Sequence[Place],
-    settings: Paper,
-    write_tables: Callable[[Mapping[str, Dataset]], None],
-) -> tuple[dict[str, Dataset], list[str]]:
-    """Evaluate, writing tables after each data set; return readable data sets, and a line per failed evaluation."""
+def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) -> tuple[dict[str, Dataset], list[str]]:
+    """Evaluate; return readable data sets, and a line per failed evaluation."""
     names = _names(rows)
     total, finished = len(places) * len(names), 0
     datasets: dict[str, Dataset] = {}
@@ -124,7 +116,7 @@ def evaluate_all(
         except InputError as error:
             fail(f"{place.name}: {error}")
             continue
-        datasets[place.name], before = dataset, finished
+        datasets[place.name] = dataset
         for difference in published_differences(dataset):
             tell(f"warning: {place.name}: {difference}; its numbers are not comparable")
         for turn, run in enumerate(names, start=number * len(names) + 1):
@@ -141,8 +133,6 @@ def evaluate_all(
                     continue
             if not (folder / PAGE).is_file():
                 jobs.report_page(folder)
-        if finished - before < len(names):
-            write_tables(datasets)
     if finished:
         tell(f"{finished} of {total} evaluations were finished before")
     return datasets, failures
@@ -186,24 +176,6 @@ def measure_times(
                 tell(f"left out: seconds of {run}: {error}")
                 del times[run]
     return times
-
-
-def _measure_growth(evaluations: Evaluations, out: Path) -> dict[str, dict[int, float]]:
-    """Seconds of a query of some systems by the size of the database; the search is measured once."""
-    path, device = out / "seconds" / "growth.json", runs.device()
-    known = runs.read_json(path) or {}
-    if known.get("device") != device:
-        known = {"device": device, "search": {}}
-    growth = {}
-    for row in (row for row in evaluations.best_rows if row.name in evaluations.seconds):
-        folder = next(folder for (_, run), folder in evaluations.folders.items() if run == row.run)
-        length = int(runs.read_json(folder / runs.SIZES)["descriptor"])
-        if str(length) not in known["search"]:
-            known["search"][str(length)] = {str(size): value for size, value in runs.search(length).items()}
-            write_json(path, known)
-        rest = sum(evaluations.seconds[row.name][step] for step in runs.STEPS)
-        growth[row.title] = {int(size): rest + value for size, value in known["search"][str(length)].items()}
-    return growth
 
 
 def _write_tables(out: Path, evaluations: Evaluations) -> dict[str, tuple[str, Table]]:

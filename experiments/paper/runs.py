@@ -2,7 +2,6 @@
 
 import json
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from experiments.paper.systems import Place, overrides
 from mfvpr.checkpoints import REGISTRY, files
@@ -22,8 +20,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.windows import WindowExtractor
-from mfvpr.localization.vectors import Vectors
-from mfvpr.report.pages.rendering import PAGE
+from mfvpr.report.rendering import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_json
 from mfvpr.retrieval import fit_to_database
@@ -31,10 +28,9 @@ from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
-from mfvpr.utils.files import expand_user, lock_folder, remove_leftovers
-from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils.files import expand_user, lock_folder
+from mfvpr.utils.fingerprints import fingerprint, versions
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.versions import versions
 
 FIGURES = 2  # queries that each run draws
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
@@ -43,16 +39,13 @@ _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
 _GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("retrieval", "features", "matching", "scores")
-_MOST_BYTES = 1 << 30  # bytes of synthetic descriptors
-_DATABASES = (100, 1000, 10_000, 100_000)  # images
-_ROUNDS = 5
 _OUTPUTS = {"runs", "tables", "figures", "comparisons", "seconds", PAGE}
 _FREE = {"out", "cache", "memory", "devices", "compiled", "cluster"}  # settings that change no number
 
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations, and remove temporary files of a killed process.
+    """Lock a folder for evaluations.
 
     Raises:
         InputError: another process uses the folder, or it has files of others.
@@ -67,7 +60,6 @@ def lock_output(out: Path) -> Iterator[None]:
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
             raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
-        remove_leftovers(out)
         yield
 
 
@@ -158,9 +150,9 @@ def read_json(path: Path) -> Any:
 def measure_query(settings: Evaluate, dataset: Dataset) -> dict[str, float]:
     """Measure the seconds of a query by step.
 
-    A part of the database is enough: only the search among descriptors depends on its size (see `search`). Queries are
-    evaluated twice under different names, so that nothing is compiled, and no feature of the database is extracted,
-    while the second pass is timed.
+    A part of the database is enough: only the search among descriptors depends on its size. Queries are evaluated
+    twice under different names, so that nothing is compiled, and no feature of the database is extracted, while the
+    second pass is timed.
     """
     sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
     number = min(QUERIES, len(sequence.images))
@@ -189,22 +181,3 @@ def measure_query(settings: Evaluate, dataset: Dataset) -> dict[str, float]:
 def device() -> dict[str, Any]:
     """The device that the seconds are measured on, and versions."""
     return {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "versions": versions()}
-
-
-def search(descriptor: int) -> dict[int, float]:
-    """Measure the seconds of a search among synthetic descriptors, by the size of the database.
-
-    `descriptor` is the size of one in bytes; all of a database take at most `_MOST_BYTES`.
-    """
-    seconds, rng, length = {}, np.random.default_rng(0), descriptor // _FLOAT
-    for size in (size for size in _DATABASES if size * descriptor <= _MOST_BYTES):
-        database = Vectors()
-        for _ in range(size):
-            database.append(rng.standard_normal(length, np.float32))
-        query, times = rng.standard_normal(length, np.float32), []
-        for _ in range(_ROUNDS + 1):
-            start = time.perf_counter()
-            database.nearest(query, 50)
-            times.append(time.perf_counter() - start)
-        seconds[size] = float(np.median(times[1:]))
-    return seconds

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mfvpr.checkpoints import REGISTRY, is_installed
-from mfvpr.checkpoints.registry import Entry
+from mfvpr.checkpoints.networks import Entry
 from mfvpr.cli.command_line import override
 from mfvpr.cli.schema import DATA_SET_NAME, Evaluate
 from mfvpr.datasets.published import PUBLISHED
@@ -40,7 +40,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Place:
-    """A data set at hand, its settings of `experiments.evaluate`, and its folder (None = it is synthetic)."""
+    """A data set at hand, its settings of `mfvpr evaluate`, and its folder (None = it is synthetic)."""
 
     name: str
     settings: tuple[str, ...]
@@ -97,7 +97,7 @@ _RUNS = {
 
 
 def overrides(run: str, dataset: str) -> tuple[str, ...]:
-    """Settings of `experiments.evaluate` that make an evaluation, without its data set."""
+    """Settings of `mfvpr evaluate` that make an evaluation, without its data set."""
     chosen = _RUNS.get(run, (f"system={run}",))
     if run.startswith("selavpr"):
         return (*chosen, "candidates=50")

@@ -50,7 +50,6 @@ class Evaluations:
         seconds: of a query, by row and step; see `runs.measure_query`.
         sizes: by row and data set: MiB of the database's features in float32, as the paper counts them.
         timed_on: the data set and the device of the seconds, in words.
-        growth: seconds of a query by title and by the size of the database.
         folders: run folders by data set and evaluation.
     """
 
@@ -60,12 +59,11 @@ class Evaluations:
     seconds: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
     timed_on: str = ""
-    growth: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     folders: Mapping[tuple[str, str], Path] = field(default_factory=dict)
 
     @property
     def best_rows(self) -> list[Row]:
-        """Rows whose histograms, failures and growth are shown, the most important first."""
+        """Rows whose histograms and failures are shown, the most important first."""
         return [row for name in _BEST for row in self.rows if row.name == name]
 
     def title(self, name: str) -> str:

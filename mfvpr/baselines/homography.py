@@ -5,7 +5,7 @@ counted at once, and samples after the one where OpenCV would stop do not count.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +17,9 @@ from mfvpr.baselines.spatial_scores import query_features
 from mfvpr.core.scorer import check_bounds
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence, require_sizes
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, NoGradientError
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, number, one_of, setting, whole
-from mfvpr.utils.numerics import (
-    at_least_single,
-    available_cpus,
-    is_concrete,
-    masked,
-    where_finite,
-    without_gradient,
-)
+from mfvpr.utils.numerics import at_least_single, available_cpus, is_concrete, masked, where_finite
 
 _MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
 _ROUNDS = 8  # the search ends after so many times the rounds that samples without degenerate draws would need
@@ -82,7 +75,7 @@ class Homography:
     def estimate(self, matches: Matches) -> Estimate:
         """Homography of one pair, with its inliers and its score."""
         points = jnp.concatenate([at_least_single(matches.points1), at_least_single(matches.points0)], axis=-1)
-        points, confidence, *limits = without_gradient(
+        points, confidence, *limits = _without_gradient(
             "homography: the number of inliers has no gradient; take a score that has one, such as HistogramOfShifts",
             (points, match_confidence(matches), self.threshold, self.max_iterations, self.confidence),
         )
@@ -212,6 +205,20 @@ class _State(NamedTuple):
 def _maximum_before(values: Float[Array, " samples"], start: Float[Array, ""]) -> Float[Array, " samples"]:
     """Maximum of `start` and all values before each one."""
     return jnp.maximum(jnp.concatenate([jnp.zeros_like(values[:1]), jax.lax.cummax(values)[:-1]]), start)
+
+
+def _without_gradient(why: str, values: Any) -> Any:
+    """The values; their derivative raises `NoGradientError` with the message `why`."""
+
+    @jax.custom_jvp
+    def same(values: Any) -> Any:
+        return values
+
+    @same.defjvp
+    def refuse(*_: Any) -> Any:
+        raise NoGradientError(why)
+
+    return same(values)
 
 
 @value

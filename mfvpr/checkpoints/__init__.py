@@ -1,7 +1,7 @@
 """Published network weights: their sources, their conversion to runtime files, and networks with these weights.
 
-Read first: registry (published files), files (install, save, load), conversion (layouts), networks (network of each
-file), checkpoint (readers).
+Read first: networks (published files and the network of each), files (install, save, load), conversion (tables of
+keys), checkpoint (readers).
 """
 
 import lazy_loader

@@ -11,4 +11,4 @@ __all__ = [
 ]
 
 from .files import WeightsError, install, is_installed, load_model, own_entries, weights_folder
-from .registry import REGISTRY, entry_of, how_to_install
+from .networks import REGISTRY, entry_of, how_to_install

@@ -12,13 +12,12 @@ from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from mfvpr.io.containers import reading, shorten
-from mfvpr.io.formats.matlab_files import read_matlab
-from mfvpr.io.formats.pickles import (
+from mfvpr.io.object_files import (
     NUMPY_MAGIC,
     DataUnpickler,
     Function,
-    PickledArray,
     open_torch_archive,
+    read_matlab,
     read_objects,
 )
 from mfvpr.utils.errors import InputError
@@ -59,9 +58,9 @@ def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
     for layer, parts in layers.items():
         for name, array in parts.items():
             key = f"{layer}.{name}"
-            if not isinstance(array, PickledArray) or not isinstance(array.content, np.ndarray):
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
                 raise InputError(f"expected arrays by layer, got {type(array).__name__} at {shorten(key)}")
-            arrays[key] = array.content
+            arrays[key] = array
     if not arrays:
         raise InputError(f"expected {_LAYERS}, got none; use the official file")
     return arrays

@@ -14,8 +14,17 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint, require_checkpoint
 from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import NETWORKS, RUNTIME, blueprint
-from mfvpr.checkpoints.registry import OWN, REGISTRY, Entry, entry_of, how_to_install, own_entry
+from mfvpr.checkpoints.networks import (
+    NETWORKS,
+    OWN,
+    REGISTRY,
+    RUNTIME,
+    Entry,
+    blueprint,
+    entry_of,
+    how_to_install,
+    own_entry,
+)
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file, write_text
 

@@ -1,21 +1,45 @@
-"""Networks of the published files, and their blueprints, which take the weights."""
+"""Published weights: names, sources, hashes, licenses, and the networks that take them. It contains no weights."""
 
+import difflib
 import math
+import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mfvpr.checkpoints import tables
+from mfvpr.checkpoints import conversion
 from mfvpr.checkpoints.conversion import Rule, Table, convert
-from mfvpr.checkpoints.registry import Entry
+from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:
     from flax import nnx
 
+OWN = "own/"  # names of weights of one's own begin with it, also in settings and run folders
 RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One published file."""
+
+    name: str
+    network: str
+    file: str  # the official file name
+    source: str  # its authors' address
+    size: int | None  # bytes; None where not published
+    sha256: str | None  # None where not published
+    code_license: str
+    weights_license: str
+    like: str | None = None  # weights of one's own: the published entry of the same network
+
+    @property
+    def license(self) -> str:
+        """Licenses of the code and of the weights, as their authors state them."""
+        return f"code {self.code_license}, weights {self.weights_license}"
 
 
 class Network(NamedTuple):
@@ -25,44 +49,169 @@ class Network(NamedTuple):
     table: Table
 
 
-def _network(table: Table, name: str, *arguments: Any, **options: Any) -> Network:
-    def builder() -> Callable[..., "nnx.Module"]:
+REGISTRY: dict[str, Entry] = {}  # by name
+NETWORKS: dict[str, Network] = {}  # by the same names
+_LICENSES = {  # network -> of the code and of the weights
+    "d2net": ("BSD-3-Clause-Clear", "none stated"),
+    "mixvpr": ("none stated", "none stated"),
+    "aliked": ("BSD-3-Clause", "BSD-3-Clause"),
+    "lightglue": ("Apache-2.0", "Apache-2.0"),
+    "ssm": ("MIT (SSM-VPR)", "CC BY (Places365)"),
+    "netvlad": ("MIT", "MIT"),
+    "patch_netvlad": ("MIT", "MIT"),
+    "gem": ("MIT", "MIT"),
+    "dinov2": ("Apache-2.0", "Apache-2.0"),
+    "selavpr": ("MIT, Apache-2.0", "none stated"),
+}
+
+
+class _Model(NamedTuple):
+    """A class of `mfvpr.networks` with arguments, and the table of its checkpoints."""
+
+    table: Table
+    name: str
+    arguments: tuple[Any, ...] = ()
+    options: Mapping[str, Any] = {}
+
+    def builder(self) -> Callable[..., "nnx.Module"]:
         from mfvpr import networks
 
-        return partial(getattr(networks, name), *arguments, **options)
-
-    return Network(builder, table)
+        return partial(getattr(networks, self.name), *self.arguments, **self.options)
 
 
-_ALIKED = ("aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32")
+def _publish(
+    network: str,
+    name: str,
+    source: str,
+    model: _Model,
+    file: str = "",
+    size: int | None = None,
+    sha256: str | None = None,
+    licenses: tuple[str, str] | None = None,
+) -> None:
+    """Register a file and its network; the source ends with the file by default."""
+    file, licenses = file or source.rpartition("/")[2], licenses or _LICENSES[network]
+    REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses)
+    NETWORKS[name] = Network(model.builder, model.table)
 
-# Names in the registry -> networks.
-NETWORKS: dict[str, Network] = {
-    **{name: _network(tables.D2NET, "D2Net") for name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism")},
-    "mixvpr_4096": _network(tables.MIXVPR, "MixVPR", out_channels=1024, out_rows=4),
-    "mixvpr_512": _network(tables.MIXVPR, "MixVPR", out_channels=256, out_rows=2),
-    "mixvpr_128": _network(tables.MIXVPR, "MixVPR", out_channels=64, out_rows=2),
-    "vgg16_places365": _network(tables.SSM, "SsmVgg"),
-    **{name: _network(tables.ALIKED, "Aliked", name) for name in _ALIKED},
-    "aliked_lightglue": _network(tables.LIGHTGLUE, "LightGlue"),
-    "netvlad_pitts30k": _network(tables.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
-    "netvlad_tokyotm": _network(tables.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True),
-    "netvlad_pytorch": _network(tables.NETVLAD, "VggNetVlad", 64, None),
-    **{
-        f"patchnetvlad_{training}_{outputs}": _network(tables.NETVLAD, "VggNetVlad", clusters, outputs)
-        for training, clusters in (("mapillary", 16), ("pitts", 64), ("landmarks", 64))
-        for outputs in ((4096,) if training == "landmarks" else (128, 512, 4096))
-    },
-    "cosplace_vgg16_512": _network(tables.GEM_VGG16, "Gem", "vgg16", 512),
-    "cosplace_resnet50_512": _network(tables.GEM_RESNET50, "Gem", "resnet50", 512),
-    "cosplace_resnet50_2048": _network(tables.GEM_RESNET50, "Gem", "resnet50", 2048),
-    "dinov2_vits14": _network(tables.DINOV2, "VisionTransformer", 384, 12, 6),
-    "dinov2_vitb14": _network(tables.DINOV2, "VisionTransformer", 768, 12, 12),
-    "dinov2_vitl14": _network(tables.DINOV2, "VisionTransformer", 1024, 24, 16),
-    "selavpr_pitts30k": _network(tables.SELAVPR, "SelaVpr", registers=0),
-    "selavpr_msls": _network(tables.SELAVPR, "SelaVpr", registers=0),
-    "selavpr_msls_registers": _network(tables.SELAVPR, "SelaVpr", registers=4),
-}
+
+def _drive(file_id: str) -> str:
+    return f"https://drive.google.com/file/d/{file_id}/view"
+
+
+for _name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism"):
+    _publish("d2net", _name, f"https://dusmanu.com/files/d2-net/{_name}.pth", _Model(conversion.D2NET, "D2Net"))
+
+for _channels, _rows, _id in (
+    (1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L"),
+    (256, 2, "1khiTUNzZhfV2UUupZoIsPIbsMRBYVDqj"),
+    (64, 2, "1DQnefjk1hVICOEYPwE4-CZAZOvi1NSJz"),
+):
+    _name, _model = f"mixvpr_{_channels * _rows}", _Model(conversion.MIXVPR, "MixVPR", (_channels, _rows))
+    _file = f"resnet50_MixVPR_{_channels * _rows}_channels({_channels})_rows({_rows}).ckpt"
+    _publish("mixvpr", _name, _drive(_id), _model, _file)
+
+for _name, _size, _sha256 in (
+    ("aliked-t16", 794_859, "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
+    ("aliked-n16", 2_738_091, "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
+    ("aliked-n16rot", 2_738_325, "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
+    ("aliked-n32", 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+):
+    _source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{_name}.pth"
+    _publish("aliked", _name, _source, _Model(conversion.ALIKED, "Aliked", (_name,)), size=_size, sha256=_sha256)
+
+_publish(
+    "lightglue",
+    "aliked_lightglue",
+    "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
+    _Model(conversion.LIGHTGLUE, "LightGlue"),
+    size=47_632_827,
+    sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+)
+_publish(
+    "ssm",
+    "vgg16_places365",
+    "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
+    "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel",
+    _Model(conversion.SSM, "SsmVgg"),
+    "vgg16_places365.npy",
+)
+
+for _name, _file in (("netvlad_pitts30k", "Pitts30K_struct.mat"), ("netvlad_tokyotm", "TokyoTM_struct.mat")):
+    _model = _Model(conversion.NETVLAD_MATLAB, "VggNetVlad", (64, 4096), {"original": True})
+    _publish("netvlad", _name, f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}", _model)
+_publish(
+    "netvlad",
+    "netvlad_pytorch",
+    "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
+    _Model(conversion.NETVLAD, "VggNetVlad", (64, None)),
+    "checkpoint.pth.tar",
+    licenses=("none stated", "none stated"),
+)
+
+for _backbone, _outputs, _table in (
+    ("VGG16", 512, conversion.GEM_VGG16),
+    ("ResNet50", 512, conversion.GEM_RESNET50),
+    ("ResNet50", 2048, conversion.GEM_RESNET50),
+):
+    _source = f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{_backbone}_{_outputs}_cosplace.pth"
+    _model = _Model(_table, "Gem", (_backbone.lower(), _outputs))
+    _publish("gem", f"cosplace_{_backbone.lower()}_{_outputs}", _source, _model)
+
+for _training, _clusters, _outputs, _size, _sha256 in (
+    ("mapillary", 16, 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
+    ("mapillary", 16, 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
+    ("mapillary", 16, 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),
+    ("pitts", 64, 128, 92_681_537, "74bb0e0113c074ed9b07651a5f01bd424171d8e3b91d7024d2ccb0b0392164f3"),
+    ("pitts", 64, 512, None, "309611d927c759e897e1eb27977994236b5618d9d3cd7202035cea1b56c08c1c"),
+    ("pitts", 64, 4096, 1_132_901_186, "2c3cf17de91974156cb6aee40a6f7a229825095273d7de87c0792084ae1bf4aa"),
+    ("landmarks", 64, 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
+):
+    _name, _model = f"{_training}_{_outputs}", _Model(conversion.NETVLAD, "VggNetVlad", (_clusters, _outputs))
+    _source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{_training}_WPCA{_outputs}.pth.tar"
+    _publish("patch_netvlad", f"patchnetvlad_{_name}", _source, _model, size=_size, sha256=_sha256)
+
+for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14", 1024, 24, 16)):
+    _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
+    _model = _Model(conversion.DINOV2, "VisionTransformer", tuple(_sizes))
+    _publish("dinov2", f"dinov2_{_name}", _source, _model)
+
+for _name, _id, _file, _registers in (
+    ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),
+    ("selavpr_msls", "1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV", "SelaVPR_msls.pth", 0),
+    ("selavpr_msls_registers", "16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk", "SelaVPR_reg4_msls.pth", 4),
+):
+    _model = _Model(conversion.SELAVPR, "SelaVpr", (), {"registers": _registers})
+    _publish("selavpr", _name, _drive(_id), _model, _file)
+
+
+def own_entry(name: str, like: str) -> Entry:
+    """Entry of weights of one's own, for the network of the published weights `like`."""
+    if not re.fullmatch(rf"{OWN}[\w-]+", name):
+        raise InputError(f"{name.removeprefix(OWN)}: expected a name of letters, digits, - and _")
+    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-"}
+    return replace(entry_of(like), name=name, file="FILE", like=like, **none)
+
+
+def how_to_install(entry: Entry) -> str:
+    """The first command that installs the weights of an entry."""
+    if entry.like is not None:
+        return f"mfvpr weights add FILE --own {entry.name.removeprefix(OWN)} --as {entry.like}"
+    command = f"add {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
+    return f"mfvpr weights {command}"
+
+
+def entry_of(name: str) -> Entry:
+    """The entry called `name`.
+
+    Raises:
+        InputError: the name is unknown; the message suggests the nearest name, or lists all.
+    """
+    if name in REGISTRY:
+        return REGISTRY[name]
+    nearest = difflib.get_close_matches(name, REGISTRY, n=1)
+    hint = f"the nearest is {nearest[0]}" if nearest else f"expected one of {', '.join(REGISTRY)}"
+    raise InputError(f"{name}: no weights of this name; {hint}")
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ import yaml
 
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
 from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_manifest
-from mfvpr.checkpoints.networks import blueprint
-from mfvpr.checkpoints.registry import how_to_install
+from mfvpr.checkpoints.networks import blueprint, how_to_install
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.console import Progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
@@ -28,15 +27,14 @@ from mfvpr.io.containers import reading
 from mfvpr.report import Table, prediction_files
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import contact_sheet
-from mfvpr.report.pages.one_run import write_report
-from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.pages import write_comparison, write_report
 from mfvpr.report.prediction_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
 from mfvpr.utils.files import printable, replacing
 from mfvpr.utils.numerics import available_cpus
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
 _CHUNK = 1 << 18  # bytes
 _UNPUBLISHED = {

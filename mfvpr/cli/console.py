@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:  # or the command line would wait for JAX
-    from mfvpr.utils.progress import Track
+    from mfvpr.utils.runtime import Track
 
 _QUIET = 2.0  # seconds before anything is shown
 _INTERVALS = {True: 0.1, False: 10.0}  # seconds between two lines in a terminal, and in a file

@@ -14,9 +14,8 @@ from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import Confidence, System, rank_dataset, read_confidences
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.evaluation.sequence_matching import num_candidates
-from mfvpr.report.confidences import confidence_figures, confidence_table
-from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.query_figures import query_figures
+from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
+from mfvpr.report.figures import query_figures, reliability_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
@@ -46,7 +45,7 @@ def evaluate(settings: Evaluate) -> None:
     with jobs.claim(settings.out, settings.dataset["name"]) as folder:
         outcome = evaluation_of(settings)
         report, description = outcome.report, outcome.description
-        tables = [recall_table(report)] if report.thresholds else []
+        tables = [recall_table(report.rows())] if report.thresholds else []
         if tables and report.confidences is not None:
             tables.append(confidence_table(report))
         jobs.write_results(
@@ -73,7 +72,7 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport(ranked, inputs.thresholds, settings.recall.ks, confidences, settings.threshold, lacking)
-    figures = query_figures(report, figure_queries) + (confidence_figures(report) if figure_queries else [])
+    figures = query_figures(report, figure_queries) + (reliability_figures(report) if figure_queries else [])
     values, scorers = to_values(settings), assembly.describe_settings(settings.scorer)
     description = RunDescription(
         {"retrieval": settings.retrieval, "features": settings.features, "matching": settings.matching},

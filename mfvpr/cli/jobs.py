@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,8 +23,7 @@ from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
 from mfvpr.evaluation.system import folders_of
 from mfvpr.matchers import MatchSet, Scales
-from mfvpr.report import runs
-from mfvpr.report.pages import one_run
+from mfvpr.report import pages, runs
 from mfvpr.report.runs import Figure
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -251,7 +251,7 @@ def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str,
 @contextmanager
 def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
     """The run folder `out`, for this run alone; None = a new one of a data set. Options as of `claim_run_folder`."""
-    folder = expand_user(out) if out else runs.new_run_folder(Path("runs"), dataset)
+    folder = expand_user(out) if out else Path("runs", dataset, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
@@ -307,7 +307,7 @@ def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
 def report_page(folder: Path) -> Path | None:
     """Write the page of an evaluation and return its path; warn and return None if that fails."""
     try:
-        return one_run.write_report(folder)
+        return pages.write_report(folder)
     except (ImportError, InputError, OSError) as error:
         warn(f"{folder}: no page was made of it ({error})")
         return None

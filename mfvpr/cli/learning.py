@@ -30,8 +30,7 @@ from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user, write_text
-from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import fingerprint, versions
 
 _TRAINING = ("every", "patience", "batch", "learning_rate", "hidden", "seed")
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}

@@ -18,13 +18,13 @@ from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Located, Map, Route
-from mfvpr.localization.declaration import fit_to_map, read_declaration, read_system
+from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
 from mfvpr.utils import Runtime
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable, used_bytes
+from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable
 
 POLL = 0.2  # seconds between two looks at a folder
 Pixels = UInt8[np.ndarray, "height width channels"]
@@ -42,8 +42,8 @@ def build_map(settings: MapBuild) -> None:
 
 def print_map(folder: Path) -> None:
     """Print the number of images, the size on disk and the settings of a map."""
-    settings, robot_map = read_declaration(folder), Map.open(folder)
-    print(f"{folder}: {len(robot_map)} images, {used_bytes(folder) / 1e6:.1f} MB")
+    settings, robot_map = read_settings(folder), Map.open(folder)
+    print(f"{folder}: {len(robot_map)} images, {sum(path.stat().st_size for path in folder.iterdir()) / 1e6:.1f} MB")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 
@@ -145,7 +145,7 @@ class _Drive:
         self.missing -= names
         [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
         path = expand_user(settings.out) / f"{file}.png"
-        from mfvpr.report.query_figures import localization_figure  # here: Matplotlib takes 0.4 s
+        from mfvpr.report.figures import localization_figure  # here: Matplotlib takes 0.4 s
 
         try:
             localization_figure(path, self._map, name, pixels, localized, root=self._root)
@@ -173,7 +173,7 @@ def _confidence(settings: Localize, system: System) -> Confidence | None:
         return None
     from mfvpr.cli.evaluation import ConfidenceFile  # here: it imports the reports
 
-    map_settings, name = read_declaration(expand_user(settings.map)), system.headline
+    map_settings, name = read_settings(expand_user(settings.map)), system.headline
     if map_settings["final"] == "score":
         del map_settings["fusion"]
     file, scorers = ConfidenceFile.read(settings.confidence), system.final_scores[name].scorers

@@ -34,7 +34,7 @@ from mfvpr.utils import InputError, Runtime, Stopwatch
 from mfvpr.utils.fields import NOT_NEGATIVE, check_values, list_of, to_values
 from mfvpr.utils.fields import Setting as Declared
 from mfvpr.utils.files import expand_user
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 _MOST_SETTINGS = 1_000_000
 

@@ -53,18 +53,16 @@ class AggregatedScore:
             center = masked_median(shifts, confidence > 0)
         else:
             center = masked_mean(shifts, matches.mask, weights if self.mean == "weighted" else confidence)
-        closeness = self._closeness(shifts - center[None], image_sizes(matches)[0][None])
-        score = jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
-        return where_finite(score, weights, shifts)
-
-    def _closeness(self, offsets: Float[Array, "slots 2"], size: Float[Array, "1 2"]) -> Float[Array, "slots 2"]:
-        """Image size minus the distance of the shift from the center, px."""
+        offsets, size = shifts - center[None], image_sizes(matches)[0][None]
         if self.temperature is None:
             closeness = size - jnp.abs(offsets)
-            return jnp.maximum(closeness, 0.0) if self.clamp else closeness
-        temperature = positive(self.temperature, offsets.dtype)
-        closeness = size - (safe_sqrt(offsets**2 + temperature**2) - temperature)
-        return temperature * jax.nn.softplus(closeness / temperature) if self.clamp else closeness
+            closeness = jnp.maximum(closeness, 0.0) if self.clamp else closeness
+        else:
+            temperature = positive(self.temperature, offsets.dtype)
+            closeness = size - (safe_sqrt(offsets**2 + temperature**2) - temperature)
+            closeness = temperature * jax.nn.softplus(closeness / temperature) if self.clamp else closeness
+        score = jnp.sum(weights * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
+        return where_finite(score, weights, shifts)
 
 
 @value

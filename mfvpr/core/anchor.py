@@ -84,12 +84,20 @@ class AnchorPoints:
         """Cells of the first image, all occupied ones: number, displacement in rows and columns, occupancy, weight."""
         num_cells = self.num_bins**2
         weights = match_weights(self.weight, matches)
-        anchor, target = (self._cell(position) for position in self._positions(matches))
-        few = len(anchor) < num_cells
 
+        def cell(position: Float[Array, "slots 2"]) -> Int[Array, " slots"]:
+            """Row-major cell of each position, clipped to the image."""
+            column, row = jnp.clip(jnp.floor(position), 0, self.num_bins - 1).astype(jnp.int32).T
+            return row * self.num_bins + column
+
+        anchor, target = map(cell, self._positions(matches))
+        few = len(anchor) < num_cells
         vote = anchor * num_cells + target
-        # The choice of the winner has no gradient; its weight below has.
-        strength = jax.lax.stop_gradient(_sums_by_key(weights, vote, num_cells**2, pairwise=few))  # [K]
+        if few:  # matches, and very many pairs of cells
+            strength = jnp.sum(jnp.where(vote[:, None] == vote[None], weights[:, None], 0.0), axis=0)
+        else:
+            strength = jnp.zeros(num_cells**2, weights.dtype).at[vote].add(weights)[vote]
+        strength = jax.lax.stop_gradient(strength)  # the choice of the winner has no gradient; its weight below has
         real = match_confidence(matches) > 0
         member = jnp.where(real, anchor, num_cells)  # out of range, hence dropped, unless it is a match
         best = jnp.full(num_cells, -jnp.inf, weights.dtype).at[member].max(strength, mode="drop")
@@ -145,11 +153,6 @@ class AnchorPoints:
         candidate = masked(at_least_single(matches.points1), matches.mask) * self.num_bins / size1[None]
         return (query, candidate) if self.first == "query" else (candidate, query)
 
-    def _cell(self, position: Float[Array, "slots 2"]) -> Int[Array, " slots"]:
-        """Row-major cell of each position, clipped to the image."""
-        column, row = jnp.clip(jnp.floor(position), 0, self.num_bins - 1).astype(jnp.int32).T
-        return row * self.num_bins + column
-
     def _membership(self, position: Float[Array, "slots 2"], temperature: Array) -> Float[Array, "slots cells"]:
         """Membership of each position in each cell, row-major; a row sums to 1."""
         centers = jnp.arange(self.num_bins, dtype=position.dtype) + 0.5
@@ -159,27 +162,16 @@ class AnchorPoints:
 
     def _neighbors(self, cells: Int[Array, " cells"]) -> Bool[Array, "cells cells"]:
         """Entry (a, b): cell b lies in the window around cell a."""
-        low, high = self._reach()
-        row, column = (index.astype(float) for index in jnp.divmod(cells, self.num_bins))
-        offsets = row[None] - row[:, None], column[None] - column[:, None]
-        row_near, column_near = ((offset >= low) & (offset <= high) for offset in offsets)
-        inside = row_near & column_near
-        return inside if self.include_self else inside & (cells[None] != cells[:, None])
-
-    def _reach(self) -> tuple[Array, Array]:
-        """Lowest and highest offset of a cell in the window."""
         window = jnp.asarray(self.window, dtype=float)
         half, half_of_odd = jnp.floor(window / 2), jnp.floor((window - 1) / 2)
-        return {
+        low, high = {
             "half_floor": (-half, half),
             "asymmetric": (-half, window - half - 1),
             "odd_down": (-half_of_odd, half_of_odd),
             "radius": (-window, window),
         }[self.window_mode]
-
-
-def _sums_by_key(values: Array, keys: Array, num_keys: int, *, pairwise: bool) -> Float[Array, " slots"]:
-    """Sum of all `values` with the same key."""
-    if pairwise:  # few values and very many keys
-        return jnp.sum(jnp.where(keys[:, None] == keys[None], values[:, None], 0.0), axis=0)
-    return jnp.zeros(num_keys, values.dtype).at[keys].add(values)[keys]
+        row, column = (index.astype(float) for index in jnp.divmod(cells, self.num_bins))
+        offsets = row[None] - row[:, None], column[None] - column[:, None]
+        row_near, column_near = ((offset >= low) & (offset <= high) for offset in offsets)
+        inside = row_near & column_near
+        return inside if self.include_self else inside & (cells[None] != cells[:, None])

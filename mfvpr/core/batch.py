@@ -1,6 +1,5 @@
 """Scores of the candidates of one query, by one scorer or by a grid of its parameters: `lax.map` around `vmap`."""
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -47,8 +46,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     plain function runs operation by operation. Capacities (`max_bins` of the histogram) are fitted to the image sizes;
     under a caller's `jit`, where sizes are traced, set them before.
     """
-    check_candidates(matches)
-    check_host(scorer)
+    check_candidates(scorer, matches)
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
     scores = _score_candidates(fit_to_sizes(partial(fit_capacities, scorer, multiple=BIN_STEP), matches), matches)
@@ -77,9 +75,8 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
-    check_candidates(matches)
+    check_candidates(scorer, matches)
     refuse_own_names(scorer, axes)
-    check_host(scorer)
     weights = _weights(axes["weight"]) if "weight" in axes and hasattr(scorer, "weight") else ()
     values = {
         name: np.arange(len(weights)) if name == "weight" and weights else _axis(scorer, name, axis)
@@ -245,8 +242,9 @@ def _on_every_core(function: Callable[[Matches], Any], matches: Matches) -> Any:
     return jax.tree.map(join, *parts)
 
 
-def check_candidates(matches: Matches) -> None:
-    """Raise a ValueError unless the matches are `[C, K, ...]`."""
+def check_candidates(scorer: Any, matches: Matches) -> None:
+    """Raise a ValueError unless the matches are `[C, K, ...]`, and a scorer of the host is a value."""
+    check_host(scorer)
     if np.ndim(matches.mask) != 2:
         raise ValueError(
             f"expected matches [C, K, ...] of candidates, got a mask of shape {np.shape(matches.mask)}; of one pair "
@@ -278,11 +276,8 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     """One checked axis of a grid, float `[n]`."""
     numeric = [*numbers_by_name(scorer), *(["weight"] if hasattr(scorer, "weight") else []), "max_distance"]
     if name not in numeric:
-        nearest = difflib.get_close_matches(name, numeric, n=1) or numeric
-        raise ValueError(
-            f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {', '.join(numeric)} "
-            f"(nearest: {nearest[0]})"
-        )
+        names = ", ".join(numeric)
+        raise ValueError(f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {names}")
     points = np.asarray(axis) if is_concrete(axis) else jnp.asarray(axis)  # on the host, which takes them apart
     if not (jnp.issubdtype(points.dtype, jnp.integer) and name in whole_numbers(scorer)):
         points = points.astype(jnp.result_type(float))

@@ -114,20 +114,18 @@ def choose_product(
     if product is not None:
         require_word("product", product, Product)
     may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
-    if not may_be_faster or device_of(sides).platform != "cpu":
+    if not may_be_faster or product == "float32" or device_of(sides).platform != "cpu":
         return "float32"
     dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
-    conditions = {
-        "cross_check=mutual": cross_check == "mutual",
-        "chunk_size=1": chunk_size == 1,
-        "descriptors in single or half precision": dtypes == {jnp.dtype(jnp.float32)},
-        "images with slots": all(side.mask.shape[-1] for side in sides),
-        "descriptors of one length": len(lengths) == 1,
-    }
-    missing = [condition for condition, holds in conditions.items() if not holds]
-    if product == "bfloat16" and missing:
-        raise ValueError(f"product=bfloat16: expected {' and '.join(missing)}; leave product out")
-    return product or ("float32" if missing else "bfloat16")
+    can_be_compared = dtypes == {jnp.dtype(jnp.float32)} and len(lengths) == 1
+    if can_be_compared and cross_check == "mutual" and chunk_size == 1 and all(side.mask.shape[-1] for side in sides):
+        return "bfloat16"
+    if product == "bfloat16":
+        raise ValueError(
+            "product=bfloat16: expected cross_check=mutual, chunk_size=1, images with slots, and descriptors of one "
+            "length in single or half precision; leave product out"
+        )
+    return "float32"
 
 
 class _Direction(NamedTuple):
@@ -145,14 +143,9 @@ class _Direction(NamedTuple):
 
     @property
     def count(self) -> Int[Array, " own"]:
-        """Number of keypoints that may be the nearest, at least if it is 0 or 1."""
+        """Number of keypoints that may be the nearest, at least if it is 0 or 1; others are settled by checks."""
         count = count_from(self.lines, self.nearest, self.threshold)
         return jnp.where(self.nearest.similarity > -jnp.inf, count, 0)
-
-    @property
-    def is_close(self) -> Bool[Array, " own"]:
-        """Whether several keypoints may be the nearest."""
-        return self.count > 1
 
 
 def round_query(features: Features) -> Rounded:
@@ -188,10 +181,10 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
     has_neighbor = to1.nearest.similarity > -jnp.inf
     excess = masked(to1.count.astype(jnp.float32) - WORTHWHILE_CHECKS, has_neighbor)
     is_worthwhile = jnp.sum(excess) <= 0
-    index1, settled1 = _settle(to1, to1.is_close & close_to_both.any(axis=0) & is_worthwhile)
+    index1, settled1 = _settle(to1, (to1.count > 1) & close_to_both.any(axis=0) & is_worthwhile)
     may_match = has_neighbor & (products[index1, columns] >= to0.threshold[index1])
     is_chosen = jnp.zeros(len(products), bool).at[index1].max(may_match)
-    index0, settled0 = _settle(to0, to0.is_close & is_chosen & is_worthwhile)
+    index0, settled0 = _settle(to0, (to0.count > 1) & is_chosen & is_worthwhile)
     longest0, longest1 = (jnp.max(side.norm + side.residual, initial=0) for side in (query, candidate))
     is_match, settled = has_neighbor & (index0[index1] == columns), settled1 & settled0 & is_worthwhile
     settled &= longest0 * longest1 < _LARGE  # False for NaN
@@ -199,7 +192,7 @@ def mutual_neighbors(query: Rounded, candidate: Rounded, *, with_second: bool) -
         return Neighbors(index1, is_match, index1, index1, is_match), settled
     lines = without(to1.lines, index1)
     rest = to1._replace(lines=lines, nearest=largest_of(lines))
-    second, settled2 = _settle(rest, rest.is_close & is_match & is_worthwhile)
+    second, settled2 = _settle(rest, (rest.count > 1) & is_match & is_worthwhile)
     neighbors = Neighbors(index1, is_match, index1, second, rest.nearest.similarity > -jnp.inf)
     return neighbors, settled & settled2
 
@@ -212,18 +205,13 @@ def _products(query: Rounded, candidate: Rounded) -> Float[Array, "keypoints1 ke
 
 
 def _direction(products: Array, axis: int, image: Rounded, other: Rounded) -> _Direction:
-    lines, window = lines_of(products, axis), _window(image, other)
-    return _Direction(image.exact, other.exact, lines, largest_of(lines), window)
-
-
-def _window(image: Rounded, other: Rounded) -> Float[Array, " own"]:
-    """2 e for each keypoint of `image`."""
-    dimensions = image.exact.shape[1]
+    lines, dimensions = lines_of(products, axis), image.exact.shape[1]
     rounding = (dimensions + 32) * 2.0**-24
     norm, residual = jnp.max(other.norm, initial=0), jnp.max(other.residual, initial=0)
     rounded = image.norm + image.residual
     bound = image.residual * norm + rounded * residual + rounding * rounded * (norm + residual)
-    return 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
+    window = 2 * (1 + 4 * rounding) * bound + 4 * dimensions * _SMALL
+    return _Direction(image.exact, other.exact, lines, largest_of(lines), window)
 
 
 def _settle(direction: _Direction, wanted: Bool[Array, " own"]) -> tuple[Int[Array, " own"], Bool[Array, ""]]:

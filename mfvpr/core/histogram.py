@@ -73,19 +73,14 @@ class HistogramOfShifts:
             or `bin_size` are traced, set it before `jit` or `vmap`, for instance by `with_capacity`; a histogram that
             then needs more bins scores NaN, never a wrong number.
         temperature: in units of the score; T > 0 scores T log(mean over bins of e^(s_ij / T)), at most the maximum
-            and smooth in everything but the number of bins. None is the paper's maximum; an array
-            not above 0 scores NaN.
+            and smooth in everything but the number of bins. None is the paper's maximum; an array not above 0 is NaN.
     """
 
     bin_size: float | Array = setting(15.0, POSITIVE, unit="px")
     sigma: float | Array = setting(22.5, POSITIVE, unit="px", learned=True)
     weight: Weight = weight_field("fs")
     truncate: float | Array = setting(
-        math.inf,
-        POSITIVE | None,
-        "vote only within so many; None = for all bins",
-        unit="sigmas",
-        none=math.inf,
+        math.inf, POSITIVE | None, "vote only within so many; None = for all bins", unit="sigmas", none=math.inf
     )
     shift_range: tuple[float, float] | None = setting(
         None, list_of(NOT_NEGATIVE, 2) | None, "None = all possible shifts", unit="[x, y] px", swept=False
@@ -111,14 +106,12 @@ class HistogramOfShifts:
 
     def __call__(self, matches: Matches) -> Float[jax.Array, ""]:
         """Score of one pair `[K]`, float32: the (smooth) maximum over bins, 0 without matches."""
-        shifts, bins, weights = self._shifts(matches), self._bins(matches), match_weights(self.weight, matches)[None]
-        return _where_usable(self._maxima(shifts, bins, weights), matches, shifts, bins, weights)[0]
+        bins, weights = self._bins(matches), match_weights(self.weight, matches)[None]
+        return bins.where_usable(self._maxima(bins, weights), matches, weights)[0]
 
-    def _maxima(
-        self, shifts: Float[Array, "2 slots"], bins: "_Bins", weights: Float[Array, "weightings slots"]
-    ) -> Float[jax.Array, " weightings"]:
+    def _maxima(self, bins: "_Bins", weights: Float[Array, "weightings slots"]) -> Float[jax.Array, " weightings"]:
         """The (smooth) maximum over bins of one pair for each weighting of its matches (0 on padding)."""
-        scores = bins.scores(shifts, weights)
+        scores = bins.scores(weights)
         if self.temperature is None:
             return jnp.max(scores, axis=(1, 2))  # of all: bins beyond the last only repeat it
         smooth = partial(smooth_maximum, mask=bins.inside, temperature=positive(self.temperature, scores.dtype))
@@ -128,10 +121,9 @@ class HistogramOfShifts:
         self, matches: Matches, weights: Float[Array, "candidates weightings slots"]
     ) -> Float[jax.Array, "candidates weightings"]:
         """Scores of candidates `[C, K, ...]` with several weights of their matches, which share the Gaussians."""
-        shifts, bins = jax.vmap(self._shifts)(matches), jax.vmap(self._bins)(matches)
-        size = self.pairs_at_once(matches, weights.shape[1])
-        maxima = jax.lax.map(lambda pair: self._maxima(*pair), (shifts, bins, weights), batch_size=size)
-        return jax.vmap(_where_usable)(maxima, matches, shifts, bins, weights)
+        bins, size = jax.vmap(self._bins)(matches), self.pairs_at_once(matches, weights.shape[1])
+        maxima = jax.lax.map(lambda pair: self._maxima(*pair), (bins, weights), batch_size=size)
+        return jax.vmap(_Bins.where_usable)(bins, maxima, matches, weights)
 
     def pairs_at_once(self, matches: Matches, num_weightings: int) -> int:
         """Pairs whose votes and bins are to exist at the same time."""
@@ -142,8 +134,8 @@ class HistogramOfShifts:
 
     def histogram(self, matches: Matches) -> ShiftHistogram:
         """All bins of one pair with their centers."""
-        scores, bins, shifts, weights = self._vote(matches)
-        scores = jnp.where(bins.are_usable(shifts, weights), scores, jnp.nan)
+        scores, bins, weights = self._vote(matches)
+        scores = jnp.where(bins.are_usable(weights), scores, jnp.nan)
         return ShiftHistogram(scores, *(bins.centers(axis, bins.index) for axis in (0, 1)))
 
     def dominant_shift(self, matches: Matches, *, refine: bool = False) -> Float[jax.Array, "2"]:
@@ -210,6 +202,7 @@ class HistogramOfShifts:
         return needed
 
     def _fit_to(self, matches: Matches) -> "HistogramOfShifts":
+        """With the capacity that one pair needs, before `jit` hides its sizes."""
         if is_concrete(matches) and not np.asarray(matches.mask).any():  # the sizes may be anything
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
@@ -243,17 +236,16 @@ class HistogramOfShifts:
         return edge + bin_size / 2, xp.where((bin_size > 0) & (lower <= upper), num_bins, 0)
 
     def _bins(self, matches: Matches) -> "_Bins":
-        dtype = match_shifts(matches).dtype
-        bin_size, truncate = (jnp.asarray(number, dtype=dtype) for number in (self.bin_size, self.truncate))
-        first, num_bins = self._bin_range(*image_sizes(matches), dtype, jnp)
-        return _Bins(first, num_bins, bin_size, self._deviation(dtype), truncate, self._capacity(matches))
+        shifts = self._shifts(matches)
+        bin_size, truncate = (jnp.asarray(number, dtype=shifts.dtype) for number in (self.bin_size, self.truncate))
+        first, num_bins = self._bin_range(*image_sizes(matches), shifts.dtype, jnp)
+        deviation = self._deviation(shifts.dtype)
+        return _Bins(shifts, first, num_bins, bin_size, deviation, truncate, self._capacity(matches))
 
-    def _vote(
-        self, matches: Matches
-    ) -> tuple[Float[Array, "bins bins"], "_Bins", Float[Array, "2 slots"], Float[Array, " slots"]]:
-        """Scores of the bins (y, x), -inf out of range, and what they follow from: bins, shifts, weights."""
-        bins, shifts, weights = self._bins(matches), self._shifts(matches), match_weights(self.weight, matches)
-        return jnp.where(bins.inside, bins.scores(shifts, weights[None])[0], -jnp.inf), bins, shifts, weights
+    def _vote(self, matches: Matches) -> tuple[Float[Array, "bins bins"], "_Bins", Float[Array, " slots"]]:
+        """Scores of the bins (y, x), -inf out of range; the bins, and the weights of the matches."""
+        bins, weights = self._bins(matches), match_weights(self.weight, matches)
+        return jnp.where(bins.inside, bins.scores(weights[None])[0], -jnp.inf), bins, weights
 
     def _shifts(self, matches: Matches) -> Float[Array, "2 slots"]:
         """Shifts along x and along y."""
@@ -268,8 +260,9 @@ class HistogramOfShifts:
 
 @value
 class _Bins:
-    """Bins of one pair, and the width of the votes, px."""
+    """Shifts of one pair, the bins that they vote for, and the width of the votes, px."""
 
+    shifts: Float[Array, "2 slots"]  # (x, y)
     first: Float[Array, "2"]  # center (x, y) of the first bin
     num_bins: Float[Array, "2"]
     bin_size: Float[Array, ""]
@@ -286,11 +279,11 @@ class _Bins:
         """Centers of bins along an axis, px, by bin number."""
         return self.first[axis] + index * self.bin_size
 
-    def votes(self, axis: int, shifts: Float[Array, "2 slots"]) -> Float[Array, "bins slots"]:
-        """Votes exp(-d^2 / (2 sigma^2)) of shifts along one axis, without weights."""
+    def votes(self, axis: int) -> Float[Array, "bins slots"]:
+        """Votes exp(-d^2 / (2 sigma^2)) of the shifts along one axis, without weights."""
         index = jnp.minimum(self.index, self.num_bins[axis] - 1)  # repeats the last bin, which changes no maximum
         # Bins along rows: the exponentials then run along K, which is longer and contiguous (1.8x faster).
-        sigmas = (self.centers(axis, index)[:, None] - shifts[axis][None]) / self.deviation
+        sigmas = (self.centers(axis, index)[:, None] - self.shifts[axis][None]) / self.deviation
         return jnp.where(jnp.abs(sigmas) > self.truncate, 0.0, jnp.exp(-0.5 * sigmas**2))
 
     @property
@@ -298,21 +291,24 @@ class _Bins:
         """(y, x), True for bins within the range of shifts."""
         return (self.index < self.num_bins[1])[:, None] & (self.index < self.num_bins[0])[None]
 
-    def scores(
-        self, shifts: Float[Array, "2 slots"], weights: Float[Array, "weightings slots"]
-    ) -> Float[Array, "weightings bins bins"]:
+    def scores(self, weights: Float[Array, "weightings slots"]) -> Float[Array, "weightings bins bins"]:
         """s_ij of equation 1, (y, x), by weighting: one product of all weighted votes along y and those along x."""
-        votes_x, votes_y = self.votes(0, shifts), self.votes(1, shifts)
+        votes_x, votes_y = self.votes(0), self.votes(1)
         rows = (weights[:, None] * votes_y[None]).reshape(len(weights) * len(votes_y), weights.shape[1])
         sums = jnp.matmul(rows, votes_x.T, precision=jax.lax.Precision.HIGHEST)
         return sums.reshape(len(weights), len(votes_y), len(votes_x))
 
-    def are_usable(self, shifts: Array, weights: Float[Array, "*weightings slots"]) -> Bool[Array, "*weightings"]:
+    def are_usable(self, weights: Float[Array, "*weightings slots"]) -> Bool[Array, "*weightings"]:
         """Whether the bins fit the capacity, and `deviation`, `truncate`, shifts and weights are numbers."""
         # Checked here, because XLA's maximum over thousands of values on a CPU skips NaN.
         fits = jnp.all((self.num_bins >= 1) & (self.num_bins <= self.capacity))
-        numbers = ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate) & jnp.all(jnp.isfinite(shifts))
+        numbers = ~jnp.isnan(self.deviation) & ~jnp.isnan(self.truncate) & jnp.all(jnp.isfinite(self.shifts))
         return fits & numbers & jnp.all(jnp.isfinite(weights), axis=-1)
+
+    def where_usable(self, values: Array, matches: Matches, weights: Array) -> Array:
+        """Values of one pair, for each weighting or of one; 0 without matches, NaN where not `are_usable`."""
+        usable = self.are_usable(weights)
+        return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
 
 
 def smooth_maximum(
@@ -329,36 +325,24 @@ def smooth_maximum(
     return jnp.where(is_near, temperature * jnp.log1p(jnp.mean(jnp.expm1(ratios), where=mask)), far)
 
 
-def _where_usable(
-    values: Float[Array, "*"],
-    matches: Matches,
-    shifts: Float[Array, "2 slots"],
-    bins: _Bins,
-    weights: Float[Array, "_ slots"],
-) -> Float[jax.Array, "*"]:
-    """Values of one pair; 0 without matches, NaN if not usable: all, or those of a weighting that is not finite."""
-    usable = bins.are_usable(shifts, weights)
-    return jnp.where(jnp.any(matches.mask), jnp.where(usable, values, jnp.nan), 0.0)
-
-
 @partial(compiled, static_argnames="refine")  # uncompiled, the loop of `climb` would be compiled at every call
 def _dominant_shift(scorer: HistogramOfShifts, matches: Matches, *, refine: bool) -> Array:
-    scores, bins, shifts, weights = scorer._vote(matches)
+    scores, bins, weights = scorer._vote(matches)
     row, column = jnp.unravel_index(jnp.argmax(scores), scores.shape)
     shift = jnp.stack([bins.centers(axis, bin.astype(scores.dtype)) for axis, bin in enumerate((column, row))])
     if refine:
-        shift = climb(shift, shifts.T, weights, bins.deviation)
+        shift = climb(shift, bins.shifts.T, weights, bins.deviation)
         if scorer.shift_range is not None:
             reach = jnp.asarray(scorer.shift_range, shift.dtype)
             shift = jnp.clip(shift, -reach, reach)
     shift = jnp.where(jnp.max(scores) > 0, shift, 0.0)
-    return _where_usable(shift, matches, shifts, bins, weights[None])
+    return bins.where_usable(shift, matches, weights[None])
 
 
 @compiled
 def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, sharpness: Array) -> Array:
     """`shift_interval`. The mass of a bin below 0 is that of 0; without votes all bins in range have the same mass."""
-    scores, bins, shifts, weights = scorer._vote(matches)
+    scores, bins, weights = scorer._vote(matches)
     level, sharpness = (jnp.asarray(number, scores.dtype) for number in (level, sharpness))
     heights, in_range = jnp.maximum(scores, 0.0), (scores > -jnp.inf).astype(scores.dtype)
     top = jnp.max(heights)
@@ -370,7 +354,7 @@ def _shift_interval(scorer: HistogramOfShifts, matches: Matches, level: Array, s
         below = jnp.concatenate([jnp.zeros(1, scores.dtype), jnp.cumsum(jnp.sum(mass, axis=axis))])
         return jnp.interp(jnp.stack([tail, 1 - tail]), below / below[-1], bins.centers(axis, edges))
 
-    return jnp.where(bins.are_usable(shifts, weights), jnp.stack([along(0), along(1)], axis=1), jnp.nan)
+    return jnp.where(bins.are_usable(weights), jnp.stack([along(0), along(1)], axis=1), jnp.nan)
 
 
 def climb(

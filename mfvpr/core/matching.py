@@ -52,10 +52,13 @@ def match_prepared(query: Query, candidate: Features, *, cross_check: CrossCheck
     """`match` of a query that `prepare_query` prepared once for all of its candidates."""
     if cross_check == "candidate":
         exchanged = Query(ready(candidate))
-        return _swap_images(match_prepared(exchanged, query.features, cross_check="none", with_ratio=with_ratio))
+        matches = match_prepared(exchanged, query.features, cross_check="none", with_ratio=with_ratio)
+        sides = [f.name[:-1] for f in fields(matches) if f.name.endswith("0")]
+        swapped = {f"{name}{1 - side}": getattr(matches, f"{name}{side}") for name in sides for side in (0, 1)}
+        return replace(matches, **swapped)
     candidate = ready(at_least_one(candidate))
     neighbors = query.neighbors(candidate, cross_check, with_second=with_ratio)
-    ratio = _distance_ratio(query.features, candidate, neighbors) if with_ratio else None
+    ratio = distance_ratio(query.features, candidate, neighbors) if with_ratio else None
     return make_matches(query.features, candidate, neighbors.match, neighbors.real, ratio=ratio)
 
 
@@ -185,12 +188,6 @@ def make_matches(
     )
 
 
-def _swap_images(matches: Matches) -> Matches:
-    names = [f.name[:-1] for f in fields(matches) if f.name.endswith("0")]
-    sides = {f"{name}0": getattr(matches, f"{name}1") for name in names}
-    return replace(matches, **sides, **{f"{name}1": getattr(matches, f"{name}0") for name in names})
-
-
 def slot_numbers(features: Features) -> Int[Array, " keypoints"]:
     return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
 
@@ -217,14 +214,13 @@ def _distance(
     return safe_sqrt(jnp.sum(difference * difference, axis=-1))
 
 
-def distance_ratio(features0: Features, features1: Features) -> Float[Array, " keypoints0"]:
-    """Ratio as in `match`, for features that are `ready`."""
-    return _distance_ratio(features0, features1, Query(features0).neighbors(features1, "none", with_second=True))
-
-
-def _distance_ratio(features0: Features, features1: Features, neighbors: Neighbors) -> Float[Array, " keypoints0"]:
-    closest, second = (
-        _distance(features0, features1, index, neighbors.has_second) for index in (neighbors.nearest, neighbors.second)
-    )
-    differ = neighbors.has_second & (closest < second)  # False if both are 0, or if rounding swaps equal distances
+def distance_ratio(
+    features0: Features, features1: Features, neighbors: Neighbors | None = None
+) -> Float[Array, " keypoints0"]:
+    """Ratio as in `match`, for features that are `ready`; `neighbors` if they are known."""
+    if neighbors is None:
+        neighbors = Query(features0).neighbors(features1, "none", with_second=True)
+    places, real = (neighbors.nearest, neighbors.second), neighbors.has_second
+    closest, second = (_distance(features0, features1, index, real) for index in places)
+    differ = real & (closest < second)  # False if both are 0, or if rounding swaps equal distances
     return jnp.where(differ, closest / jnp.where(differ, second, 1.0), 1.0)

@@ -31,8 +31,7 @@ def count_correct(
     rows: Int[np.ndarray, "queries depth"], positives: Positives, ks: Sequence[int]
 ) -> Int[np.ndarray, " ks"]:
     """Number of queries with a positive among their first k."""
-    correct = positives.contains(rows)
-    return np.array([correct[:, :k].any(axis=1).sum() for k in ks], int)
+    return np.array([hits(rows, positives, k).sum() for k in ks], int)
 
 
 def recall_at_k(

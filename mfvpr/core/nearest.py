@@ -5,6 +5,7 @@ once, for the maximum of every block of about 30 entries, then the block with th
 times faster than `argmax` on XLA's CPU backend. Elsewhere `argmax` reads the matrix once.
 """
 
+from contextlib import nullcontext
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -160,11 +161,9 @@ def ready(features: Features) -> Features:
     """Features on the device, in at least single precision: half precision decides near-ties in another way."""
     wide = {name: at_least_single(values) for name, values in per_keypoint(features).items() if name != "mask"}
     size = features.image_size
-    if size is not None and is_concrete(size):
-        with jax.ensure_compile_time_eval():  # concrete also under a caller's `jit`: scorers derive capacities from it
-            size = at_least_single(size)
-    elif size is not None:
-        size = at_least_single(size)
+    # A concrete size stays so under a caller's `jit`: scorers derive capacities from it.
+    with jax.ensure_compile_time_eval() if is_concrete(size) else nullcontext():
+        size = None if size is None else at_least_single(size)
     return Features(**wide, mask=jnp.asarray(features.mask), image_size=size)
 
 

@@ -8,8 +8,7 @@ Matches also take lists, arrays of torch and other libraries (DLPack) on any dev
 Arrays of fewer axes are never broadcast silently in this package: `values[None]` says so (the tests raise otherwise).
 """
 
-from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform
 
 import jax
@@ -188,17 +187,14 @@ INDICES = ("index0", "index1")  # integer fields, which take part in no arithmet
 
 def per_match(matches: Matches) -> dict[str, Array]:
     """Fields with a value for every match, `[..., K, ...]` by name, without mask and None."""
-    return _present(matches, lambda f: f.name != "mask" and not f.metadata.get("per_pair"))
+    values = {f.name: getattr(matches, f.name) for f in fields(matches) if not f.metadata.get("per_pair")}
+    return {name: entries for name, entries in values.items() if name != "mask" and entries is not None}
 
 
 def per_pair(matches: Matches) -> dict[str, Array]:
     """Fields with one value per pair of images, `[..., ...]` by name, without None."""
-    return _present(matches, lambda f: bool(f.metadata.get("per_pair")))
-
-
-def _present(matches: Matches, predicate: Callable[[Field[Any]], bool]) -> dict[str, Array]:
-    names = [f.name for f in fields(matches) if predicate(f)]
-    return {name: values for name in names if (values := getattr(matches, name)) is not None}
+    values = {f.name: getattr(matches, f.name) for f in fields(matches) if f.metadata.get("per_pair")}
+    return {name: entries for name, entries in values.items() if entries is not None}
 
 
 @value

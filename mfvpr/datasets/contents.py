@@ -1,7 +1,7 @@
 """Hashes and headers of image files, remembered between runs, so that unchanged files are not read again.
 
-A remembered hash is used only if path, size, both times and inode number of the file are unchanged, and if the times
-were old enough when the file was read: a file that is written twice within one tick of the clock keeps its times.
+A file is unchanged if its path, size, both times and inode number are, and if the times were old enough when it was
+read: a file that is written twice within one tick of the clock keeps its times.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from typing import Any
 from mfvpr.datasets.datasets import ImageFolder, OwnRows
 from mfvpr.datasets.image_reading import read_header
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
 FORMAT = 2  # of the record files: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds
@@ -88,7 +88,11 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     root = folder.root.absolute()
     name = f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}-{FORMAT}.json"
     path = None if cache is None else Path(cache) / name
-    records, start = {} if path is None else _read_records(path), time.time_ns()
+    records: dict[str, list[Any]] = {}  # state and content of files by name
+    start = time.time_ns()
+    if path is not None:
+        with suppress(OSError, ValueError):  # missing or damaged
+            records = json.loads(path.read_text(encoding="ascii"))
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
     unchanged = {name for name, state in states.items() if state and name in records and records[name][:4] == state}
     changed = [name for name in folder.names if name not in unchanged]
@@ -113,11 +117,7 @@ def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
 
 
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each of the `queries`, the rows of files in the `database` with the same content.
-
-    Example:
-        own_rows(contents(data.queries), contents(data.database))
-    """
+    """For each of the `queries`, the rows of files in the `database` with the same content."""
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         if file.sha256:
@@ -152,11 +152,3 @@ def read_content(path: Path) -> Content:
     except OSError:
         return Content()  # reading the image raises
     return Content(hashlib.sha256(content).hexdigest(), *read_header(content))
-
-
-def _read_records(path: Path) -> dict[str, list[Any]]:
-    """State and content of files by name; empty if the record file is missing or damaged."""
-    try:
-        return json.loads(path.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return {}

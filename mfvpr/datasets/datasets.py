@@ -9,10 +9,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.datasets.ground_truth import CHOICES, AllowedTruth, FrameTruth, Truth, truth_from_names
+from mfvpr.datasets.ground_truth import (
+    CHOICES,
+    AllowedTruth,
+    FrameTruth,
+    Truth,
+    truth_from_file,
+    truth_from_labels,
+    truth_from_names,
+)
 from mfvpr.datasets.image_reading import read_image
 from mfvpr.datasets.positives import Positives
-from mfvpr.datasets.truth_files import truth_from_file, truth_from_labels
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
@@ -23,7 +30,7 @@ MEANS = ("mean", "pooled")  # names in results of the means over sequences, and 
 
 @dataclass(frozen=True)
 class IndexFile:
-    """Ground truth of a file of pairs or positions, see `mfvpr.datasets.truth_files.truth_from_file`.
+    """Ground truth of a file of pairs or positions, see `mfvpr.datasets.ground_truth.truth_from_file`.
 
         data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
 
@@ -38,10 +45,10 @@ class IndexFile:
 
 @dataclass(frozen=True)
 class LabelFiles:
-    """Ground truth of two files of labels, see `mfvpr.datasets.truth_files.truth_from_labels`.
+    """Ground truth of two files of labels, see `mfvpr.datasets.ground_truth.truth_from_labels`.
 
     Example:
-        labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")  # for folder(ground_truth=labels)
+        labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")
     """
 
     queries: Path | str
@@ -185,7 +192,11 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
         raise InputError(f"{root}: expected a folder of images, got {got}; check the path")
     if bits is not None and not 8 <= bits <= 16:
         raise InputError(f"bits={bits}: expected from 8 to 16 bits in use, or none")
-    for folder, folders, files in os.walk(root, onerror=_refuse, followlinks=True):
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be listed ({error.strerror}); make it readable, or remove it")
+
+    for folder, folders, files in os.walk(root, onerror=refuse, followlinks=True):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(folder, name) for name in folders):
             if path.is_symlink() and path.parent.resolve().is_relative_to(path.resolve()):
@@ -197,11 +208,12 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
                 raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
     if not names:
         raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
-    return ImageFolder(root, tuple(sorted(names, key=_natural)), orient, bits)
 
+    def natural(name: str) -> tuple[list[tuple[int, int, str]], str]:  # runs of digits compare as numbers
+        parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+        return [(1, len(part), part) if place % 2 else (0, 0, part) for place, part in enumerate(parts)], name
 
-def _refuse(error: OSError) -> None:
-    raise InputError(f"{error.filename}: cannot be listed ({error.strerror}); make it readable, or remove it") from None
+    return ImageFolder(root, tuple(sorted(names, key=natural)), orient, bits)
 
 
 def folder(
@@ -232,7 +244,7 @@ def folder(
     """
     images = image_folder(database, orient=orient, bits=bits)
     if isinstance(queries, Path | str):
-        return Dataset(name, images, (_sequence(name, images, queries, ground_truth),))
+        return Dataset(name, images, (_sequence(name, images, queries, ground_truth, Path()),))
     folders = [Path(path) for path in queries]
     names = [(path.resolve() if path.name in ("", "..") else path).name for path in folders]
     if not names or len({*names, *MEANS}) < len(names) + len(MEANS):
@@ -243,7 +255,7 @@ def folder(
 
 
 def _sequence(
-    name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path = Path()
+    name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path
 ) -> QuerySequence:
     images = image_folder(queries, orient=database.orient, bits=database.bits)
     names = images.names, database.names
@@ -252,11 +264,11 @@ def _sequence(
             truth = None
         case Truth():
             truth = ground_truth
-        case "order":
-            if len(images) != len(database):
-                got = f"{len(images)} and {len(database)}; name the pairs in an index file"
-                raise InputError(f"ground_truth=order: expected as many queries as database images, got {got}")
+        case "order" if len(images) == len(database):
             truth = FrameTruth(tuple((row,) for row in range(len(images))), len(database))
+        case "order":
+            got = f"{len(images)} and {len(database)}; name the pairs in an index file"
+            raise InputError(f"ground_truth=order: expected as many queries as database images, got {got}")
         case "utm":
             truth = truth_from_names(*names)
         case IndexFile(path, is_widened):
@@ -267,9 +279,3 @@ def _sequence(
             files = "files are given as mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)"
             raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; {files}")
     return QuerySequence(name, images, truth)
-
-
-def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key in which runs of digits, of any length, compare as numbers."""
-    parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-    return [(1, len(part), part) if place % 2 else (0, 0, part) for place, part in enumerate(parts)], name

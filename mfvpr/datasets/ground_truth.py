@@ -1,21 +1,27 @@
-"""Ground truth: positives at a threshold, by file order or UTM coordinates (`truth_files` reads it from files).
+"""Ground truth: positives at a threshold; by file order, UTM coordinates in names, or from files as data.
 
 There are three units. Frames of the database sequence and meters have a threshold up to which database images count as
 correct. Exact ground truth has none.
 """
 
+import csv
+import json
 from abc import ABC, abstractmethod
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from functools import partial
+from itertools import chain
+from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.datasets.positives import Positives, rows_within
-from mfvpr.io.checks import parse_number
+from mfvpr.io.containers import parse_number, read_npz, reading, shorten
+from mfvpr.io.names import require_all
 from mfvpr.utils.errors import InputError
 
 Unit = Literal["frames", "m", "exact"]
@@ -26,8 +32,9 @@ CHOICES = (
     "@easting@northing@...); label (two csv files of name,label: images with the same label (floor, room) are "
     "correct); none (rankings only)"
 )
-_NO_ROWS = np.zeros(0, np.int32)
 FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
+_LINES = "lines (with an empty cell if it has no place or label)"
+_reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets/README.md")
 
 
 class Truth(ABC):
@@ -101,13 +108,12 @@ class FrameTruth(Truth):
     def positives(self, threshold: float) -> Positives:
         """Correct database images at a tolerance in frames, inclusive."""
         tolerance = int(min(threshold, self.num_database)) if self.widened else 0
-
-        def around(row: int) -> np.ndarray:
-            first, last = self._drive(row)
-            return np.arange(max(row - tolerance, first), min(row + tolerance + 1, last), dtype=np.int32)
-
-        rows = (np.concatenate([_NO_ROWS, *map(around, rows)]) for rows in self.rows)
-        return Positives.from_rows(rows, self.num_database)
+        correct = []
+        for rows in self.rows:
+            drives = [(row, *self._drive(row)) for row in rows]
+            near = (range(max(row - tolerance, first), min(row + tolerance + 1, last)) for row, first, last in drives)
+            correct.append([*chain(*near)])
+        return Positives.from_rows(correct, self.num_database)
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
         """Frames to the nearest of the query's rows."""
@@ -211,7 +217,7 @@ def require_positions(where: str, xy: np.ndarray, count: int) -> None:
 
 
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
-    """UTM easting and northing from names `@easting@northing@...` (the convention of VPR-datasets-downloader)."""
+    """UTM positions from names `@easting@northing@...` (the convention of VPR-datasets-downloader)."""
     sides = []
     for names in (query_names, database_names):
         positions = []
@@ -227,3 +233,103 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
             positions.append((easting, northing))
         sides.append(np.array(positions))
     return RadiusTruth(*sides)
+
+
+def truth_from_labels(
+    query_file: Path | str, database_file: Path | str, query_names: Sequence[str], database_names: Sequence[str]
+) -> LabelTruth:
+    """Ground truth by equal labels, from a csv with the columns `name,label` for each side, one line per image.
+
+    An image with an empty label is never correct, and a query with one has no correct image. Labels are compared as
+    text, without spaces around them.
+    """
+    sides = []
+    for path, names in ((Path(query_file), query_names), (Path(database_file), database_names)):
+        with _reading(path):
+            lines = _csv_columns(path, choices=(("name", "label"),))
+        table, labels = _row_table(names), dict[int, str]()
+        for number, (name, label) in enumerate(lines, start=1):
+            row = table.get(name.strip())
+            if row is None or row in labels:
+                got = f"{shorten(name)!r} {'again' if row in labels else ', which none or several have'}"
+                raise InputError(f"{path}: entry {number}: expected the path of an image, each once, got {got}")
+            labels[row] = label.strip()
+        sides.append(require_all(path, names, [labels.get(row) for row in range(len(names))], _LINES))
+    numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*sides[0], *sides[1]} - {""}))}
+    return LabelTruth(*(np.array([numbers[label] for label in side], np.int32) for side in sides))
+
+
+def truth_from_file(
+    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, widened: bool = False
+) -> Truth:
+    """Ground truth from an index file.
+
+    * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
+      pair: file names, or numbers from 0 in file order. A query may have several lines; an empty database cell means
+      that its place is not in the database.
+    * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
+    * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
+
+    If `widened`, database images within a tolerance in frames count as well, for databases that are sequences.
+    """
+    path = Path(path)
+    with _reading(path):
+        if path.suffix.lower() == ".csv":
+            content = _csv_columns(path, choices=(("query", "database"), ("live", "reference")))
+        elif path.suffix.lower() == ".json":
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if not all(isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in content):
+                raise InputError("expected [[query, [database, ...]], ...] as in VPR-Bench")
+            content = [(query, place) for query, places in content for place in (places or [""])]
+        elif path.suffix.lower() == ".npz":
+            arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
+            if {"utmQ", "utmDb"} <= arrays.keys():
+                query_xy, database_xy = (arrays[name].astype(np.float64) for name in ("utmQ", "utmDb"))
+                require_positions("utmQ", query_xy, len(query_names))
+                require_positions("utmDb", database_xy, len(database_names))
+                return RadiusTruth(query_xy, database_xy)
+            if not {"query", "database"} <= arrays.keys():
+                got = shorten(", ".join(arrays)) or "neither"
+                raise InputError(f"expected arrays query and database, or utmQ and utmDb; got {got}")
+            content = list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
+        else:
+            raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}")
+    sides = ("query", query_names, _row_table(query_names)), ("database", database_names, _row_table(database_names))
+    rows: dict[int, list[int]] = {}
+    for line, pair in enumerate(content, start=1):
+        places: list[int] = []
+        for (side, names, table), value in zip(sides, pair, strict=True):
+            text = str(value).strip()
+            text = text.lstrip("0") or "0" if text.isdecimal() else text
+            if side == "database" and not text:
+                continue
+            if text not in table:
+                expected = f"the name of a {side} image or a number from 0 to {len(names) - 1}"
+                raise InputError(f"{path}: pair {line}: expected {expected}, got {shorten(text)!r}")
+            places.append(table[text])
+        rows.setdefault(places[0], []).extend(places[1:])
+    places_by_query = require_all(path, query_names, [rows.get(row) for row in range(len(query_names))], _LINES)
+    return FrameTruth(tuple(map(tuple, places_by_query)), len(database_names), widened)
+
+
+def _csv_columns(path: Path, choices: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Cells of the first of several pairs of columns that a csv has."""
+    with path.open(newline="", encoding="utf-8-sig", errors="surrogateescape") as file:  # as file names are decoded
+        lines = csv.reader(file)
+        names = [name.strip().lower() for name in next(lines, [])]
+        for pair in choices:
+            if all(names.count(column) == 1 for column in pair):
+                first, second = map(names.index, pair)
+                padding = [""] * len(names)  # missing cells at the end of a line are empty
+                return [((line + padding)[first], (line + padding)[second]) for line in lines if line]
+    got = shorten(",".join(names)) or "no header"
+    raise InputError(f"{path}: expected a header with the columns {','.join(choices[0])}; got {got}")
+
+
+def _row_table(names: Sequence[str]) -> dict[str, int]:
+    """Rows by number, by unique file names, and by relative path, which counts first."""
+    bases = [PurePosixPath(name).name for name in names]
+    counts = Counter(bases)
+    table = {str(row): row for row in range(len(names))}
+    table |= {base: row for row, base in enumerate(bases) if counts[base] == 1}
+    return table | {name: row for row, name in enumerate(names)}

@@ -30,18 +30,10 @@ Interpolation = Literal[
 ]
 _PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
 _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic": cv2.INTER_CUBIC}
-
 _GRAY, _COLOR = ("I", "I;16", "I;16L", "I;16B", "I;16N"), ("RGB", "RGBA", "LA")  # Pillow's modes of 16-bit files
 _ORIENTATION = 0x0112
-_TURN = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
+_TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90"
+_TURN = {orientation: Image.Transpose[name] for orientation, name in enumerate(_TURNS.split(), start=2)}
 _INVERSE = {6: 8, 8: 6}  # all others are their own inverse
 _MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of a PNG file
 
@@ -158,11 +150,9 @@ def read_header(content: bytes) -> tuple[int, int | None]:
 def resize(
     image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int], interpolation: Interpolation = "pil_bilinear"
 ) -> Num[np.ndarray, "height width 3"]:
-    """Resize an image to `size` (width, height) without crop; the aspect ratio changes.
+    """Resize an image to `size` (width, height) without crop; pixel centers are at half pixels.
 
         mfvpr.datasets.resize(image, (640, 480), "cv2_area")  # [H, W, 3]
-
-    Pixel centers are at half pixels.
 
     | interpolation | as | result |
     | :-- | :-- | :-- |
@@ -170,8 +160,6 @@ def resize(
     | `cv2_linear`, `cv2_area`, `cv2_cubic` | OpenCV; only `cv2_area` is antialiased | uint8 |
     | `torch_bilinear` | torch's antialiasing of floats, not rounded | float32, 0 .. 255 |
     | `torch_no_antialias` | torch's bilinear of floats as it was up to 2022, not rounded | float32, 0 .. 255 |
-
-    Networks take both types; SIFT refuses floats.
     """
     require_word("interpolation", interpolation, Interpolation)
     if interpolation == "torch_bilinear":  # Pillow's kernel is torch's, and its float images are not rounded

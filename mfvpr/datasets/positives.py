@@ -10,7 +10,6 @@ from jaxtyping import Bool, Int, Integer, Num
 
 from mfvpr.utils.errors import InputError
 
-_AT_A_TIME = 1 << 20  # ranked rows and positives that are looked up together, in numbers of eight bytes
 _QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
 
 
@@ -101,38 +100,24 @@ class Positives:
         rows = np.asarray(rows)
         if rows.ndim < 2 or rows.shape[-2] != len(self):
             raise InputError(f"rows: expected shape [..., {len(self)} queries, k], got {list(rows.shape)}")
-        is_correct = np.zeros(rows.shape, bool)
-        if not rows.size:
-            return is_correct
-        if rows.dtype.kind not in "iu" or rows.max() >= self.num_database:
+        if rows.size and (rows.dtype.kind not in "iu" or rows.max() >= self.num_database):
             got = f"{rows.dtype} up to {rows.max()}; rank images of this database"
             raise InputError(f"rows: expected whole numbers below {self.num_database}, got {got}")
-        step = max(1, _AT_A_TIME * len(self) // (rows.size + len(self.rows)))
-        for first in range(0, len(self), step):
-            block, block_rows = self.take(slice(first, first + step)), rows[..., first : first + step, :]
-            starts = np.arange(len(block)) * self.num_database  # a pair of query and row is a number
-            pairs = np.append(np.repeat(starts, block.counts) + block.rows, -1)  # -1: the pair beyond the last
-            ranked = starts[:, None] + block_rows.astype(np.int64)
-            is_known = pairs[np.searchsorted(pairs[:-1], ranked)] == ranked
-            is_correct[..., first : first + step, :] = is_known & (block_rows >= 0)
-        return is_correct
+        if not rows.size or not self.num_database:
+            return np.zeros(rows.shape, bool)
+        queries = np.broadcast_to(np.arange(len(self))[:, None], rows.shape)
+        is_correct = self._csr()[queries.ravel(), np.maximum(rows, 0).ravel()].reshape(rows.shape)
+        return np.asarray(is_correct) & (rows >= 0)
 
     def dense(self, queries: Any = slice(None)) -> Bool[np.ndarray, "_ database"]:
         """Matrix `[q, N]` of queries that are selected as in `take`; large data sets do not fit into memory."""
         return self.take(queries)._csr().toarray()
 
     def __or__(self, other: "Positives") -> "Positives":
-        self._require_same_size(other)
         return self._from_csr(self._csr() + other._csr())
 
     def __sub__(self, other: "Positives") -> "Positives":
-        self._require_same_size(other)
         return self._from_csr(self._csr() > other._csr())
-
-    def _require_same_size(self, other: "Positives") -> None:
-        sizes = [(len(positives), positives.num_database) for positives in (self, other)]
-        if sizes[0] != sizes[1]:
-            raise InputError(f"positives: expected two of one size (queries, database), got {sizes[0]} and {sizes[1]}")
 
     def _csr(self) -> "scipy.sparse.csr_array":
         content = np.ones(len(self.rows), bool), self.rows, self.offsets

@@ -9,13 +9,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions
+from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
 from mfvpr.datasets.positives import rows_within
-from mfvpr.datasets.truth_files import truth_from_file
-from mfvpr.io.checks import parse_number
-from mfvpr.io.containers import reading
-from mfvpr.io.formats.matlab_files import read_matlab
-from mfvpr.io.formats.pickles import read_objects
+from mfvpr.io.containers import parse_number, reading
+from mfvpr.io.object_files import read_matlab, read_objects
 from mfvpr.utils.errors import InputError
 
 SEASONS = ("fall", "spring", "summer", "winter")
@@ -96,48 +93,39 @@ def published_differences(dataset: Dataset) -> Iterator[str]:
             yield f"{got:,} queries in {sequence.name} where {number:,} are published"
 
 
-# Ground truth in frames. Nordland (Suenderhauf et al., 2013) is a train journey in four seasons. Its variants are
-# different data sets.
-
-
 def ssm_vpr(root: Path, name: str) -> Dataset:
     """A data set of SSM-VPR (Camara and Preucil, 2020), which the paper uses as well: two folders and a table."""
     database, queries = image_folder(root / "Reference"), image_folder(root / "Live")
     for images in (database, queries):
         for row, image in enumerate(images.names):  # the table has the numbers at the ends of the names
-            digits = re.search(r"(\d+)$", PurePosixPath(image).stem)
-            if digits is None or int(digits[1]) != row:
+            if not re.search(rf"(^|\D)0*{row}$", PurePosixPath(image).stem):
                 raise InputError(f"{images.root}: expected images numbered from 0 without gaps, got {image}")
     truth = truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
     return _dataset(name, database, queries, truth)
 
 
-def nordland_27592(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """Patch-NetVLAD's and gmberton's variant: every frame but tunnels and stations; correct within 10 frames."""
+def nordland(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
+    """Equal frames of two seasons; each folder of the database is a drive.
+
+    Patch-NetVLAD's and gmberton's 27,592 are every frame but tunnels and stations, correct within 10 frames; the 3,450
+    of Olid, Facil and Civera (2018) are two sections, correct within 2 frames of the same section.
+    """
     folders = []
     for season, side in zip(seasons, ("index", "query"), strict=True):
         origin = root / f"nordland_imageNames_{side}.txt"
-        if origin.exists():  # its names begin with other folders
-            folders.append(listed_images(root / season, [PurePosixPath(line).name for line in _lines(origin)], origin))
+        images = root / (season if name == "nordland_27592" else f"{season}_images_test")
+        if name == "nordland_27592" and origin.exists():  # its names begin with other folders
+            folders.append(listed_images(images, [PurePosixPath(line).name for line in _lines(origin)], origin))
         else:
-            folders.append(image_folder(root / season))
-    return _frame_pairs(name, *folders)
-
-
-def nordland_3450(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """The test part of Olid, Facil and Civera (2018); correct within 2 frames of the same section."""
-    return _frame_pairs(name, *(image_folder(root / f"{season}_images_test") for season in seasons))
-
-
-def _frame_pairs(name: str, database: ImageFolder, queries: ImageFolder) -> Dataset:
-    """Data set of equal frames of two seasons; each folder of the database is a drive."""
-    stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in (database, queries)]
+            folders.append(image_folder(images))
+    database, queries = folders
+    stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in folders]
     if stems[0] != stems[1]:
         differing = next((stem for pair in zip(*stems, strict=False) for stem in pair if pair[0] != pair[1]), None)
         got = f"{len(queries):,} and {len(database):,} frames" + (f", first {differing} alone" if differing else "")
         raise InputError(f"{queries.root}: expected the frames of {database.root}, got {got}; get the whole data set")
-    folders = [stem.parent for stem in stems[0]]
-    starts = tuple(row for row in range(1, len(folders)) if folders[row] != folders[row - 1])
+    drives = [stem.parent for stem in stems[0]]
+    starts = tuple(row for row in range(1, len(drives)) if drives[row] != drives[row - 1])
     truth = FrameTruth(tuple((row,) for row in range(len(queries))), len(database), starts=starts)
     return _dataset(name, database, queries, truth)
 
@@ -186,9 +174,6 @@ def robotcar_seasons(root: Path, name: str) -> Dataset:
     return Dataset(name, listed_images(root / "images", database, path), tuple(sequences))
 
 
-# Ground truth by position, or by the lists of GSV-Cities.
-
-
 def pitts30k(root: Path, name: str) -> Dataset:
     """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016).
 
@@ -229,45 +214,35 @@ def msls_val(root: Path, name: str) -> Dataset:
     lists = [root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
     if any(path.exists() for path in lists):
         return _dataset_of_lists(root, name, *lists)
-    sides = []
+    flags = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
+    names, places = {}, {}
     for side in ("database", "query"):
-        names, positions = [], []
+        names[side], positions = [], []
         for folder in (root / "train_val" / city / side for city in CITIES):
-            raw, processed, tasks = (
-                _table(folder / f"{each}.csv") for each in ("raw", "postprocessed", "subtask_index")
-            )
+            tables = {}
+            for each in ("raw", "postprocessed", "subtask_index"):
+                path = folder / f"{each}.csv"
+                with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
+                    lines = list(csv.DictReader(file))
+                tables[each] = {line.get("key", ""): line for line in lines}
+                if len(tables[each]) < len(lines):
+                    got = f"{len(tables[each])} in {len(lines)} lines"
+                    raise InputError(f"{path}: expected a different key in every line, got {got}")
+            raw, processed, tasks = tables.values()
             if not raw.keys() == processed.keys() == tasks.keys():
                 raise InputError(f"{folder}: expected the same keys in raw, postprocessed and subtask_index.csv")
             with reading(folder / "postprocessed.csv", mend="expected pano, all (True or False), easting, northing"):
                 for key, line in processed.items():
-                    if _FLAGS[tasks[key]["all"].lower()] and not _FLAGS[raw[key]["pano"].lower()]:
-                        names.append(f"train_val/{folder.parent.name}/{side}/images/{key}.jpg")
+                    if flags[tasks[key]["all"].lower()] and not flags[raw[key]["pano"].lower()]:
+                        names[side].append(f"train_val/{folder.parent.name}/{side}/images/{key}.jpg")
                         positions.append([parse_number(line["easting"]), parse_number(line["northing"])])
-        xy = np.array(positions, np.float64).reshape(-1, 2)
-        require_positions(f"{root}: {side}", xy, len(names))
-        sides.append((names, xy))
-    (database, database_xy), (queries, query_xy) = sides
-    rows = [row for row, near in enumerate(rows_within(query_xy, database_xy, 25.0)) if len(near)]
-    images = listed_images(root, database, root / "train_val")
-    return _dataset(
-        name,
-        images,
-        listed_images(root, [queries[row] for row in rows], root / "train_val"),
-        RadiusTruth(query_xy[rows], database_xy),
-    )
-
-
-_FLAGS = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
-
-
-def _table(path: Path) -> dict[str, dict[str, str]]:
-    """Lines of a table by key."""
-    with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    table = {line.get("key", ""): line for line in lines}
-    if len(table) < len(lines):
-        raise InputError(f"{path}: expected a different key in every line, got {len(table)} in {len(lines)} lines")
-    return table
+        places[side] = np.array(positions, np.float64).reshape(-1, 2)
+        require_positions(f"{root}: {side}", places[side], len(names[side]))
+    near = rows_within(places["query"], places["database"], 25.0)
+    rows = [row for row, database_rows in enumerate(near) if len(database_rows)]
+    images = listed_images(root, names["database"], root / "train_val")
+    queries = listed_images(root, [names["query"][row] for row in rows], root / "train_val")
+    return _dataset(name, images, queries, RadiusTruth(places["query"][rows], places["database"]))
 
 
 def _dataset_of_lists(
@@ -320,10 +295,7 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
     with reading(path, "a list", "expected lists of rows"), path.open("rb") as file:
         is_pickle = b"'|O'" in file.read(128)
         file.seek(0)
-        if is_pickle:
-            lists = [getattr(rows, "content", rows) for rows in read_objects(file, "lists of rows")]
-        else:
-            lists = np.lib.format.read_array(file, allow_pickle=False)
+        lists = read_objects(file, "lists of rows") if is_pickle else np.lib.format.read_array(file, allow_pickle=False)
         per_query = [np.asarray(rows).reshape(-1) for rows in lists]
         if num_database > 2 and all(len(rows) == num_database and set(rows) <= {0, 1} for rows in per_query):
             raise InputError(f"{path}: expected the rows of each query's database images, got flags")
@@ -343,51 +315,40 @@ def _lines(path: Path) -> list[str]:
     return [stripped for line in text.splitlines() if (stripped := line.strip())]
 
 
-_SSM_VPR = (
-    ("berlin_a100", "Berlin A100: a motorway from two cars", 85, 81, "BerlinA100_RAS2020"),
-    ("berlin_halenseestrasse", "Berlin Halenseestrasse: a road and its bicycle lane", 67, 157, "Halen_RAS2020"),
-    ("berlin_kudamm", "Berlin Kudamm: a busy street from a bus and a bicycle", 201, 222, "Kudamm_RAS2020"),
-    ("gardens_point", "Gardens Point: a campus by day and at night", 200, 200, "Gardens_point_RAS2020"),
-    ("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
-)
-PUBLISHED = {
-    **{
-        name: Published(
-            name, f"{title}, as SSM-VPR has it", SSM_LAYOUT, database, {name: queries}, ssm_vpr,
-            "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", (name, archive),
+_SSM_VPR, _SEASONS = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", ("summer", "winter")
+_ENTRIES = (
+    *(
+        Published(name, f"{title}, as SSM-VPR has it", SSM_LAYOUT, database, {name: queries}, ssm_vpr, _SSM_VPR,
+                  (name, archive))
+        for name, title, database, queries, archive in (
+            ("berlin_a100", "Berlin A100: a motorway from two cars", 85, 81, "BerlinA100_RAS2020"),
+            ("berlin_halenseestrasse", "Berlin Halenseestrasse: a road and its bicycle lane", 67, 157,
+             "Halen_RAS2020"),
+            ("berlin_kudamm", "Berlin Kudamm: a busy street from a bus and a bicycle", 201, 222, "Kudamm_RAS2020"),
+            ("gardens_point", "Gardens Point: a campus by day and at night", 200, 200, "Gardens_point_RAS2020"),
+            ("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
         )
-        for name, title, database, queries, archive in _SSM_VPR
-    },
-    "nordland_27592": Published(
-        "nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)", LAYOUT_27592, 27_592,
-        {"nordland_27592": 27_592}, nordland_27592, "https://github.com/QVPR/Patch-NetVLAD",
-        ("nordland_27592", "nordland"), ("summer", "winter"),
     ),
-    "nordland_3450": Published(
-        "nordland_3450", "Nordland, the test part of Olid, Facil and Civera", LAYOUT_3450, 3450,
-        {"nordland_3450": 3450}, nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
-        ("nordland_3450",), ("summer", "winter"),
-    ),
-    "nordland_vprbench": Published(
-        "nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", LAYOUT_VPRBENCH, 27_592,
-        {"nordland_vprbench": 2760}, nordland_vprbench, "https://github.com/MubarizZaffar/VPR-Bench",
-        ("nordland_vprbench",),
-    ),
-    "robotcar_seasons": Published(
-        "robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
-        ROBOTCAR_LAYOUT, 220, dict(zip(CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True)),
-        robotcar_seasons, "https://www.visuallocalization.net/datasets/", ("robotcar_seasons", "RobotCar-Seasons"),
-    ),
-    **{
-        f"pitts30k_{part}": Published(
-            f"pitts30k_{part}", f"Pittsburgh30k, {part} part", PITTSBURGH_LAYOUT.format(part=part), 10_000,
-            {f"pitts30k_{part}": queries}, pitts30k, "on request from its authors: https://github.com/Relja/netvlad",
-            (f"pitts30k_{part}", "pitts30k"),
-        )
+    Published("nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)", LAYOUT_27592,
+              27_592, {"nordland_27592": 27_592}, nordland, "https://github.com/QVPR/Patch-NetVLAD",
+              ("nordland_27592", "nordland"), _SEASONS),
+    Published("nordland_3450", "Nordland, the test part of Olid, Facil and Civera", LAYOUT_3450, 3450,
+              {"nordland_3450": 3450}, nordland, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
+              ("nordland_3450",), _SEASONS),
+    Published("nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", LAYOUT_VPRBENCH,
+              27_592, {"nordland_vprbench": 2760}, nordland_vprbench,
+              "https://github.com/MubarizZaffar/VPR-Bench", ("nordland_vprbench",)),
+    Published("robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
+              ROBOTCAR_LAYOUT, 220, dict(zip(CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True)),
+              robotcar_seasons, "https://www.visuallocalization.net/datasets/",
+              ("robotcar_seasons", "RobotCar-Seasons")),
+    *(
+        Published(f"pitts30k_{part}", f"Pittsburgh30k, {part} part", PITTSBURGH_LAYOUT.format(part=part), 10_000,
+                  {f"pitts30k_{part}": queries}, pitts30k,
+                  "on request from its authors: https://github.com/Relja/netvlad", (f"pitts30k_{part}", "pitts30k"))
         for part, queries in (("val", 7608), ("test", 6816))
-    },
-    "msls_val": Published(
-        "msls_val", "Mapillary Street-Level Sequences, validation part", MSLS_LAYOUT, 18_871, {"msls_val": 740},
-        msls_val, "https://www.mapillary.com/dataset/places", ("msls_val", "msls"),
     ),
-}  # fmt: skip
+    Published("msls_val", "Mapillary Street-Level Sequences, validation part", MSLS_LAYOUT, 18_871,
+              {"msls_val": 740}, msls_val, "https://www.mapillary.com/dataset/places", ("msls_val", "msls")),
+)  # fmt: skip
+PUBLISHED = {entry.name: entry for entry in _ENTRIES}

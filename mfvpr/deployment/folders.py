@@ -11,16 +11,14 @@ import numpy as np
 
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array
-from mfvpr.deployment import onnx_models
-from mfvpr.deployment.check_arrays import check_inputs, largest_difference
+from mfvpr.deployment import program_formats
+from mfvpr.deployment.program_formats import PLATFORMS, TOLERANCE, deserialize, export_program, without_unused_inputs
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
-from mfvpr.deployment.stablehlo import PLATFORMS, deserialize, serialize, without_unused_inputs
 from mfvpr.evaluation.system import System
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.fingerprints import recipe_of, versions
 from mfvpr.utils.numerics import as_array
-from mfvpr.utils.versions import versions
 
 FORMAT = "mfvpr exported program 1"
 DESCRIPTION, PROGRAM, MODEL, CHECK = "export.json", "program.stablehlo", "program.onnx", "check"
@@ -60,11 +58,8 @@ class ExportedProgram:
             if (str(got.dtype), got.shape) != (each.dtype, each.shape):
                 raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got.dtype} {[*got.shape]}")
         _require_sizes(values)
-        return self._outputs(values)
-
-    def _outputs(self, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        outputs = self.run(*(arrays[each.name] for each in self.inputs))
-        return {each.name: np.asarray(values) for each, values in zip(self.outputs, outputs, strict=True)}
+        outputs = self.run(*(values[each.name] for each in self.inputs))
+        return {each.name: np.asarray(array) for each, array in zip(self.outputs, outputs, strict=True)}
 
     def check(self) -> float:
         """Largest difference from the outputs in the folder, relative where they are above 1."""
@@ -72,7 +67,7 @@ class ExportedProgram:
             {each.name: np.load(self.folder / CHECK / f"{each.name}.npy", allow_pickle=False) for each in tensors}
             for tensors in (self.inputs, self.outputs)
         )
-        return largest_difference(self._outputs(inputs), outputs)
+        return largest_difference(self(**inputs), outputs)
 
 
 def export(
@@ -110,11 +105,17 @@ def export(
         program = without_unused_inputs(
             make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
         )
-        content = serialize(program)
+        content = bytes(export_program(program).serialize())
         inputs = check_inputs(program)
         values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = _model(program, inputs, outputs, required=onnx)
+    recipes: dict[str, Any] = {}
+    for name, part in program.parameters.items():
+        try:
+            recipes[name] = recipe_of(part)
+        except TypeError:  # a plain function
+            recipes[name] = {"function": getattr(part, "__qualname__", type(part).__qualname__)}
     description = {
         "format": FORMAT,
         "versions": versions(),
@@ -123,7 +124,7 @@ def export(
         "outputs": [each._asdict() for each in program.outputs],
         "axes": {"C": shapes.candidates, "K": shapes.keypoints, "D": program.shapes.dimension},
         "image_size": program.shapes.image_size,
-        "parameters": {name: _recipe(part) for name, part in program.parameters.items()},
+        "parameters": recipes,
         "left_out": program.left_out,
         "onnx": onnx_note,
     }
@@ -175,26 +176,19 @@ def _model(
     program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray], *, required: bool | None
 ) -> tuple[bytes | None, dict[str, Any]]:
     """The ONNX model, and how it was checked, or why there is none."""
-    if required is False or (required is None and not onnx_models.is_installed()):
+    if required is False or (required is None and not program_formats.has_jax2onnx()):
         return None, {"missing": "not requested" if required is False else "jax2onnx is not installed"}
     try:
-        model = onnx_models.convert(program)
-        difference = largest_difference(onnx_models.run(model, inputs), outputs)
-        if not difference <= onnx_models.TOLERANCE:
-            expected = f"outputs within {onnx_models.TOLERANCE:g} of JAX's"
+        model = program_formats.to_onnx(program)
+        difference = largest_difference(program_formats.run_onnx(model, inputs), outputs)
+        if not difference <= TOLERANCE:
+            expected = f"outputs within {TOLERANCE:g} of JAX's"
             raise InputError(f"onnx=True: expected {expected}, got a difference of {difference:g}; leave onnx out")
     except InputError as error:
         if required:
             raise
         return None, {"missing": str(error)}
-    return model, {"largest_difference": difference, "tolerance": onnx_models.TOLERANCE}
-
-
-def _recipe(part: Any) -> Any:
-    try:
-        return recipe_of(part)
-    except TypeError:  # a plain function
-        return {"function": getattr(part, "__qualname__", type(part).__qualname__)}
+    return model, {"largest_difference": difference, "tolerance": TOLERANCE}
 
 
 def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
@@ -213,3 +207,57 @@ def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
             row = int(wrong.any(axis=1).argmax())
             got = f"{sizes[row].tolist()} with a point {points[row].tolist()}"
             raise InputError(f"{name}: expected (width, height) of images that contain all points, got {got}")
+
+
+def check_inputs(program: Program) -> dict[str, np.ndarray]:
+    """Inputs by name: candidates of one place, each less precise than the one before, the last without matches."""
+    shapes = program.shapes
+    rng, size = np.random.default_rng(0), np.asarray(shapes.image_size, np.float32)
+    lengths = shapes.candidates, shapes.keypoints
+    spread = 0.01 * (1 + np.arange(shapes.candidates))[:, None, None]  # of image size and descriptors
+    points0 = rng.uniform(size=(shapes.keypoints, 2)) * size
+    points1 = np.clip(points0 + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2)), 0, size)
+    unit = lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True)  # noqa: E731
+    descriptors0 = unit(rng.normal(size=(shapes.keypoints, shapes.dimension or 1)))
+    descriptors1 = unit(descriptors0 + spread * rng.normal(size=(*lengths, shapes.dimension or 1)))
+    mask = rng.uniform(size=lengths) < 0.9
+    mask[-1] = shapes.candidates == 1
+    numbers = np.broadcast_to(np.arange(shapes.keypoints), lengths)
+    scores0 = rng.uniform(0.1, 1, shapes.keypoints)
+    values = {
+        "points0": np.broadcast_to(points0, (*lengths, 2)),
+        "points1": points1,
+        "mask": mask,
+        "distance": rng.uniform(0, 1, lengths),
+        "ratio": rng.uniform(0.5, 1, lengths),
+        "confidence": np.linspace(0, 1, lengths[0] * lengths[1]).reshape(lengths),
+        "scores0": scores0,
+        "scores1": rng.uniform(0.1, 1, lengths),
+        "image_size0": size,
+        "image_size1": np.broadcast_to(size, (shapes.candidates, 2)),
+        "index0": numbers,
+        "index1": numbers,
+        "count0": shapes.keypoints,
+        "count1": np.full(lengths[0], lengths[1]),
+        "keypoints0": points0,
+        "descriptors0": descriptors0,
+        "mask0": rng.uniform(size=shapes.keypoints) < 0.9,
+        "keypoints1": points1,
+        "descriptors1": descriptors1,
+        "mask1": mask,
+    }
+    return {
+        each.name: np.array(np.broadcast_to(values[each.name], each.shape), each.dtype, order="C")
+        for each in program.inputs
+    }
+
+
+def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> float:
+    """Largest difference of finite outputs, relative where they are above 1; infinite if NaN differ."""
+    differences = [0.0]
+    for name, values in expected.items():
+        if not np.array_equal(np.isfinite(arrays[name]), finite := np.isfinite(values)):
+            return np.inf
+        difference = np.abs(arrays[name][finite] - values[finite]) / np.maximum(np.abs(values[finite]), 1)
+        differences.append(float(np.max(difference, initial=0.0)))
+    return max(differences)

@@ -72,13 +72,10 @@ class ExportShapes:
     dimension: int | None = None
 
     def __post_init__(self) -> None:
-        for name, number in (
-            ("candidates", self.candidates),
-            ("keypoints", self.keypoints),
-            ("dimension", self.dimension),
-        ):
-            if not (name == "dimension" and number is None):
-                whole(1, 10**9).check(name, number)
+        count = whole(1, 10**9)
+        count.check("candidates", self.candidates)
+        count.check("keypoints", self.keypoints)
+        (count | None).check("dimension", self.dimension)
         size = np.asarray(self.image_size, np.float64)
         if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
             raise InputError(f"image_size={self.image_size!r}: expected (width, height) above 0, px")

@@ -73,23 +73,15 @@ def confidence_inputs(
 
 @dataclass(frozen=True)
 class Confidence:
-    """A logistic model of the probability that a system's top prediction is correct.
+    """A logistic model of the probability that a system's top prediction is correct."""
 
-    Attributes:
-        inputs: names of inputs, see `confidence_inputs`, as for `apart`.
-        center: mean of each input over the data that the model was fitted on; `scale`: standard deviation.
-        weights: of the inputs in these units.
-        bias: log odds at the center.
-        refusals: shares of images without enough evidence for a place (`mfvpr.evaluation.evidence`), of places that the
-            database shows and of absent ones.
-    """
-
-    inputs: tuple[Input, ...]
-    apart: int
-    center: tuple[float, ...]
-    scale: tuple[float, ...]
-    weights: tuple[float, ...]
-    bias: float
+    inputs: tuple[Input, ...]  # names, see `confidence_inputs`
+    apart: int  # see `confidence_inputs`
+    center: tuple[float, ...]  # mean of each input over the data that the model was fitted on
+    scale: tuple[float, ...]  # standard deviation of each input over these data
+    weights: tuple[float, ...]  # of the inputs in these units
+    bias: float  # log odds at the center
+    # Shares of images without enough evidence (`mfvpr.evaluation.evidence`), of places that the database shows and not.
     refusals: tuple[float, float] = REFUSALS
 
     def __call__(self, ranked: Ranked, by_retrieval: Ranked) -> Float[np.ndarray, " queries"]:
@@ -147,17 +139,11 @@ def fit_confidence(
 
 
 class CalibrationData(NamedTuple):
-    """Inputs of a confidence of Q queries, for places that the database shows and for absent places.
+    """Inputs of a confidence of Q queries, for places that the database shows and for absent places."""
 
-    Attributes:
-        present: inputs of the queries as they are, see `confidence_inputs`.
-        absent: inputs of the same queries without the images of their place; NaN without candidates of other places.
-        correct: whether the top predictions of the queries as they are are correct.
-    """
-
-    present: Float[np.ndarray, "queries inputs"]
-    absent: Float[np.ndarray, "queries inputs"]
-    correct: Bool[np.ndarray, " queries"]
+    present: Float[np.ndarray, "queries inputs"]  # of the queries as they are, see `confidence_inputs`
+    absent: Float[np.ndarray, "queries inputs"]  # without the images of their place; NaN if no candidate is left
+    correct: Bool[np.ndarray, " queries"]  # whether the top predictions of the queries as they are are correct
 
     @property
     def num_absent(self) -> int:

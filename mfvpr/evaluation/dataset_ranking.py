@@ -10,7 +10,7 @@
 Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,13 +24,11 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import Matched, Ranked
 from mfvpr.evaluation.sequence_matching import match_sequence
-from mfvpr.evaluation.stages import require_finite
 from mfvpr.evaluation.system import System, folders_of
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import Runtime
+from mfvpr.utils.runtime import Runtime, Stopwatch
 
 KS = (1, 5, 10)  # depths of recall, by default
 Reason = Literal[  # why there is no place
@@ -73,19 +71,13 @@ class Recall:
 
 @dataclass(frozen=True, repr=False)
 class RankedDataset:
-    """Rankings of one data set by one system.
-
-    Attributes:
-        matched: candidates and matches of each sequence.
-        systems: rankings of each sequence, by name of the final score: retrieval alone, each scorer, combined scores.
-        seconds: by stage.
-    """
+    """Rankings of one data set by one system."""
 
     dataset: Dataset
     system: System
-    matched: Sequence[Matched]
-    systems: Mapping[str, Sequence[Ranked]]
-    seconds: Mapping[str, float]
+    matched: Sequence[Matched]  # candidates and matches of each sequence
+    systems: Mapping[str, Sequence[Ranked]]  # rankings of each sequence, by name of the final score
+    seconds: Mapping[str, float]  # by stage
 
     def __repr__(self) -> str:
         return f"RankedDataset({self.dataset!r} by {', '.join(self.systems)})"
@@ -106,28 +98,23 @@ class RankedDataset:
         return positives
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = KS) -> dict[str, Recall]:
-        """Recall@K of every system; a query without positives counts as a failure.
+        """Recall@K of every system; a query without positives counts as a failure. Errors are those of `positives`.
 
-        Args:
-            thresholds: largest distances of a correct prediction, in the unit of the ground truth.
-            ks: depths, from 1.
-
-        Raises:
-            InputError: as `positives`, or a depth below 1.
+        `thresholds` are the largest distances of a correct prediction, in the unit of the ground truth.
         """
         if min(ks, default=1) < 1:
             raise InputError(f"ks={[*ks]}: expected depths from 1")
         by_threshold = [self.positives(threshold) for threshold in thresholds]
 
-        def count(rankings: Sequence[Ranked]) -> Recall:
+        recalls = {}
+        for name, rankings in self.systems.items():
             correct = [
                 [count_correct(ranking.rows, positives[sequence], ks) for positives in by_threshold]
                 for sequence, ranking in enumerate(rankings)
             ]
-            shape = len(rankings), len(by_threshold), len(ks)
-            return Recall(np.array(correct, int).reshape(shape), np.array([len(ranking.rows) for ranking in rankings]))
-
-        return {name: count(rankings) for name, rankings in self.systems.items()}
+            shape, queries = (len(rankings), len(by_threshold), len(ks)), [len(ranking.rows) for ranking in rankings]
+            recalls[name] = Recall(np.array(correct, int).reshape(shape), np.array(queries))
+        return recalls
 
 
 def rank_dataset(
@@ -136,14 +123,9 @@ def rank_dataset(
     """Rank every query's candidates by the retrieval, by every scorer, and by combined scores.
 
     Args:
-        dataset: one database, one or more query sequences.
-        system: finds, matches, scores and ranks candidates.
         cache: where features and matches are kept; None = in memory. With a folder, compiled programs stay on disk as
             well, see `mfvpr.utils.compiled_programs`.
         runtime: devices, memory, progress and messages; None = those of the cache.
-
-    Returns:
-        Rankings by name, and the seconds of each stage. Extraction always counts as `features`.
 
     Raises:
         InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
@@ -154,7 +136,7 @@ def rank_dataset(
     if cache.root is not None:
         keep_compiled_programs()
     system = system.fit_image_size(folders_of(dataset), cache.warn)
-    systems: dict[str, list[Ranked]] = {}
+    systems = dict[str, list[Ranked]]()
     matched = [match_sequence(dataset, each, system.pipeline, cache=cache, watch=watch) for each in dataset.sequences]
     for sequence in matched:
         with watch("scores"):
@@ -170,21 +152,12 @@ def rank_dataset(
         )
         for name, ranking in rankings.items():
             systems.setdefault(name, []).append(ranking)
-    for line in score_warnings(matched, systems, system.scorers):
-        cache.warn(line)
-    return RankedDataset(dataset, system, matched, systems, watch.seconds)
-
-
-def score_warnings(
-    matched: Sequence[Matched], systems: Mapping[str, Sequence[Ranked]], scorers: Iterable[str]
-) -> Iterator[str]:
-    """Warnings of NaN and infinite scores of every sequence; see also `require_finite`."""
-    for name in scorers:
-        require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
-    for number, sequence in enumerate(matched):
+    for name in system.scorers:
+        stages.require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
+    for number, sequence in enumerate(dataset.sequences):
         for name, rankings in systems.items():
             values = rankings[number].scores[rankings[number].rows >= 0]
-            if count := int(np.isnan(values).sum()):
-                yield f"{sequence.sequence.name}: {count} scores of {name} are NaN, and rank last"
-            if count := int(np.isinf(values).sum()):
-                yield f"{sequence.sequence.name}: {count} scores of {name} are infinite"
+            for words, is_bad in (("NaN, and rank last", np.isnan(values)), ("infinite", np.isinf(values))):
+                if count := int(is_bad.sum()):
+                    cache.warn(f"{sequence.name}: {count} scores of {name} are {words}")
+    return RankedDataset(dataset, system, matched, systems, watch.seconds)

@@ -63,8 +63,6 @@ class Drive:
         returns: probability, for each image, that a robot that left the map is on it again.
         correct: probability that the top prediction is correct while the robot is on the map.
 
-    Raises:
-        InputError: a field is no number, or out of its range.
     """
 
     advance: float | None = None
@@ -106,8 +104,15 @@ class Evidence(NamedTuple):
         p = STREETS(ranked, ranked) if confidence is None else confidence
         p = np.nan_to_num(p, nan=0.0)
         odds = np.clip(p / np.maximum(1 - p, 1e-9), 1 / _MOST_ODDS, _MOST_ODDS)
-        scores = np.where(ranked.rows >= 0, ranked.scores, np.nan)
-        return cls(ranked.rows.astype(np.int32), _shares(scores), odds.astype(np.float32))
+        # Shares: the square of the score above the mean; 0 if it is not finite.
+        finite = (ranked.rows >= 0) & np.isfinite(ranked.scores)
+        values = np.where(finite, ranked.scores, 0.0).astype(np.float64)
+        mean = values.sum(axis=1, keepdims=True) / np.maximum(finite.sum(axis=1), 1)[:, None]
+        above = np.maximum(np.where(finite, values - mean, 0), 0)
+        powers = (above / np.maximum(above.max(axis=1, keepdims=True), np.finfo(np.float64).tiny)) ** _SHARPNESS
+        powers = np.where(powers.any(axis=1, keepdims=True), powers, finite)  # all scores are equal
+        shares = (powers / np.maximum(powers.sum(axis=1, keepdims=True), 1e-300)).astype(np.float32)
+        return cls(ranked.rows.astype(np.int32), shares, odds.astype(np.float32))
 
 
 @value
@@ -132,7 +137,13 @@ class DriveModel:
         speeds = np.array(SPEEDS if drive.advance is None else [drive.advance], np.float32)
         shifts = np.round(speeds).astype(np.int32)
         steps = np.stack([_gaussian(part, drive.spread) for part in (speeds - shifts).tolist()])
-        changes, kidnapped, correct = _speed_changes(speeds), np.float32(drive.kidnapped), np.float32(drive.correct)
+        changes = np.ones((1, 1), np.float32)
+        if len(speeds) > 1:
+            few = np.exp(-((speeds[:, None] - speeds) ** 2) / 2) * (speeds[:, None] != speeds)
+            few /= few.sum(axis=1, keepdims=True)
+            changes = (1 - _ANY) * (_STEADY * np.eye(len(speeds)) + (1 - _STEADY) * few) + _ANY / len(speeds)
+            changes = changes.astype(np.float32)
+        kidnapped, correct = np.float32(drive.kidnapped), np.float32(drive.correct)
         reach = 16 * math.ceil((np.abs(shifts).max() + steps.shape[1] // 2) / 16)  # few sizes, so few programs
         return cls(there, speeds, shifts, steps, changes, kidnapped, correct, reach)
 
@@ -147,11 +158,26 @@ class DriveModel:
         self, belief: Float[Array, "speeds rows"], here: Float[Array, " rows"]
     ) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
         """The belief after the next image, of total 1, and the image's probability, from its likelihood."""
-        return self.normalize(self._moved(belief) * here[None])
+        reach, size = self.reach, len(self.there)
+        wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
+        starts = reach - self.shifts - self.steps.shape[1] // 2
+        moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
+        outside = jnp.where(self._is_inside, 0.0, moved).sum()
+        carried = self.kidnapped * belief.sum() + outside  # who moves beyond an end may be anywhere on the map
+        inside = jnp.where(self._is_inside, moved, 0.0)[:, reach : reach + size]
+        return self.normalize((inside + carried * self.anywhere) * here[None])
 
     def before(self, later: Float[Array, "speeds rows"], here: Float[Array, " rows"]) -> Float[Array, "speeds rows"]:
-        """Relative probabilities of an image and those after it, by the state at the image before."""
-        seen = self._seen_from_before(later * here[None])
+        """Relative probabilities of an image and those after it, by the state at the image before.
+
+        It is the transpose of the motion in `after`.
+        """
+        later = later * here[None]
+        anywhere = (later * self.anywhere).sum()
+        wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
+        starts = self.reach + self.shifts - self.steps.shape[1] // 2
+        moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
+        seen = (1 - self.kidnapped) * moved + self.kidnapped * anywhere
         return jnp.where(seen.max() > 0, seen / jnp.where(seen.max() > 0, seen.max(), 1.0), 1.0)
 
     def likelihood(self, evidence: Evidence) -> Float[Array, " rows"]:
@@ -170,34 +196,11 @@ class DriveModel:
         total = belief.sum()
         return jnp.where(total > 0, belief / jnp.where(total > 0, total, 1.0), self.anywhere), total
 
-    def by_row(self, belief: Float[Array, "speeds rows"]) -> Float[Array, " rows"]:
-        """Probabilities of the rows at any speed."""
-        return belief.sum(axis=0)
-
     @property
     def _is_inside(self) -> Bool[Array, "1 wide"]:
         """Whether rows from -reach to size + reach are on the map or in a gap."""
         rows = jnp.arange(-self.reach, len(self.there) + self.reach)
         return ((rows >= 0) & (rows < len(self.there) - jnp.argmax(self.there[::-1])))[None]
-
-    def _moved(self, belief: Array) -> Array:
-        """The belief when the next image is taken; who moves beyond an end of the map may be anywhere on it."""
-        reach, size = self.reach, len(self.there)
-        wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
-        starts = reach - self.shifts - self.steps.shape[1] // 2
-        moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
-        outside = jnp.where(self._is_inside, 0.0, moved).sum()
-        carried = self.kidnapped * belief.sum() + outside
-        inside = jnp.where(self._is_inside, moved, 0.0)[:, reach : reach + size]
-        return inside + carried * self.anywhere
-
-    def _seen_from_before(self, later: Array) -> Array:
-        """Probabilities of `later` by the state before a motion: the transpose of `_moved`."""
-        anywhere = (later * self.anywhere).sum()
-        wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
-        starts = self.reach + self.shifts - self.steps.shape[1] // 2
-        moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
-        return (1 - self.kidnapped) * moved + self.kidnapped * anywhere
 
     def _changed(self, changes: Array, values: Array) -> Array:
         """Products of changes `[speeds, speeds]` and values `[speeds, rows]`."""
@@ -223,27 +226,6 @@ def _gaussian(mean: float, spread: float) -> Float[np.ndarray, " steps"]:
     near = np.abs(steps - mean) <= max(_REACH * spread, 0.5)
     weights = np.where(near, np.exp(exponents - exponents.max(where=near, initial=-np.inf)), 0)
     return (weights / weights.sum()).astype(np.float32)
-
-
-def _speed_changes(speeds: Float[np.ndarray, " speeds"]) -> Float[np.ndarray, "speeds speeds"]:
-    """Probabilities of each next speed (columns) after each speed (rows)."""
-    if len(speeds) == 1:
-        return np.ones((1, 1), np.float32)
-    few = np.exp(-((speeds[:, None] - speeds) ** 2) / 2) * (speeds[:, None] != speeds)
-    few /= few.sum(axis=1, keepdims=True)
-    changes = (1 - _ANY) * (_STEADY * np.eye(len(speeds)) + (1 - _STEADY) * few) + _ANY / len(speeds)
-    return changes.astype(np.float32)
-
-
-def _shares(scores: Float[np.ndarray, "images candidates"]) -> Float[np.ndarray, "images candidates"]:
-    """Shares of each image's candidates, of sum 1: the square of the score above the mean; 0 if it is not finite."""
-    finite = np.isfinite(scores)
-    values = np.where(finite, scores, 0.0).astype(np.float64)
-    above = np.where(finite, values - values.sum(axis=1, keepdims=True) / np.maximum(finite.sum(axis=1), 1)[:, None], 0)
-    above = np.maximum(above, 0)
-    powers = (above / np.maximum(above.max(axis=1, keepdims=True), np.finfo(np.float64).tiny)) ** _SHARPNESS
-    powers = np.where(powers.any(axis=1, keepdims=True), powers, finite)  # all scores are equal
-    return (powers / np.maximum(powers.sum(axis=1, keepdims=True), 1e-300)).astype(np.float32)
 
 
 def off_the_map(drive: Drive, off: float, chance: float) -> float:
@@ -395,5 +377,5 @@ def _smoothed(
 def _best_rows(belief: Array, later: Array, drive: DriveModel, depth: int) -> tuple[Array, Array]:
     """The most probable rows and their probabilities, from the images up to one and those after it."""
     both, _ = drive.normalize(belief * later)
-    p, rows = jax.lax.top_k(jnp.where(drive.there, drive.by_row(both), -1.0), depth)
+    p, rows = jax.lax.top_k(jnp.where(drive.there, both.sum(axis=0), -1.0), depth)
     return rows, p

@@ -54,17 +54,17 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     brightness = brightness.astype(np.float32)
     rows, columns = (max(1, round(side / 80)) for side in brightness.shape)
     pairs = (brightness[rows:], brightness[:-rows]), (brightness[:, columns:], brightness[:, :-columns])
-    correlations = np.array([_correlation(*pair) for pair in pairs])
+
+    def correlation(first: np.ndarray, second: np.ndarray) -> float:
+        """Correlation of two images of one size; NaN if one of them is plain."""
+        first, second = ((values - values.mean()).ravel() for values in (first, second))
+        variances = np.vdot(first, first) * np.vdot(second, second)
+        return float(np.vdot(first, second) / np.sqrt(variances)) if variances else np.nan
+
+    correlations = np.array([correlation(*pair) for pair in pairs])
     if (correlations < _LEAST_CORRELATION).all():
         return "no better than noise"
     return "blurred" if (correlations > _MOST_CORRELATION).all() else None
-
-
-def _correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Correlation of two images of one size; NaN if one of them is plain."""
-    first, second = ((values - values.mean()).ravel() for values in (first, second))
-    variances = np.vdot(first, first) * np.vdot(second, second)
-    return float(np.vdot(first, second) / np.sqrt(variances)) if variances else np.nan
 
 
 def strength(features: Features) -> float:
@@ -80,10 +80,7 @@ def evidence_scores(pairs: Matches) -> Float[np.ndarray, " pairs"]:
 def reason_against(matches: float, score: float, noise: float) -> Reason | None:
     """Why the matches with the best candidate are too little evidence; None = they are enough.
 
-    Args:
-        matches: their number.
-        score: of the candidate; NaN = not known.
-        noise: best score of noise images; NaN = not known.
+    `score` is the candidate's, `noise` the best score of noise images; NaN = not known.
     """
     if matches < LEAST_MATCHES:
         return "too few matches"
@@ -93,11 +90,8 @@ def reason_against(matches: float, score: float, noise: float) -> Reason | None:
 def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Reason | None]]:
     """Why there is too little evidence for the predictions of each query, by sequence; None = there is enough.
 
-    Scores are known for matches with a ratio, of a single scale, and a retrieval by global descriptors.
-
-    Args:
-        ranked: the ranking that decides gives the predictions.
-        cache: of the evaluation.
+    The ranking that decides gives the predictions. Scores are known for matches with a ratio, of a single scale, and a
+    retrieval by global descriptors.
     """
     database, pipeline = ranked.dataset.database, ranked.system.pipeline
     sample, extractor = range(0, len(database), -(-len(database) // _SAMPLE)), pipeline.extractor

@@ -109,23 +109,24 @@ class FrameCorrelation:
 
         Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
         """
+
+        def gains(rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
+            """Largest relative gains of rows; `before` are places and scores."""
+            places, scores = before.T
+            best = scores.max()
+            strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
+            nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
+            return self.gain * np.max(strength * nearness, axis=1, initial=0)
+
         mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
         before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
         for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
             positive = usable & (row_scores > 0)
             if len(before) == self.previous:
-                row_scores[positive] *= 1 + self._gains(rows[positive], np.array(before))
+                row_scores[positive] *= 1 + gains(rows[positive], np.array(before))
             best = row_scores.max(where=positive, initial=0)
             before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
         return correlated.astype(np.float32)
-
-    def _gains(self, rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
-        """Largest relative gains of rows; `before` are places and scores."""
-        places, scores = before.T
-        best = scores.max()
-        strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
-        nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
-        return self.gain * np.max(strength * nearness, axis=1, initial=0)
 
 
 @dataclass(frozen=True)

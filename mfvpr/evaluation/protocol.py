@@ -17,20 +17,17 @@ from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash
 
+Split = Literal["first_half", "second_half", "both"]
+_HALVES = ("first_half", "second_half")
+
 
 class Half(NamedTuple):
-    """Two disjoint parts of a path: settings are chosen or learned on one, and reported on the other.
+    """Two disjoint parts of a path: settings are chosen or learned on one, and reported on the other."""
 
-    tune: query rows to choose on.
-    report: query rows to report on.
-    allowed: database rows that may be used while choosing.
-    paths: number of queries to choose on of each path, if there are several paths one after the other.
-    """
-
-    tune: Int[np.ndarray, " tune"]
-    report: Int[np.ndarray, " report"]
-    allowed: Bool[np.ndarray, " database"]
-    paths: tuple[int, ...] = ()
+    tune: Int[np.ndarray, " tune"]  # query rows to choose on
+    report: Int[np.ndarray, " report"]  # query rows to report on
+    allowed: Bool[np.ndarray, " database"]  # database rows that may be used while choosing
+    paths: tuple[int, ...] = ()  # number of queries to choose on of each path, if there are several
 
 
 def halves(positives: Positives) -> tuple[Half, Half]:
@@ -39,9 +36,7 @@ def halves(positives: Positives) -> tuple[Half, Half]:
     Choosing sees nothing of the reported places: database rows that show the place of a reported query are not allowed,
     and queries whose place such a row shows are left out (they are neighbors across the cut).
 
-    Args:
-        positives: database images of a query's place within the widest threshold, also images that are no positives
-            (the query itself).
+    `positives` are all database images of a query's place within the widest threshold, the query itself included.
     """
     first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
     return separate(positives, first, second), separate(positives, second, first)
@@ -108,15 +103,13 @@ def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries
     if they show the place of the same query, and each connected part of the map is traversed from one of its ends. With
     the unit "exact", images are in the order of the first queries that they show.
 
-    Args:
-        shown: images of the map that show each query's place, within a tolerance or a radius.
-        unit: of the tolerance or radius.
-
-    Returns:
-        -1 for a query whose place no image shows.
+    `shown` are images of the map that show each query's place, within a tolerance or a radius. The result is -1 for a
+    query whose place no image shows.
     """
-    orders = {"m": _traversal_order, "exact": _query_order}
-    order = orders[unit](shown) if unit in orders else np.arange(shown.num_database)
+    order = _traversal_order(shown) if unit == "m" else np.arange(shown.num_database)
+    if unit == "exact":  # the first query whose place each image shows
+        order = np.full(shown.num_database, len(shown))
+        np.minimum.at(order, shown.rows, np.repeat(np.arange(len(shown)), shown.counts))
     sums = np.add.reduceat(np.append(order[shown.rows], 0), shown.offsets[:-1]) if len(shown) else np.zeros(0)
     middle = sums / np.maximum(shown.counts, 1)
     return np.where(shown.counts > 0, np.unique(middle, return_inverse=True)[1], -1)
@@ -140,39 +133,18 @@ def _traversal_order(shown: Positives) -> np.ndarray:
     return rank[queries:]
 
 
-def _query_order(shown: Positives) -> np.ndarray:
-    """The first query `[N]` whose place each image shows."""
-    first = np.full(shown.num_database, len(shown))
-    np.minimum.at(first, shown.rows, np.repeat(np.arange(len(shown)), shown.counts))
-    return first
-
-
-Split = Literal["first_half", "second_half", "both"]
-_HALVES = ("first_half", "second_half")
-
-
 @dataclass(frozen=True)
 class EvaluationProtocol:
-    """Ground truth at several thresholds, and a split into queries to choose on and queries to report on.
+    """Ground truth at several thresholds, and a split into queries to choose on and queries to report on."""
 
-    Attributes:
-        thresholds: largest distances of a correct prediction, frames or meters, ascending.
-        places: images of a query's place at the widest threshold, also those that are no positives.
-        halves: where to choose and where to report; none = both on all queries.
-        views: candidates that are ranked: all, and for each half those that choosing may see.
-        split: which half to choose on, or both in turn; "other sets" if the halves are complete data sets, see
-            `mfvpr.tuning.learning.splits`; None = no halves.
-        reported_sets: number of queries of each data set that is reported on, by name, if there are several sets.
-    """
-
-    thresholds: Sequence[float]
+    thresholds: Sequence[float]  # largest distances of a correct prediction, frames or meters, ascending
     unit: Unit
     positives: Sequence[Positives]
-    places: Positives
-    halves: Sequence[Half]
-    views: Sequence[Bool[np.ndarray, "queries candidates"]] = ()
-    split: Split | Literal["other sets"] | None = None
-    reported_sets: Mapping[str, int] = field(default_factory=dict)
+    places: Positives  # images of a query's place at the widest threshold, also those that are no positives
+    halves: Sequence[Half]  # where to choose and where to report; none = both on all queries
+    views: Sequence[Bool[np.ndarray, "queries candidates"]] = ()  # candidates: all, and for each half what it may see
+    split: Split | Literal["other sets"] | None = None  # "other sets": halves are data sets; None = no halves
+    reported_sets: Mapping[str, int] = field(default_factory=dict)  # queries of each set, if there are several
 
     @property
     def main(self) -> int:
@@ -250,8 +222,7 @@ def evaluation_protocol(truth: Truth, thresholds: Iterable[float], split: Split 
 
     Args:
         truth: of the queries, in the order of their path.
-        thresholds: at least one, in any order. The middle one decides. Queries to choose on and queries to report on
-            share no place within the widest one.
+        thresholds: at least one, in any order. Queries to choose on and to report on share no place within the widest.
         split: the half of the path to choose on, or both in turn; None = choose and report on all queries.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Matches and rankings of a sequence of queries."""
+"""Matches and rankings of a sequence of queries, and scores of shortlists: of the retrieval, fused, and ranked."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matchers.match_set import MatchSet, Scales
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import at_least_single, compiled, masked, masked_mean, masked_std, or_nan
+from mfvpr.utils.numerics import at_least_single, compiled, is_concrete, masked, masked_mean, safe_sqrt
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
@@ -35,7 +35,7 @@ def balancing_c(
     """
     both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
     retrieval_deviation, deviation = (
-        masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
+        _masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
     )
     c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
     return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
@@ -60,7 +60,7 @@ def fuse_shortlist(
 ) -> Scores:
     """Combined scores of retrieval and re-ranking, see `fuse`; NaN without a candidate."""
     fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
-    return np.asarray(or_nan(fused, candidates.mask))
+    return np.asarray(_or_nan(fused, candidates.mask))
 
 
 def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
@@ -91,7 +91,7 @@ def fuse_scales(
     and affects only the sum of its own candidate. "none" leaves the scores as they are, for pairs without other
     candidates.
     """
-    return or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
+    return _or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
 
 
 @partial(compiled, static_argnames="normalize")
@@ -117,7 +117,7 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
     values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # its square may overflow
     values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
-    mean, deviation = masked_mean(values, finite), masked_std(values, finite)
+    mean, deviation = masked_mean(values, finite), _masked_std(values, finite)
     return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
 
 
@@ -175,3 +175,16 @@ class Ranked:
         """The ranking as a shortlist, to be written (`mfvpr.io.write_shortlist`) or matched again."""
         mask = self.rows >= 0
         return Shortlist(indices=self.rows, scores=np.where(mask, self.scores, 0), mask=mask)
+
+
+def _masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
+    """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
+    values, mask = values.reshape(-1), mask.reshape(-1)
+    return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
+
+
+def _or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
+    """`values` where `mask`, NaN elsewhere."""
+    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
+        return jax.device_put(np.where(mask, values, np.nan))
+    return jnp.where(mask, values, jnp.nan)

@@ -13,15 +13,13 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.system import Pipeline, folders_of
 from mfvpr.matchers.host_matcher import Side
-from mfvpr.retrieval.fitting import fit_to_database
-from mfvpr.retrieval.retriever import RetrievalResult
+from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.storage.match_files import MatchStore
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import Runtime
+from mfvpr.utils.runtime import Runtime, Stopwatch
 
 _REMARKS = "images.json"  # beside the matches: which images are bad
 

@@ -1,4 +1,4 @@
-"""The stages of re-ranking a data set: match, score, explain. `mfvpr.evaluation.fusion` fuses and ranks.
+"""The stages of re-ranking a data set: match, score in batches on all devices, explain. `fusion` fuses and ranks.
 
 Files and threads stay on the host; each computation is one compiled program per shape.
 """
@@ -36,11 +36,10 @@ from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.storage.match_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore, StoredMatches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 
@@ -168,8 +167,7 @@ def match(
     """Match every query with its candidates. Matches of compiled matchers include their ratio, which some weights use.
 
     Args:
-        queries: features of Q images; or the images, if that is what the matcher takes.
-        database: likewise, of M images.
+        queries: features of Q images; or the images, if that is what the matcher takes. The database likewise.
         candidates: `[Q, C]` rows of the database.
         matcher: of one pair; one that runs on the host takes no part in a cluster.
         store: of these features, candidates and matcher. Queries that it lacks, or has with other candidates, are
@@ -276,8 +274,7 @@ def dominant_shifts(
     Returns:
         Refined dominant shifts (candidate minus query), and their 95 % intervals (low, high); NaN if no match votes.
         Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of the resized
-        query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, to whose px they
-        refer.
+        query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, in px.
     """
     fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))

@@ -47,12 +47,7 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
     In simulations with recalls of 0.5 to 0.95 and autocorrelations of the hits up to 0.9 from query to query, the 95 %
     interval covers the recall in at least 90 %. It covers less if noise of single queries hides a slow change.
 
-    Args:
-        hits: `[Q]` bool, in the order of the path.
-        level: of confidence.
-
-    Returns:
-        (low, high), fractions; (0, 1) without queries.
+    Hits `[Q]` are bool, in the order of the path. The interval is (0, 1) without queries.
     """
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
@@ -105,9 +100,7 @@ def path_test(first: np.ndarray, second: np.ndarray) -> PathTest:
     noise of single queries hides a slow change. Differences are found late: of independent queries, 300 suffice to
     find in two of three cases that a recall is 0.9 and not 0.8; with correlated ones, more.
 
-    Args:
-        first: `[Q]` bool, in the order of the path; of several drives, in the order of the places.
-        second: `[Q]` bool, of the same queries.
+    The hits are in the order of the path; of several drives, in the order of the places.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     if first.ndim != 1 or first.shape != second.shape:

@@ -23,11 +23,9 @@ from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matchers.host_matcher import PairSource
-from mfvpr.matchers.lightglue_matcher import LightGlueMatcher
 from mfvpr.matchers.match_set import Scales
-from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.retrieval.fitting import with_parts
-from mfvpr.retrieval.retriever import Retriever
+from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
+from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import clip_middle
 
@@ -75,7 +73,13 @@ class Pipeline:
             expected = "a function of the features of two images that returns Matches"
             raise InputError(f"matcher: expected {expected}, got {got}; see mfvpr.Matcher")
         if isinstance(self.matcher, LightGlueMatcher):
-            _check_lightglue(self.matcher, self.extractor)
+            dimensions = [scale.dimension for scale in self.extractor.scales if scale.dimension]  # 0 = not known
+            if isinstance(self.extractor, Sift) or {*dimensions} - {self.matcher.dimension}:
+                got = f"{type(self.extractor).__name__} of {', '.join(map(str, dimensions))}"
+                expected = f"ALIKED's features, of {self.matcher.dimension} dimensions"
+                raise InputError(
+                    f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors"
+                )
 
     @property
     def image_source(self) -> PairSource | None:
@@ -240,11 +244,3 @@ def _with_part(whole: Any, part: Any, new: Any) -> Any:
     if whole is part or (type(whole) is type(part) and whole == part):
         return new
     return with_parts(whole, lambda each: _with_part(each, part, new))
-
-
-def _check_lightglue(matcher: LightGlueMatcher, extractor: Extractor | Source) -> None:
-    dimensions = [scale.dimension for scale in extractor.scales if scale.dimension]  # 0 = not known
-    if isinstance(extractor, Sift) or {*dimensions} - {matcher.dimension}:
-        got = f"{type(extractor).__name__} of {', '.join(map(str, dimensions))}"
-        expected = f"ALIKED's features, of {matcher.dimension} dimensions"
-        raise InputError(f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors")

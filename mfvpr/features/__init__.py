@@ -1,8 +1,8 @@
 """Images -> keypoints, descriptors and global descriptors.
 
-Read first: extractor (the protocols), sift (the shortest extractor), network (what the extractors with a network
-share, and their batches), then the others; vlad (global descriptors from local ones), feature_set (features on
-demand), feature_extraction (folders of images, on threads).
+Read first: extractor (the protocols, and folders of images), sift (the shortest extractor), network (what extractors
+with a network share; global descriptors), then keypoint_networks, patch_networks, ssm_features with windows; vlad
+(global descriptors from local ones), feature_set (features on demand).
 """
 
 import lazy_loader

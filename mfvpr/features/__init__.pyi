@@ -24,14 +24,11 @@ __all__ = [
     "WindowFitting",
 ]
 
-from .aliked_features import AlikedFeatures
-from .d2net_features import D2NetFeatures
-from .dinov2 import Dinov2Features
 from .extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
-from .global_descriptor import GlobalDescriptor, MixVprDescriptor
-from .patch_netvlad import PatchNetVladFeatures
-from .selavpr_features import SelaVprFeatures
+from .keypoint_networks import AlikedFeatures, D2NetFeatures
+from .network import GlobalDescriptor, MixVprDescriptor
+from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeatures
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows
 from .vlad import Vlad, VladFitting

@@ -1,16 +1,21 @@
-"""Protocols of extractors, aggregations and sources of features, and the descriptions that they return."""
+"""What an extractor is and what it returns; descriptions of a folder's images: threads decode while it works."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import jax
 import numpy as np
 from jaxtyping import Float, Num
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.image_reading import Interpolation
-from mfvpr.features.feature_set import FeatureSet, FeatureSource
+from mfvpr.datasets.image_reading import Interpolation, resize
+from mfvpr.features.feature_set import FeatureSet, FeatureSource, check_features, without_padding
+from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.runtime import Track, no_progress, ordered_map
 
 
 class Scale(NamedTuple):
@@ -33,11 +38,7 @@ class Description(NamedTuple):
 
     @property
     def features(self) -> Features:
-        """The features of the only scale.
-
-        Raises:
-            ValueError: there are several scales, or none.
-        """
+        """The features of the only scale; a `ValueError` if there are several scales, or none."""
         if len(self.local) != 1:
             raise ValueError(f"expected features of one scale, got {len(self.local)}; see `local`")
         return self.local[0]
@@ -59,32 +60,29 @@ class Extractor(Protocol):
     """Images, uint8 RGB -> a Description of each.
 
     A cache on disk needs the `recipe` of an extractor of your own, see `mfvpr.utils.recipe_of`.
+
+    Attributes:
+        image_size: (width, height) that images are resized to, px.
+        interpolation: of the resizing, see `mfvpr.datasets.image_reading.resize`.
+        batch_size: images per call.
+        vector_size: length of the global descriptor; 0 = no global descriptor.
+        scales: of the local features; () = no local features.
     """
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """(width, height) that images are resized to, px."""
-        ...
+    def image_size(self) -> tuple[int, int]: ...
 
     @property
-    def interpolation(self) -> Interpolation:
-        """Interpolation of the resizing, see `mfvpr.datasets.image_reading.resize`."""
-        ...
+    def interpolation(self) -> Interpolation: ...
 
     @property
-    def batch_size(self) -> int:
-        """Images per call."""
-        ...
+    def batch_size(self) -> int: ...
 
     @property
-    def vector_size(self) -> int:
-        """Length of the global descriptor; 0 = no global descriptor."""
-        ...
+    def vector_size(self) -> int: ...
 
     @property
-    def scales(self) -> tuple[Scale, ...]:
-        """Scales of the local features; () = no local features."""
-        ...
+    def scales(self) -> tuple[Scale, ...]: ...
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
         """Descriptions of images of `image_size`; networks raise an `InputError` for images of another size."""
@@ -92,42 +90,35 @@ class Extractor(Protocol):
 
 
 class Aggregation(Protocol):
-    """Local features -> a global descriptor of each image, of unit length."""
+    """Local features -> a global descriptor of each image, of unit length and `vector_size` numbers."""
 
     @property
-    def vector_size(self) -> int:
-        """Length of a global descriptor."""
-        ...
+    def vector_size(self) -> int: ...
 
     def __call__(self, images: Sequence[Features]) -> Float[np.ndarray, "images dimensions"]: ...
 
 
 class Fitting(Protocol):
-    """Settings of an aggregation that is learned from the database."""
+    """Settings of an aggregation that is learned from the database; equal features give equal aggregations."""
 
-    def fit(self, database: FeatureSet) -> Aggregation:
-        """Fit the aggregation to the database's local features; equal features give equal aggregations."""
-        ...
+    def fit(self, database: FeatureSet) -> Aggregation: ...
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Local features of folders of images that were extracted elsewhere."""
+    """Local features of folders of images that were extracted elsewhere, of one scale.
+
+    `image_size` is that of the images that the keypoints are in, px; None = the size of the image files.
+    """
 
     @property
-    def image_size(self) -> tuple[int, int] | None:
-        """(width, height) of the images that the keypoints are in, px; None = the size of the image files."""
-        ...
+    def image_size(self) -> tuple[int, int] | None: ...
 
     @property
-    def interpolation(self) -> Interpolation:
-        """Interpolation of the resizing to `image_size`."""
-        ...
+    def interpolation(self) -> Interpolation: ...
 
     @property
-    def scales(self) -> tuple[Scale, ...]:
-        """The only scale."""
-        ...
+    def scales(self) -> tuple[Scale, ...]: ...
 
     def open(self, folder: ImageFolder, *, partial: bool) -> FeatureSource:
         """The features of a folder's images; if `partial`, features of some images may be missing."""
@@ -140,3 +131,72 @@ class Aggregated:
 
     extractor: Extractor | Source
     fitting: Fitting
+
+
+def describe_folder(
+    folder: ImageFolder,
+    extractor: Extractor,
+    rows: Sequence[int],
+    bad: dict[int, str],
+    *,
+    skip_bad: bool = False,
+    track: Track = no_progress,
+) -> Iterator[dict[int, Description]]:
+    """Extract descriptions of the images in `rows`, by row, batch by batch.
+
+    Images that are not used are added to `bad`, row -> reason: images whose description is not finite, and with
+    `skip_bad` images that cannot be read. Without `skip_bad` these raise an `InputError`.
+    """
+    if extractor.batch_size < 1:
+        raise InputError(f"batch_size={extractor.batch_size}: expected a whole number above 0")
+    require_word("interpolation", extractor.interpolation, Interpolation)  # `load` would take it for a bad image
+
+    def load(row: int) -> np.ndarray | InputError:
+        try:
+            return resize(folder.read(row), extractor.image_size, extractor.interpolation)
+        except InputError as error:
+            return error
+
+    def readable() -> Iterator[tuple[int, np.ndarray]]:
+        images = ordered_map(load, rows, workers=available_cpus())
+        for row, image in zip(rows, track(images, len(rows)), strict=True):
+            if not isinstance(image, InputError):
+                yield row, image
+            elif skip_bad:
+                bad[row] = str(image)
+            else:
+                raise InputError(f"{image}, or skip bad images")
+
+    images = readable()
+    while batch := list(itertools.islice(images, extractor.batch_size)):
+        batch_rows, arrays = zip(*batch, strict=True)
+        descriptions = {}
+        for row, description in zip(batch_rows, describe_images(np.stack(arrays), extractor), strict=True):
+            if description is None:
+                bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
+            else:
+                descriptions[row] = description
+        yield descriptions
+
+
+def describe_images(images: Num[np.ndarray, "images height width 3"], extractor: Extractor) -> list[Description | None]:
+    """Extract descriptions of images of the extractor's size; None if a description is not finite."""
+    name, dimensions = type(extractor).__name__, [scale.dimension for scale in extractor.scales]
+    descriptions: list[Description | None] = []
+    for description in (described := list(extractor(images))):
+        if not isinstance(description, Description):
+            got = type(description).__name__
+            raise InputError(f"{name}: expected a Description, got {got}; return Description(vector, (features,))")
+        vector, local = description
+        for features in local:
+            check_features(features, f"{name}: features", unit_length=False)
+        if (got := [features.descriptors.shape[-1] for features in local]) != dimensions:
+            raise InputError(f"{name}: expected local features of {dimensions} dimensions, as in `scales`, got {got}")
+        if (size := 0 if vector is None else np.size(vector)) != extractor.vector_size:
+            raise InputError(f"{name}: vector_size={extractor.vector_size}, but a description with {size} numbers")
+        unpadded = Description(vector, tuple(map(without_padding, local)))
+        is_finite = all(np.isfinite(array).all() for array in jax.tree.leaves(unpadded))
+        descriptions.append(unpadded if is_finite else None)
+    if len(described) != len(images):
+        raise InputError(f"{name}: expected a Description of each of {len(images)} images, got {len(described)}")
+    return descriptions

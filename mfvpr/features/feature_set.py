@@ -14,12 +14,11 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int, Shaped
 
 from mfvpr.core.types import Array, Features, per_keypoint
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import Device, compiled, free_bytes, round_up
+from mfvpr.utils.numerics import Device, compiled, free_bytes, repeat_last, round_up
 
 SHARE = 1 / 3  # of the free memory, by default
 STEP = 32  # capacities are multiples of it
@@ -81,10 +80,8 @@ class FeatureSet:
         for number, image in enumerate(images):
             check_features(image, f"features of image {number}", unit_length=unit_length)
             if (dimension := image.descriptors.shape[1]) != (expected := images[0].descriptors.shape[1]):
-                raise InputError(
-                    f"features of image {number}: expected descriptors of {expected} dimensions, as those of image 0, "
-                    f"got {dimension}; extract all images alike"
-                )
+                got = f"{dimension}; extract all images alike"
+                raise InputError(f"features of image {number}: expected {expected} dimensions, got {got}")
         return cls(InMemory(dict(enumerate(map(without_padding, images))), len(images)), {})
 
     @property
@@ -131,18 +128,6 @@ def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
     return int((SHARE * free if memory is None else 1e9 * memory) / sharing)
 
 
-def _capacities(counts: Int[np.ndarray, " images"]) -> Int[np.ndarray, " capacities"]:
-    """The capacity that fits all counts, and a smaller one for half of the images if it saves a quarter."""
-    half, most = ragged.sizes(counts, (0.5, 1.0), STEP)[[0, -1]]
-    return np.array([half, most] if half <= 0.75 * most else [most])
-
-
-def few_sizes(number: int) -> int:
-    """Round a number of slots up, by a quarter at most, because each number needs a program of its own."""
-    number = max(WRITTEN, number)
-    return round_up(number, 2 ** (number.bit_length() - 3))
-
-
 class Staged(NamedTuple):
     """Slots of rows on the device, and the rows that have to be written to them first."""
 
@@ -152,29 +137,8 @@ class Staged(NamedTuple):
     new: Sequence[tuple[int, Int[np.ndarray, " WRITTEN"], Features]]
 
 
-class Recent:
-    """Assignment of rows to `number` slots of one capacity; the least recently used row makes room."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-        self._slots: OrderedDict[int, int] = OrderedDict()
-
-    def take(self, rows: Sequence[int]) -> tuple[list[int], list[int]]:
-        """Assign distinct rows, at most `number`, to slots; return their slots, and the rows that were in none."""
-        if len(rows) > self.number:
-            raise ValueError(f"expected at most {self.number} rows at the same time, got {len(rows)}")
-        new = [row for row in rows if row not in self._slots]
-        for row in rows:  # before new rows come, so that none of these rows makes room for them
-            if row in self._slots:
-                self._slots.move_to_end(row)
-        for row in new:
-            is_full = len(self._slots) == self.number
-            self._slots[row] = self._slots.popitem(last=False)[1] if is_full else len(self._slots)
-        return [self._slots[row] for row in rows], new
-
-
 class Slots:
-    """Rows of a feature set on one device, padded, in slots of a few capacities.
+    """Rows of a feature set on one device, padded, in slots of a few capacities; the least recently used makes room.
 
     An image's capacity depends on its count and on the counts of all `wanted` images, never on the images that it is
     matched with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
@@ -184,17 +148,21 @@ class Slots:
         """Plan empty slots for the distinct rows `wanted`, with `budget` bytes for them and for rows on their way."""
         self._features, self._device = features, device
         counts = features.counts
-        capacities = _capacities(counts[wanted])
-        self._capacity = ragged.smallest_capacities(capacities, np.minimum(counts, capacities[-1]))
-        wanted_capacities = self._capacity[wanted[counts[wanted] > 0]]
-        rows = {int(capacity): int(np.sum(wanted_capacities == capacity)) for capacity in capacities}
-        size = features.keypoint_bytes if wanted_capacities.size else 1
+        # The capacity that fits all counts, and a smaller one for half of the images if it saves a quarter.
+        half, most = few_capacities(counts[wanted], (0.5, 1.0), STEP)[[0, -1]].tolist()
+        capacities = [half, most] if half <= 0.75 * most else [most]
+        self._capacity = np.array(capacities)[np.searchsorted(capacities, np.minimum(counts, most))]
+        wanted = wanted[counts[wanted] > 0]
+        rows = {capacity: int(np.sum(self._capacity[wanted] == capacity)) for capacity in capacities}
+        size = features.keypoint_bytes if len(wanted) else 1
         share = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
-        self._part_size = max(WRITTEN, int(STAGED * budget / (capacities[-1] * size)))
-        self._recent = {
-            capacity: Recent(few_sizes(min(number, max(self._part_size, int(share * number)))))
-            for capacity, number in rows.items()
-        }
+        self._part_size = max(WRITTEN, int(STAGED * budget / (most * size)))
+        self._numbers: dict[int, int] = {}  # of slots, by capacity
+        for capacity, number in rows.items():
+            number = max(WRITTEN, min(number, max(self._part_size, int(share * number))))
+            # Rounded up, by a quarter at most, because each number needs a program of its own.
+            self._numbers[capacity] = round_up(number, 2 ** (number.bit_length() - 3))
+        self._slots = {capacity: OrderedDict[int, int]() for capacity in capacities}  # by row, the oldest first
         self._arrays: dict[int, Features] = {}
 
     def parts(self, rows: Int[np.ndarray, " rows"]) -> Iterator[Int[np.ndarray, " part"]]:
@@ -206,46 +174,51 @@ class Slots:
         distinct, inverse = np.unique(rows, return_inverse=True)
         capacity, slot = self._capacity[distinct], np.zeros(len(distinct), np.int32)
         missing: list[tuple[int, list[int]]] = []
-        for size, recent in self._recent.items():
-            has_size = capacity == size
-            slot[has_size], new = recent.take(distinct[has_size].tolist())
+        for size, slots in self._slots.items():
+            wanted = distinct[capacity == size].tolist()
+            if len(wanted) > self._numbers[size]:
+                raise ValueError(f"expected at most {self._numbers[size]} rows at the same time, got {len(wanted)}")
+            new = [row for row in wanted if row not in slots]
+            for row in wanted:  # before new rows come, so that none of these rows makes room for them
+                if row in slots:
+                    slots.move_to_end(row)
+            for row in new:
+                is_full = len(slots) == self._numbers[size]
+                slots[row] = slots.popitem(last=False)[1] if is_full else len(slots)
+            slot[capacity == size] = [slots[row] for row in wanted]
             missing += [(size, new[start : start + WRITTEN]) for start in range(0, len(new), WRITTEN)]
         features = self._features.read([row for _, new in missing for row in new])
         writes = []
         for size, new in missing:
             images = [image for _, image in itertools.islice(features, len(new))]
-            slots = np.full(WRITTEN, self._recent[size].number, np.int32)
-            slots[: len(new)] = slot[np.searchsorted(distinct, new)]
-            writes.append((size, slots, stack_features(images, size, total=WRITTEN)))
+            numbers = np.full(WRITTEN, self._numbers[size], np.int32)
+            numbers[: len(new)] = slot[np.searchsorted(distinct, new)]
+            writes.append((size, numbers, stack_features(images, size, total=WRITTEN)))
         return Staged(capacity[inverse], slot[inverse], writes)
 
     def put(self, staged: Staged) -> Mapping[int, Features]:
         """Write staged rows to the device; return all slots `[slots, N, ...]` by capacity, until the next call."""
         for capacity, slots, features in staged.new:
-            rows = jax.device_put(features, self._device)
+            rows, number = jax.device_put(features, self._device), self._numbers[capacity]
             if capacity not in self._arrays:
-                self._arrays[capacity] = empty_slots(rows, self._recent[capacity].number)
-            self._arrays[capacity] = write_slots(self._arrays[capacity], slots, rows)
+                zeros = lambda leaf, number=number: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device)  # noqa: E731
+                self._arrays[capacity] = jax.tree.map(zeros, rows)
+            self._arrays[capacity] = _write_slots(self._arrays[capacity], slots, rows)
         return self._arrays
 
 
-def empty_slots(rows: Features, number: int) -> Features:
-    """Zeros `[number, N, ...]` on the device of rows `[R, N, ...]`, with their types."""
-    return jax.tree.map(lambda leaf: jnp.zeros((number, *leaf.shape[1:]), leaf.dtype, device=leaf.device), rows)
-
-
 @partial(compiled, donate_argnums=0)  # the arrays may be as large as the memory allows
-def write_slots(arrays: Features, slots: Int[Array, " rows"], rows: Features) -> Features:
+def _write_slots(arrays: Features, slots: Int[Array, " rows"], rows: Features) -> Features:
     """Write rows `[R, N, ...]` to slots in place; rows with a slot beyond the last are dropped."""
     return jax.tree.map(lambda array, row: array.at[slots].set(row, mode="drop"), arrays, rows)
 
 
 def stack_features(images: Sequence[Features], capacity: int, *, total: int | None = None) -> Features:
-    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `ragged.pad_rows`."""
+    """Pad Features `[n, ...]` of at least one image to `[R, capacity, ...]`, NumPy; see `pad_rows`."""
     rows = [{name: values for name, values in per_keypoint(image).items() if name != "mask"} for image in images]
-    arrays, mask = ragged.pad_rows(rows, capacity, total=total)
+    arrays, mask = pad_rows(rows, capacity, total=total)
     sizes = np.stack([image.image_size for image in images])
-    return Features(**arrays, mask=mask, image_size=sizes if total is None else ragged.repeat_last(sizes, total))
+    return Features(**arrays, mask=mask, image_size=sizes if total is None else repeat_last(sizes, total))
 
 
 def without_padding(image: Features) -> Features:
@@ -269,3 +242,27 @@ def check_features(image: Features, name: str, *, unit_length: bool) -> None:
             f"{name}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
             "divide them by their Euclidean length, or say unit_length=False"
         )
+
+
+def pad_rows(
+    rows: Sequence[Mapping[str, np.ndarray]], capacity: int, *, total: int | None = None
+) -> tuple[dict[str, Shaped[np.ndarray, "rows slots ..."]], Bool[np.ndarray, "rows slots"]]:
+    """At least one row as `total` padded arrays by name, 0 beyond the ends of the rows, and the mask."""
+    total = len(rows) if total is None else total
+    arrays = {name: np.zeros((total, capacity, *values.shape[1:]), values.dtype) for name, values in rows[0].items()}
+    counts = np.zeros(total, int)
+    for place, row in enumerate(rows):
+        counts[place] = len(next(iter(row.values())))
+        for name, values in row.items():
+            arrays[name][place, : counts[place]] = values
+    return arrays, np.arange(capacity) < counts[:, None]
+
+
+def few_capacities(
+    counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int
+) -> Int[np.ndarray, " capacities"]:
+    """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts`: quantiles of those above 0."""
+    lengths = counts[counts > 0]
+    if not lengths.size:
+        return np.array([step])
+    return np.unique(np.ceil(np.quantile(lengths, quantiles) / step).astype(int) * step)

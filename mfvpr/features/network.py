@@ -1,32 +1,62 @@
-"""Run networks: weights are arguments of one compiled program; images have one size."""
+"""Extractors with a network: their base, which runs images in batches, and networks of global descriptors."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
-from operator import attrgetter
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import jax
 import numpy as np
 from flax import nnx
-from jaxtyping import Num
+from jaxtyping import Float, Num
 
-from mfvpr.features.extractor import Description
-from mfvpr.utils import ragged
+from mfvpr.datasets.image_reading import Interpolation
+from mfvpr.features.extractor import Description, Scale
+from mfvpr.networks.layers import Images, Pixels, of_unit_length
+from mfvpr.networks.mixvpr import IMAGE_SIZE
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import device_bytes, knows_own_context
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.fields import SIZE, Rule, check_fields, setting, whole, word_of
+from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
+from mfvpr.utils.runtime import ordered_map
 
 TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
 
 
+@dataclass(frozen=True)
 class NetworkExtractor:
-    """Base of the extractors with a network, which are dataclasses with these fields."""
+    """Base of the extractors with a network: dataclasses whose further fields are further settings.
 
-    model: Any
-    image_size: tuple[int, int]
-    batch_size: int
-    vector_size: Any = property(attrgetter("model.dimension"))  # of the global descriptor
-    scales: Any = ()  # no local features
+    By default it is an extractor of the global descriptors of `model.dimension` numbers that the network returns for
+    preprocessed images. An extractor of another kind defines `compute`, `describe_result`, `vector_size` and `scales`.
+
+    Raises:
+        InputError: another network than `network`, or a value that is out of its range.
+    """
+
+    network: ClassVar[type] = object
+    has_vector: ClassVar[bool] = True  # False = no global descriptor
+
+    model: Any = field(repr=False)
+    image_size: tuple[int, int] = setting((336, 336), SIZE, "width, height")
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    batch_size: int = setting(8, whole(1, 256), recipe=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if not isinstance(self.model, self.network):
+            expected, got = self.network.__name__, type(self.model).__name__
+            mend = "`mfvpr.checkpoints.load_model` gives a network by its name"
+            raise InputError(f"{type(self).__name__}: expected a {expected} as model, got {got}; {mend}")
+
+    @property
+    def vector_size(self) -> int:
+        """Length of the global descriptor."""
+        return self.model.dimension if self.has_vector else 0
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """No local features."""
+        return ()
 
     def __call__(self, images: Num[np.ndarray, "images height width 3"]) -> list[Description]:
         """Descriptions of images, RGB, 0 .. 255, uint8 or float32; an `InputError` for images of another size."""
@@ -34,9 +64,9 @@ class NetworkExtractor:
         if (columns, rows) != tuple(size):
             name = type(self).__name__
             raise InputError(f"{name}: expected images of {size[0]} x {size[1]} px, got {columns} x {rows}")
-        return [self._describe(result) for result in self._extract(images)]
+        return [self.describe_result(result) for result in self.run_network(images)]
 
-    def _extract(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
         """Results of the network for each image."""
         return in_batches(self._program, images, self.batch_size)
 
@@ -49,8 +79,80 @@ class NetworkExtractor:
         """Results for a batch; runs in a compiled program."""
         return model(model.preprocess(images))
 
-    def _describe(self, result: Any) -> Description:
+    def describe_result(self, result: Any) -> Description:
         return Description(result.reshape(-1))
+
+
+def only_size(width: int, height: int) -> Any:
+    """The setting of an `image_size` that cannot be chosen."""
+    is_size = lambda value: isinstance(value, list | tuple) and tuple(value) == (width, height)  # noqa: E731
+    rule = Rule(is_size, f"[{width}, {height}], the only size that its weights are for")
+    return setting((width, height), rule, "width, height: the only one that its weights are for")
+
+
+@dataclass(frozen=True)
+class MixVprDescriptor(NetworkExtractor):
+    """MixVPR's global descriptors, as the public code extracts them: 4096, 512 or 128 numbers with published weights.
+
+    The authors' demonstration and OpenVPRLab interpolate by "pil_bicubic", the authors' training by "pil_bilinear",
+    VPR-methods-evaluation by "torch_bilinear".
+    """
+
+    image_size: tuple[int, int] = only_size(*IMAGE_SIZE)
+    interpolation: Interpolation = setting(
+        "pil_bicubic",
+        word_of(Interpolation),
+        "the authors' demo, OpenVPRLab; pil_bilinear (training), torch_bilinear (VPR-methods-evaluation)",
+    )
+
+
+class DescriptorNetwork(Protocol):
+    """A network that maps preprocessed images to descriptors of unit length.
+
+    `has_components` says whether a descriptor consists of principal components, the largest first. `require` raises an
+    InputError if the network cannot take images of this (width, height) px.
+    """
+
+    dimension: int
+    has_components: bool
+
+    def require(self, size: tuple[int, int]) -> None: ...
+
+    def preprocess(self, images: Pixels) -> Images: ...
+
+    def __call__(self, images: Images) -> Float[jax.Array, "images dimensions"]: ...
+
+
+@dataclass(frozen=True)
+class GlobalDescriptor(NetworkExtractor):
+    """Global descriptors of a `DescriptorNetwork`, which takes images of many sizes, as the public code extracts them.
+
+    640 x 480 px is Patch-NetVLAD's size. Principal `components` that are kept are scaled to unit length again.
+
+    Raises:
+        InputError: the network cannot take images of this size, or has fewer principal components.
+    """
+
+    image_size: tuple[int, int] = setting((640, 480), SIZE, "width, height")
+    components: int | None = setting(
+        None, whole(1, 4096) | None, "how many of the first of 4096, 512 or 128 are kept; null = all"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.model.require(self.image_size)
+        if self.components is not None and not self.model.has_components:
+            raise InputError(f"components={self.components}: expected None, since these weights have no whitening")
+        if self.components is not None and self.components > self.model.dimension:
+            raise InputError(f"components={self.components}: expected from 1 to {self.model.dimension}")
+
+    @property
+    def vector_size(self) -> int:
+        return self.components or self.model.dimension
+
+    def compute(self, model: DescriptorNetwork, images: jax.Array) -> jax.Array:
+        descriptors = model(model.preprocess(images))
+        return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
 
 
 def compile_network(model: nnx.Module, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -59,19 +161,6 @@ def compile_network(model: nnx.Module, function: Callable[..., Any]) -> Callable
     program = jax.jit(lambda state, *inputs: function(nnx.merge(graph, state), *inputs))
     state = jax.device_put(state)
     return lambda *inputs: program(state, *inputs)
-
-
-def require_network(name: str, model: Any, expected: type[nnx.Module]) -> None:
-    """Raise an InputError unless the model is a network of the expected class."""
-    if not isinstance(model, expected):
-        mend = "`mfvpr.checkpoints.load_model` gives a network by its name"
-        raise InputError(f"{name}: expected a {expected.__name__} as model, got {type(model).__name__}; {mend}")
-
-
-def require_at_least(name: str, size: tuple[int, int], smallest: int) -> None:
-    """Raise an InputError if images of this (width, height) are smaller than `smallest` px."""
-    if min(size) < smallest:
-        raise InputError(f"{name}: expected images of {smallest} x {smallest} px or more, got {size[0]} x {size[1]}")
 
 
 def in_batches(
@@ -93,7 +182,7 @@ def in_batches(
 
     def run(start: int) -> list[Any]:
         batch = images[start : start + size]
-        outputs = jax.tree.map(np.asarray, program(ragged.repeat_last(batch, size)))
+        outputs = jax.tree.map(np.asarray, program(repeat_last(batch, size)))
         return [jax.tree.map(lambda field, row=row: field[row], outputs) for row in range(len(batch))]
 
     starts = range(0, len(images), size)

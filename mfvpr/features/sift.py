@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from mfvpr.core.types import Features
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
@@ -16,10 +15,8 @@ from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SHAPED_SIZE, SIZE, check_
 class Sift:
     """RootSIFT of the gray image, 128 dimensions; scores are the detector's responses (of order 0.01 to 0.2).
 
-    Attributes, beside those of `Extractor`:
-        max_keypoints: the keypoints of the highest scores are kept; None = all.
-        contrast_threshold: OpenCV's; low, so that dark images reach `max_keypoints` as well.
-        clahe_clip: clip limit of local histogram equalization before detection; 0 turns it off.
+    The `max_keypoints` (None = all) of the highest scores are kept. `contrast_threshold` is OpenCV's, and `clahe_clip`
+    the clip limit of local histogram equalization before detection (0 = off).
     """
 
     vector_size = 0  # no global descriptor
@@ -30,8 +27,7 @@ class Sift:
     clahe_clip: float = setting(0.0, NOT_NEGATIVE, "local histogram equalization before detection; 0 = off")
     batch_size: int = setting(8, whole(1, 256), recipe=False)
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
     @property
     def scales(self) -> tuple[Scale, ...]:
@@ -39,18 +35,19 @@ class Sift:
         return (Scale(128, self.max_keypoints or self.image_size[0] * self.image_size[1] // 100),)
 
     def __call__(self, images: UInt8[np.ndarray, "images height width 3"]) -> list[Description]:
-        return [Description(local=(self._extract(image),)) for image in images]
-
-    def _extract(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        if self.clahe_clip > 0:
-            gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
         detector = cv2.SIFT_create(self.max_keypoints or 0, contrastThreshold=self.contrast_threshold)  # pyright: ignore
-        detections, descriptors = detector.detectAndCompute(gray, None)
-        scores = np.array([keypoint.response for keypoint in detections], np.float32)
-        strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
-        keypoints = np.array([keypoint.pt for keypoint in detections], np.float32).reshape(-1, 2)
-        sift = np.zeros((0, 128), np.float32) if descriptors is None else descriptors[strongest]
-        # RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length.
-        root = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-12))
-        return local_features(keypoints[strongest], root, gray.shape[::-1], scores[strongest])
+        descriptions = []
+        for image in images:
+            gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+            if self.clahe_clip > 0:
+                gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
+            detections, descriptors = detector.detectAndCompute(gray, None)
+            scores = np.array([keypoint.response for keypoint in detections], np.float32)
+            strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit
+            keypoints = np.array([keypoint.pt for keypoint in detections], np.float32).reshape(-1, 2)
+            sift = np.zeros((0, 128), np.float32) if descriptors is None else descriptors[strongest]
+            # RootSIFT: the square root of L1-normalized SIFT has unit Euclidean length.
+            root = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1e-12))
+            features = local_features(keypoints[strongest], root, gray.shape[::-1], scores[strongest])
+            descriptions.append(Description(local=(features,)))
+        return descriptions

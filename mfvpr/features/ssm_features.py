@@ -1,30 +1,25 @@
 """SSM-VPR's descriptors (Camara & Preucil, RAS 2020): windows for retrieval, cells of a grid for matching."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
 from jaxtyping import Float, Num
 
-from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.features.network import NetworkExtractor, compile_network
+from mfvpr.features.network import NetworkExtractor, compile_network, only_size
+from mfvpr.features.whitening import Whitening
 from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
-from mfvpr.networks.imagenet import Preprocessing
-from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.utils.fields import SIZE, check_fields, setting, whole, word_of
-from mfvpr.utils.whitening import Whitening
+from mfvpr.networks.layers import Preprocessing
+from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.utils.fields import SIZE, setting, whole, word_of
 
-CHANNELS = 512
-STAGE1_SIZE = (224, 224)
-STAGE1_FITTING, STAGE2_FITTING = WindowFitting(125), WindowFitting(100, dtype="float64")  # as published
-_PREPROCESSING: Any = setting(
-    "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
-)
+_CHANNELS = 512
 _STRIDES = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}
+_FITTINGS = {1: WindowFitting(125), 2: WindowFitting(100, dtype="float64")}  # as published
 _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its middle
 
 
@@ -32,23 +27,19 @@ _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its mid
 class SsmMaps(NetworkExtractor):
     """Feature maps of one stage as global descriptors, of unit length at every position.
 
-    Attributes, beside those of `Extractor`:
-        stage: 1 or 2.
+    Attributes, beside those of `NetworkExtractor`:
         preprocessing: "torch" as the public code, or "caffe", which the weights are for.
+        stage: 1 or 2.
     """
 
-    model: SsmVgg = field(repr=False)
-    stage: Literal[1, 2]
-    image_size: tuple[int, int]
-    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = _PREPROCESSING
-    batch_size: int = setting(8, whole(1, 256), recipe=False)
+    preprocessing: Preprocessing = "torch"
+    stage: Literal[1, 2] = 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(rows, columns, channels) of a map."""
         columns, rows = (-(-side // _STRIDES[self.stage]) for side in self.image_size)
-        return rows, columns, CHANNELS
+        return rows, columns, _CHANNELS
 
     @property
     def vector_size(self) -> int:
@@ -61,19 +52,26 @@ class SsmMaps(NetworkExtractor):
         return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
 
 
+@dataclass(frozen=True)
 class _WhitenedWindows(NetworkExtractor):
-    """Base of the extractors of whitened windows, which are dataclasses with the fields of `SsmMaps`."""
+    """Base of the extractors of whitened windows of a stage's maps."""
 
-    stage: Literal[1, 2]
-    interpolation: Interpolation
-    preprocessing: Preprocessing
-    whitening: WindowFitting | Whitening
-    windows: Any
+    stage: ClassVar[Literal[1, 2]]
+
+    preprocessing: Preprocessing = setting(
+        "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
+    )
+    whitening: WindowFitting | Whitening = _FITTINGS[1]
+
+    @property
+    def windows(self) -> Windows:
+        """The windows of a map."""
+        raise NotImplementedError
 
     @property
     def maps(self) -> SsmMaps:
         """Extractor of the stage's maps."""
-        return SsmMaps(self.model, self.stage, self.image_size, self.interpolation, self.preprocessing, self.batch_size)
+        return SsmMaps(self.model, self.image_size, self.interpolation, self.batch_size, self.preprocessing, self.stage)
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
@@ -93,17 +91,12 @@ class SsmWindows(_WhitenedWindows):
     """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
 
     Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
-
-    Attributes, beside those of `SsmMaps`:
-        whitening: settings to learn it from the database, or the learned whitening.
+    `whitening` are settings to learn it from the database, or the learned whitening.
     """
 
-    image_size, stage = STAGE1_SIZE, 1
-    model: SsmVgg = field(repr=False)
-    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = _PREPROCESSING
-    whitening: WindowFitting | Whitening = STAGE1_FITTING
-    batch_size: int = setting(8, whole(1, 256), recipe=False)
+    stage = 1
+    image_size: tuple[int, int] = only_size(224, 224)
+    whitening: WindowFitting | Whitening = _FITTINGS[1]
 
     @property
     def windows(self) -> Windows:
@@ -125,26 +118,22 @@ class SsmCells(_WhitenedWindows):
 
     Attributes, beside those of `SsmMaps`:
         image_size: (width, height) px: 336 x 336 as the paper, 224 x 224 as the public program, 448 x 448.
-        stride: positions from cell to cell.
         whitening: settings to learn it from the database, or the learned whitening.
+        stride: positions from cell to cell.
 
     Raises:
         InputError: images of this size have no cells.
     """
 
-    vector_size, stage = 0, 2  # no global descriptor; the second stage's map
-    model: SsmVgg = field(repr=False)
+    has_vector, stage = False, 2
     image_size: tuple[int, int] = setting(
         (336, 336), SIZE, "width, height: 40 x 40 cells; [224, 224]: 26 x 26, [448, 448]: 54 x 54"
     )
-    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
-    preprocessing: Preprocessing = _PREPROCESSING
+    whitening: WindowFitting | Whitening = _FITTINGS[2]
     stride: int = setting(1, whole(1, 8), "positions of the map, 8 px each, from cell to cell")
-    whitening: WindowFitting | Whitening = STAGE2_FITTING
-    batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
         self.windows  # noqa: B018  # refuses images that are too small
 
     @property
@@ -157,6 +146,6 @@ class SsmCells(_WhitenedWindows):
         """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
-    def _describe(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:
+    def describe_result(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:
         middles = STAGE2_STRIDE * (self.windows.corners[:, ::-1] + self.windows.size // 2) + _MIDDLE
         return Description(local=(local_features(middles, result, self.image_size),))

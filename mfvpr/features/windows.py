@@ -1,7 +1,7 @@
 """Whitened windows of a network's maps, the descriptors of both stages of SSM-VPR (Camara & Preucil, RAS 2020).
 
-The whitening is learned from windows of the database's images; see `mfvpr.retrieval.fitting`. It is linear: descriptors
-of all windows are one convolution of the map, and only the fitting forms windows.
+The whitening is learned from windows of the database's images, see `mfvpr.retrieval.fit_to_database`. It is linear:
+descriptors of all windows are one convolution of the map, and only the fitting forms windows.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,11 +16,10 @@ from jaxtyping import Float, Int
 
 from mfvpr.core.types import Array
 from mfvpr.features.extractor import Extractor
+from mfvpr.features.whitening import Whitening, fit_whitening
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.numerics import free_host_bytes
-from mfvpr.utils.whitening import Whitening, fit_bytes, fit_whitening
 
 
 @dataclass(frozen=True)
@@ -69,13 +68,8 @@ class Windows:
 class WindowFitting:
     """Settings of a whitening that is learned from random windows of random images of the database.
 
-    Attributes:
-        dimension: D' of the whitened vectors.
-        max_images: number of images to learn from; None = all.
-        max_windows: number of windows of these images to learn from; None = all.
-        zero_row: add a window of zeros, as in the public code's second stage.
-        dtype: of the windows and of the result. Sums are always in double precision.
-        seed: of the random images and windows. (The public code has no seed.)
+    `dimension` is D' of the whitened vectors, `dtype` that of the windows and of the result (sums are always in double
+    precision). The public code has no seed; its second stage has a `zero_row`, a window of zeros.
     """
 
     dimension: int = setting(100, whole(1, 4096), "that are learned from the database and kept")
@@ -85,8 +79,7 @@ class WindowFitting:
     dtype: Literal["float32", "float64"] = "float32"
     seed: int = setting(0, INDEX)
 
-    def __post_init__(self) -> None:
-        check_fields(self)
+    __post_init__ = check_fields
 
     def sample_rows(self, num_images: int) -> list[int]:
         """Rows of the images to learn from."""
@@ -101,21 +94,14 @@ class WindowFitting:
     ) -> Whitening:
         """Learn the whitening from maps of the images in `rows` (`sample_rows`), which come by row in batches.
 
-        Unreadable images may be missing. Too few windows, or more than fit into memory, raise an `InputError`.
+        Unreadable images may be missing. Too few windows raise an `InputError`.
         """
         total = len(rows) * windows.count
         chosen = np.arange(total)
         if self.max_windows is not None and total > self.max_windows:
             rng = np.random.default_rng([self.seed, 1])
             chosen = np.sort(rng.choice(total, self.max_windows, replace=False))
-        count = len(chosen) + self.zero_row
-        needed = fit_bytes(count, windows.dimension, np.dtype(self.dtype).itemsize)
-        if needed > (free := free_host_bytes()):
-            raise InputError(
-                f"whitening of {count} windows of {windows.dimension} numbers: takes {needed / 1e9:.1f} GB of memory, "
-                f"but {free / 1e9:.1f} GB are free; lower max_images or max_windows"
-            )
-        sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
+        sample, filled = np.zeros((len(chosen) + self.zero_row, windows.dimension), self.dtype), 0
         starts = {row: windows.count * number for number, row in enumerate(rows)}
         for batch in maps:
             for row, image_map in batch.items():
@@ -127,35 +113,27 @@ class WindowFitting:
 
 @runtime_checkable
 class WindowExtractor(Protocol):
-    """An extractor of whitened windows: a dataclass whose `whitening` is replaced when it was learned."""
+    """An extractor of whitened windows of `maps`: a dataclass whose `whitening` is replaced when it was learned."""
 
     @property
-    def whitening(self) -> WindowFitting | Whitening:
-        """Settings to learn it from the database, or the learned whitening."""
-        ...
+    def whitening(self) -> WindowFitting | Whitening: ...
 
     @property
-    def windows(self) -> Windows:
-        """The windows of a map."""
-        ...
+    def windows(self) -> Windows: ...
 
     @property
-    def maps(self) -> Extractor:
-        """Extractor of the maps, as global descriptors."""
-        ...
+    def maps(self) -> Extractor: ...
 
 
 def learned_whitening(extractor: WindowExtractor) -> Whitening:
     """The extractor's learned whitening; an `InputError` if it was not learned yet, or from something else."""
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
-        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fitting.fit_to_database(...) of it")
-    if len(whitening.mean) != expected:
-        got = f"{len(whitening.mean)}; learn it from windows of these maps"
-        raise InputError(f"{name}: expected a whitening of {expected} numbers, got one of {got}")
-    if whitening.origin and whitening.origin != origin(extractor):
-        got = "one that was learned with others; replace it by a WindowFitting"
-        raise InputError(f"{name}: expected a whitening of its own network, images and windows, got {got}")
+        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
+    if len(whitening.mean) != expected or whitening.origin not in ("", origin(extractor)):
+        got = f"one of {len(whitening.mean)} that was learned with others; replace it by a WindowFitting"
+        own = f"{expected} numbers of its own network, images and windows"
+        raise InputError(f"{name}: expected a whitening of {own}, got {got}")
     return whitening
 
 

@@ -16,8 +16,13 @@ __all__ = [
     "write_trajectory",
 ]
 
-from .descriptors import read_global_descriptors, write_global_descriptors
-from .features import ImportedFeatures, open_features, write_features
+from .features import (
+    ImportedFeatures,
+    open_features,
+    read_global_descriptors,
+    write_features,
+    write_global_descriptors,
+)
 from .matches import Images, ImportedMatches, open_matches
 from .shortlists import read_shortlist, reranked_shortlist, write_shortlist
 from .trajectories import read_poses, read_stamps, stamps_in_names, write_trajectory

@@ -1,14 +1,15 @@
-"""Files with arrays by image: hloc's HDF5, NumPy's archives, folders of archives; and messages about damaged files."""
+"""Files with arrays by image: hloc's HDF5, NumPy's archives, folders of archives; their numbers, and messages."""
 
 import os
 import zipfile
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Shaped
 
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import printable, replacing, require_file, require_replaceable
@@ -26,23 +27,25 @@ class FileEntry(NamedTuple):
 
 
 class Container:
-    """Base class of readers of several images, which read only the requested arrays."""
+    """Base class of readers of several images, which read only the requested arrays.
 
-    path: Path  # file or folder, for messages
-    images: tuple[str, ...]  # their names in the file
-    transposed = False  # whether descriptors are `[D, N]` if their shapes fit both layouts
+    Attributes:
+        path: file or folder, for messages.
+        entries: place of each image's arrays, by its name in the file.
+        transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
+    """
 
-    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
-        """For each image, the shapes of its arrays among `parts`, and () for its other arrays; reads no values."""
+    path: Path
+    entries: Mapping[str, FileEntry]
+    transposed = False
+
+    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
+        """For each image, the shapes of its arrays among `parts`, and () for those among `others`; reads no values."""
         raise NotImplementedError
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         """For each image, its arrays among `parts`."""
         raise NotImplementedError
-
-    def entry(self, image: str) -> FileEntry:
-        """Place of an image's arrays."""
-        return FileEntry(self.path, image)
 
 
 class H5File(Container):
@@ -60,26 +63,25 @@ class H5File(Container):
             file.visit(names.append)  # follows no links
         groups = {name.rpartition("/")[0] for name in names}
         images = (name.rpartition("/")[0] for name in names if name not in groups)
-        self.images = tuple(dict.fromkeys(filter(None, images)))
-        if not self.images:
+        self.entries = {image: FileEntry(path, image) for image in images if image}
+        if not self.entries:
             raise InputError(f"{path}: expected a group for every image, as hloc writes them, got no datasets")
 
-    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
+    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
         with self._open() as file:
             for image in images:
-                group = file[image]
-                yield {name: self._dataset(group, image, name).shape if name in parts else () for name in group}
+                shapes = {part: self._dataset(file, image, part).shape for part in parts if part in file[image]}
+                yield shapes | {part: () for part in others if part in file[image]}
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
         with self._open() as file:
             for image in images:
-                group = file[image]
-                yield {part: self._dataset(group, image, part)[()] for part in parts if part in group}
+                yield {part: self._dataset(file, image, part)[()] for part in parts if part in file[image]}
 
-    def _dataset(self, group: Any, image: str, part: str) -> Any:
-        dataset, where = group[part], f"{self.path}: {shorten(image)}/{part}"
+    def _dataset(self, file: Any, image: str, part: str) -> Any:
+        dataset, where = file[image][part], f"{self.path}: {shorten(image)}/{part}"
         has_values = getattr(dataset, "shape", None) is not None and not dataset.external and not dataset.is_virtual
-        if not has_values or dataset.file.filename != group.file.filename:
+        if not has_values or dataset.file.filename != file.filename:
             raise InputError(f"{where}: expected data in this file, got a group or a link; copy the data")
         stored = dataset.id.get_storage_size()
         if dataset.size and not stored:  # HDF5 would read zeros
@@ -94,70 +96,55 @@ class H5File(Container):
             yield file
 
 
-class NpzFile(Container):
-    """Reader of one archive for all images, with arrays named `image/part`: `a/1.jpg/keypoints`.
+class NpzFiles(Container):
+    """Reader of one archive for all images, or of a folder with an archive for each image.
 
-    Every call reads the directory, which takes half a second for 10,000 images: request many images at once.
+    In one archive, arrays are named `image/part`: `a/1.jpg/keypoints`. Every call reads its directory, which takes half
+    a second for 10,000 images: request many images at once. In a folder, files are `a/1.jpg.npz` or `a/1.jpg.d2-net`;
+    hidden files and folders are skipped, and links to folders are not followed.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _open_npz(path) as archive:
-            names = archive.files
-        self.images = tuple(dict.fromkeys(name.rpartition("/")[0] for name in names if "/" in name))
-        if not self.images:
-            raise InputError(
-                f"{path}: expected arrays named by images (a.jpg/keypoints), got {shorten(', '.join(names)) or 'none'};"
-                " if every image has its own file, give their folder"
-            )
-
-    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
-        with _open_npz(self.path) as archive:
-            members = defaultdict(list)
-            for name in archive.files:
-                image, _, part = name.rpartition("/")
-                members[image].append(part)
-            for image in images:
-                yield {part: _shape(archive, f"{image}/{part}") if part in parts else () for part in members[image]}
-
-    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        with _open_npz(self.path) as archive:
-            for image in images:
-                names = {part: f"{image}/{part}" for part in parts}
-                yield {part: _read(archive, name) for part, name in names.items() if name in archive}
-
-
-class NpzFolder(Container):
-    """Reader of a folder with an archive for each image: `a/1.jpg.npz` or `a/1.jpg.d2-net`.
-
-    Hidden files and folders are skipped; links to folders are not followed.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._paths: dict[str, Path] = {}
+        self.entries: dict[str, FileEntry] = {}
+        if not path.is_dir():
+            with _open_npz(path) as archive:
+                names = archive.files
+            self.entries = {image: FileEntry(path, image) for name in names if (image := name.rpartition("/")[0])}
+            if not self.entries:
+                got = f"{shorten(', '.join(names)) or 'none'}; if every image has its own file, give their folder"
+                raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}")
+            return
         for folder, folders, files in os.walk(path):
             folders[:] = sorted(name for name in folders if not name.startswith("."))
             for file in (Path(folder, name) for name in sorted(files) if name.endswith(SUFFIXES) and name[0] != "."):
                 image = file.relative_to(path).as_posix().removesuffix(file.suffix)
-                if image in self._paths:
-                    raise InputError(f"{file}: {self._paths[image].name} beside it is of the same image; remove either")
-                self._paths[image] = file
-        self.images = tuple(self._paths)
-        if not self.images:
+                other = self.entries.setdefault(image, FileEntry(file, "")).file
+                if other != file:
+                    raise InputError(f"{file}: {other.name} beside it is of the same image; remove either")
+        if not self.entries:
             raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
 
-    def shapes(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Shapes]:
-        for image in images:
-            with _open_npz(self._paths[image]) as archive:
-                yield {name: _shape(archive, name) if name in parts else () for name in archive.files}
+    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
+        def read_shape(archive: Any, name: str) -> tuple[int, ...]:
+            if name.rpartition("/")[2] not in parts:
+                return ()
+            with archive.zip.open(f"{name}.npy") as file:
+                return read_npy_header(file)[0]
+
+        return self._read_each(images, (*parts, *others), read_shape)
 
     def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        for image in images:
-            yield read_npz(self._paths[image], parts)
+        return self._read_each(images, parts, _read)
 
-    def entry(self, image: str) -> FileEntry:
-        return FileEntry(self._paths[image], "")
+    def _read_each(self, images: Iterable[str], parts: Sequence[str], read: Callable) -> Iterator[dict[str, Any]]:
+        """For each image, `read(archive, name)` of its arrays among `parts`."""
+        for file, entries in groupby((self.entries[image] for image in images), key=lambda entry: entry.file):
+            with _open_npz(file) as archive:
+                known = {*archive.files}
+                for entry in entries:
+                    names = {part: f"{entry.name}/{part}" if entry.name else part for part in parts}
+                    yield {part: read(archive, name) for part, name in names.items() if name in known}
 
 
 def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
@@ -219,6 +206,25 @@ def shorten(text: str, limit: int = 60) -> str:
     return start if len(start) <= limit else f"{start[: limit - 20]}... ({len(text)} characters)"
 
 
+def parse_number(text: str) -> float:
+    """The number in a text, as C writes it, or a `ValueError`; Python's own `float` also reads `1_0` as 10."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"not a number: {text!r}")
+    return float(text)
+
+
+def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:
+    """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32; InputError for others."""
+    if array.dtype.kind not in kinds:
+        raise InputError(f"{where}: expected {'floating-point ' if kinds == 'f' else ''}numbers, got {array.dtype}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = np.ascontiguousarray(array, np.float32)
+    if not np.isfinite(values).all():
+        first = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise InputError(f"{where}: expected finite float32, got {array[tuple(first)]} at {first}; extract it again")
+    return values
+
+
 @contextmanager
 def _open_npz(path: Path) -> Iterator[Any]:
     with reading(path), path.open("rb") as file:
@@ -227,11 +233,6 @@ def _open_npz(path: Path) -> Iterator[Any]:
             raise InputError("expected an archive of NumPy (.npz), got an array")
         with archive:
             yield archive
-
-
-def _shape(archive: Any, name: str) -> tuple[int, ...]:
-    with archive.zip.open(f"{name}.npy") as file:
-        return read_npy_header(file)[0]
 
 
 def _read(archive: Any, name: str) -> np.ndarray:

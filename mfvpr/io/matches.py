@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Num
+from jaxtyping import Float32
 
 from mfvpr.core.types import Features, Matches, Shortlist
-from mfvpr.io.checks import as_float32
-from mfvpr.io.containers import FileEntry, choose_reader, shorten
+from mfvpr.io.containers import FileEntry, as_float32, choose_reader, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
-from mfvpr.io.formats.pair_files import (
+from mfvpr.io.names import match_paths, require_one_image
+from mfvpr.io.pair_files import (
     ColmapPairs,
     FileMatches,
     HlocPairs,
@@ -26,8 +26,7 @@ from mfvpr.io.formats.pair_files import (
     PairReader,
     Size,
 )
-from mfvpr.io.formats.result_files import PredictionPairs, ResultFiles
-from mfvpr.io.names import match_paths, require_one_image
+from mfvpr.io.result_files import PredictionPairs, ResultFiles
 from mfvpr.utils.errors import InputError
 
 _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
@@ -64,7 +63,7 @@ class ImportedMatches:
     ) -> None:
         self.path, self._reader, self._sides = reader.path, reader, sides
         self._image_size, self._use_confidences = image_size, confidences
-        self._has_confidences: bool | None = None  # whether the first pair that was read has confidences
+        self._has_confidences: bool | None = None  # of the pairs that were read; None = no matches yet
         self.numbered = reader.by_number
         names, known = [], {}
         for side, word in zip(sides, ("queries", "database images"), strict=True):
@@ -96,9 +95,16 @@ class ImportedMatches:
         features = self._features(0, [query]) | self._features(1, [*stored]) if self.numbered and stored else {}
         matches = {}
         for (row, (_, is_exchanged)), content in zip(stored.items(), contents, strict=True):
-            raw = content.exchanged() if is_exchanged else content
+            raw = content
+            if is_exchanged:
+                raw = FileMatches(raw.second, raw.first, raw.confidence, raw.sizes and (raw.sizes[1], raw.sizes[0]))
             where = f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"
-            confidence = self._confidence(where, raw)
+            uses_confidence = self._use_confidences and raw.first.size > 0
+            confidence = raw.confidence if uses_confidence else None
+            if uses_confidence:
+                if self._has_confidences not in (None, confidence is not None):
+                    raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
+                self._has_confidences = confidence is not None
             if self.numbered:
                 sides: Any = features[0, query], features[1, row]
                 matches[row] = numbered_matches(where, raw.first, raw.second, confidence, *sides)
@@ -113,9 +119,9 @@ class ImportedMatches:
         first, second = self.names[0][query], self.names[1][candidate]
         if first is None or second is None:
             return None
-        if (first, second) in self._reader:
+        if (first, second) in self._reader.places:
             return (first, second), False
-        return ((second, first), True) if not self._reader.sided and (second, first) in self._reader else None
+        return ((second, first), True) if not self._reader.sided and (second, first) in self._reader.places else None
 
     def warnings(self, shortlist: Shortlist) -> list[str]:
         """Warn in one line if pairs of a shortlist are missing; raise an InputError if all are."""
@@ -144,16 +150,6 @@ class ImportedMatches:
             require_inside(where, points, size)
             features[side, row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
         return features
-
-    def _confidence(self, where: str, raw: FileMatches) -> Num[np.ndarray, "..."] | None:
-        """Confidences of the file; all pairs or none must have them."""
-        if not self._use_confidences or not raw.first.size:
-            return None
-        has_confidence = raw.confidence is not None
-        if self._has_confidences not in (None, has_confidence):
-            raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
-        self._has_confidences = has_confidence
-        return raw.confidence
 
     def _size(self, side: int, row: int, stored: Size | None) -> Size:
         """Size of the image that points are in; an InputError if nobody knows it."""
@@ -192,7 +188,18 @@ def open_matches(
         InputError: the file is missing, damaged or has another format; names are ambiguous; there is no pair of a query
             and a database image; or features are missing.
     """
-    reader = _open(Path(path), queries, database, verified)
+    path = Path(path)
+    if not path.is_dir():
+        kind = choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})
+        reader = ColmapPairs(path, verified) if kind is ColmapPairs else HlocPairs(path)
+    elif KapturePairs.fits(path):
+        reader = KapturePairs(path)
+    elif PredictionPairs.fits(path):
+        reader = PredictionPairs(path, verified)
+    else:
+        reader = ResultFiles(path, (queries.names, database.names), verified)
+    if verified and isinstance(reader, HlocPairs | KapturePairs):
+        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
     if reader.by_number and not isinstance(reader, ColmapPairs | KapturePairs):
         if queries.features is None or database.features is None:
             raise InputError(f"{path}: expected the features that were matched, got none; give hloc's feats*.h5")
@@ -207,33 +214,12 @@ def content_paths(path: Path) -> list[Path]:
     return [each.resolve() for each in (KapturePairs.folders(path) if is_kapture else [path])]
 
 
-def _open(path: Path, queries: Images, database: Images, verified: bool) -> PairReader:
-    if not path.is_dir():
-        reader = choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})
-        if reader is ColmapPairs:
-            return ColmapPairs(path, verified)
-    elif KapturePairs.fits(path):
-        reader = KapturePairs
-    elif PredictionPairs.fits(path):
-        return PredictionPairs(path, verified)
-    else:
-        return ResultFiles(path, (queries.names, database.names), verified)
-    if verified:
-        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
-    return reader(path)
-
-
 def numbered_matches(
     where: str, first: Any, second: Any, confidence: Any, features0: Features, features1: Features
 ) -> Matches:
-    """Matches `[M]` from numbers of keypoints.
+    """Matches `[M]` from numbers `[M]` of keypoints of `features0` and `features1`, which have no padding.
 
-    Args:
-        where: the pair, for messages.
-        first: numbers `[M]` of keypoints of `features0`; `second` of `features1`.
-        confidence: `[M]` from 0 to 1; None = 1.
-        features0: of the query, without padding; distances are 0 without descriptors.
-        features1: of the candidate.
+    `confidence` is `[M]`, from 0 to 1; None = 1. Distances are 0 without descriptors. `where` is for messages.
     """
     numbers = []
     for values, features in ((first, features0), (second, features1)):
@@ -249,8 +235,7 @@ def numbered_matches(
         raise InputError(f"{where}: expected pairs of keypoints, got {len(number0)} and {len(number1)} numbers")
     dimensions = [np.shape(features.descriptors)[1] for features in (features0, features1)]
     if dimensions[0] != dimensions[1]:
-        got = f"{dimensions[0]} and {dimensions[1]}; give the features that were matched"
-        raise InputError(f"{where}: expected descriptors of one length, got {got}")
+        raise InputError(f"{where}: expected descriptors of one length, got {dimensions[0]} and {dimensions[1]}")
     differences = np.asarray(features0.descriptors)[number0] - np.asarray(features1.descriptors)[number1]
     return Matches(
         points0=features0.keypoints[number0],

@@ -1,7 +1,7 @@
 """Match the names in a file of another program to the images of a data set."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -13,16 +13,15 @@ Entry = TypeVar("Entry")
 Parts = tuple[str, ...]
 Prefix = tuple[Parts, Parts]  # folders only in the file's names, only in the images' names
 ImageOfEntry = dict[tuple[Path, str], Path]  # file and name of an entry -> image
-_NO_PREFIX: Prefix = ((), ())
 _FULL_NAMES = "give names with their folders as the file has them"
 
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
     """Find the name of each image in a file.
 
-    A name matches if it is the relative path of the image, as in hloc; else if one of the two paths is the end of the
-    other (a file name alone, or a path from another root); else if this holds without the suffixes of images. All
-    images have the same prefix: if `1.jpg` is `db/1.jpg`, `2.jpg` is never `query/2.jpg`.
+    A name matches if it is the relative path of the image; else if one of the two paths is the end of the other; else
+    if this holds without the suffixes of images. All images have the same prefix: if `1.jpg` is `db/1.jpg`, `2.jpg` is
+    never `query/2.jpg`.
 
     Args:
         path: file, for messages.
@@ -40,7 +39,7 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
     is_exact = any(matched)
-    prefix = _NO_PREFIX if is_exact else None
+    prefix: Prefix | None = ((), ()) if is_exact else None
     for spellings in (lambda name: [name], _stems):
         spelled = defaultdict(list)  # free names by the last part of each of their spellings
         for name in foreign.keys() - set(matched):
@@ -51,10 +50,14 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         for row in (row for row, match in enumerate(matched) if match is None):
             ours = spellings(printable(names[row]))[0]
             for name, theirs in spelled[PurePosixPath(ours).name]:
-                each = _prefix(ours, theirs)
-                if each is not None and prefix in (None, each):
+                parts, other = _parts(ours), _parts(theirs)
+                shared = min(len(parts), len(other))
+                each = other[: len(other) - shared], parts[: len(parts) - shared]
+                if other[len(each[0]) :] != parts[len(each[1]) :]:
+                    continue  # neither path is the end of the other
+                if prefix in (None, each):
                     pairs_by_prefix[each].append((row, name))
-                elif each is not None and not is_exact:
+                elif not is_exact:
                     contradictions[row] = name
         pairs = [pair for each in pairs_by_prefix.values() for pair in dict.fromkeys(each)]
         contradictions = {row: name for row, name in contradictions.items() if row not in dict(pairs)}
@@ -74,9 +77,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     return matched
 
 
-def match_paths(path: Path, names: Sequence[str], paths: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
+def match_paths(path: Path, names: Sequence[str], paths: Sequence[str], foreign: Collection[str]) -> list[str | None]:
     """Find images by their full `paths` `[M]`, or if no image has such a name, or () was given, as `match_names`."""
-    foreign = list(foreign)
     for kind in filter(None, (paths, names)):
         if any(matched := match_names(path, kind, foreign)):
             return matched
@@ -124,14 +126,6 @@ def require_one_image(
 def adds_folders(name: str, match: str) -> bool:
     """Whether the name in a file has folders before the part that it shares with the image's name."""
     return len(_parts(match)) > len(_parts(name))
-
-
-def _prefix(name: str, match: str) -> Prefix | None:
-    """Folders before the shared end of both names; None unless one of two paths is the end of the other."""
-    ours, theirs = _parts(name), _parts(match)
-    shared = min(len(ours), len(theirs))
-    prefix = theirs[: len(theirs) - shared], ours[: len(ours) - shared]
-    return prefix if theirs[len(prefix[0]) :] == ours[len(prefix[1]) :] else None
 
 
 def _stems(name: str) -> list[str]:

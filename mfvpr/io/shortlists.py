@@ -4,17 +4,16 @@ Lists of image pairs are hloc's `query database` and kapture's `query, reference
 a folder of predictions, a text file for each query. To-Match adds the results of an image matcher.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from mfvpr.core.types import Ranking, Shortlist
-from mfvpr.io.checks import parse_number
-from mfvpr.io.containers import FileEntry, read_npz, reading, shorten, write_npz
-from mfvpr.io.formats.result_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
+from mfvpr.io.containers import FileEntry, parse_number, read_npz, reading, shorten, write_npz
 from mfvpr.io.names import adds_folders, match_names, require_different
+from mfvpr.io.result_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_replaceable, write_text
 
@@ -33,14 +32,13 @@ class Pair(NamedTuple):
 def read_shortlist(
     path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
 ) -> Shortlist:
-    """Read the candidates that another program chose.
+    """Read the candidates that another program chose; a query's best candidate comes first.
 
     Args:
-        path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and optional `scores` `[Q, K]`, in the
-            order of `query_names` and `database_names`. Other suffixes: lines of text, `query database` as hloc, or
-            `query, reference[, score]` as kapture and Patch-NetVLAD's predictions; # begins a comment. A folder:
-            `preds` of VPR-methods-evaluation; with To-Match's `.torch` files beside its text files, candidates are
-            re-ranked by the number of inliers. A query's best candidate comes first.
+        path: `.npz`: `predictions` `[Q, K]`, rows of the database, -1 = none, and optional `scores` `[Q, K]`.
+            Other suffixes: lines of text, `query database` as hloc, or `query, reference[, score]` as kapture and
+            Patch-NetVLAD's predictions. A folder: `preds` of VPR-methods-evaluation; with To-Match's `.torch` files
+            beside its text files, candidates are re-ranked by the number of inliers.
         query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
         database_names: `[N]` likewise.
         num_candidates: C; None = the largest number of a query's candidates.
@@ -66,14 +64,15 @@ def read_with_entries(
     path = Path(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
-    queries, database = {}, {}
+    entries: Any = [None] * len(query_names), [None] * len(database_names)
     if path.suffix.lower() == ".npz":
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
         names = _read_predictions(path) if path.is_dir() else _read_pairs(path)
-        queries = _rows(path, query_names, dict.fromkeys(pair.query for pair in names), "query")
-        database = _rows(path, database_names, dict.fromkeys(pair.database for pair in names), "database")
+        queries, query_entries = _rows(path, query_names, (pair.query for pair in names), "query")
+        database, database_entries = _rows(path, database_names, (pair.database for pair in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
+        entries = query_entries, database_entries
     candidates: list[dict[int, float | None]] = [{} for _ in query_names]  # database rows and scores, best first
     for query, row, score in pairs:
         candidates[query].setdefault(row, score)  # of several scores, the first counts
@@ -91,7 +90,7 @@ def read_with_entries(
         if has_score == {True}:
             scores[query, :count] = _descending(f"{path}: {shorten(query_names[query])}", [*rows.values()])[:count]
     shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-    return shortlist, _entries(path, query_names, queries), _entries(path, database_names, database)
+    return shortlist, *entries
 
 
 def write_shortlist(
@@ -138,16 +137,22 @@ def write_shortlist(
         for name in names:
             if name != name.strip() or name.startswith("#") or {*_SEPARATORS[layout]} & {*name}:
                 raise InputError(f"{path}: expected names that fit the layout {layout}, got {name!r}; write .npz")
-    rows = [row[real].tolist() for row, real in zip(indices, mask, strict=True)]
+    require_replaceable(path)
     if layout == "preds":
-        _write_predictions(path, query_names, database_names, rows, positives)
+        path.mkdir(parents=True)
+        for row, query in enumerate(query_names):
+            if mask[row].any():  # the number of a file is the query's row
+                parts = [[QUERY, query], [PREDICTIONS, *(database_names[each] for each in indices[row][mask[row]])]]
+                if positives is not None:
+                    parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
+                text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
+                write_text(path / f"{row:03d}.txt", text)
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
         names = (query_names[query], database_names[int(indices[query, position])])
         score = np.float32(scores[query, position])
         lines.append(" ".join(names) if layout == "hloc" else ", ".join((*names, str(score))))
-    require_replaceable(path)
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -196,7 +201,7 @@ def _read_pairs(path: Path) -> list[Pair]:
 
 
 def _read_predictions(folder: Path) -> list[Pair]:
-    """Read the pairs of a folder of predictions. Positives are not read: the data set has its own ground truth."""
+    """Read the pairs of a folder of predictions."""
     pairs, files = [], dict[str, Path]()
     for path in sorted(folder.glob("*.txt")):
         query, predictions = read_predictions(path)
@@ -212,40 +217,19 @@ def _read_predictions(folder: Path) -> list[Pair]:
     return pairs
 
 
-def _write_predictions(
-    folder: Path,
-    query_names: Sequence[str],
-    database_names: Sequence[str],
-    predictions: Sequence[Sequence[int]],
-    positives: Sequence[Sequence[int]] | None,
-) -> None:
-    """Write a file for each query that has predictions; its number is the query's row."""
-    require_replaceable(folder)
-    folder.mkdir(parents=True)
-    for row, query in enumerate(query_names):
-        if predictions[row]:
-            parts = [[QUERY, query], [PREDICTIONS, *(database_names[each] for each in predictions[row])]]
-            if positives is not None:
-                parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
-            text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
-            write_text(folder / f"{row:03d}.txt", text)
-
-
-def _rows(path: Path, names: Sequence[str], foreign: dict[str, None], side: str) -> dict[str, int]:
-    """Row of each foreign name; raises an InputError for unknown names."""
+def _rows(
+    path: Path, names: Sequence[str], foreign: Iterable[str], side: str
+) -> tuple[dict[str, int], list[FileEntry | None]]:
+    """Row of each foreign name, and the entry of each image; an InputError for unknown names."""
+    foreign = dict.fromkeys(foreign)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
-    for name in foreign:
-        if name not in rows:
-            raise InputError(
-                f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none "
-                f"of the {len(names)} has, or one has by its full path"
-            )
-    return rows
-
-
-def _entries(path: Path, names: Sequence[str], rows: dict[str, int]) -> list[FileEntry | None]:
-    entries = {row: FileEntry(path, match) for match, row in rows.items() if adds_folders(names[row], match)}
-    return [entries.get(row) for row in range(len(names))]
+    for name in foreign.keys() - rows.keys():
+        raise InputError(
+            f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none "
+            f"of the {len(names)} has, or one has by its full path"
+        )
+    entries = {row: FileEntry(path, name) for name, row in rows.items() if adds_folders(names[row], name)}
+    return rows, [entries.get(row) for row in range(len(names))]
 
 
 def _descending(where: str, scores: Any) -> np.ndarray:

@@ -10,14 +10,13 @@ from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
 
-from mfvpr.io.checks import parse_number
-from mfvpr.io.containers import reading, shorten
+from mfvpr.io.containers import parse_number, reading, shorten
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
 
 SECOND = 10**9  # nanoseconds
 _END = Decimal(2**31)  # seconds, of ROS; a larger number has another unit
-_DIGITS = (13, 16, 19)  # of whole numbers of ms, us and ns since 1970
+_UNITS = {13: -3, 16: -6, 19: -9}  # digits of whole numbers of ms, us and ns since 1970 -> power of ten
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]{1,3})?")
 _NAME = re.compile(r"[0-9]+\.[0-9]+|[1-9][0-9]{9}([0-9]{3}){0,3}")  # a frame number is no time
 _TUM, _KITTI = 7, 12  # numbers of a pose
@@ -31,8 +30,8 @@ def parse_stamp(text: str, where: str = "time") -> int:
 
     More than 9 decimals of seconds are rounded. An `InputError` that begins with `where` if it is no time before 2038.
     """
-    scale = len(text) - 10 if len(text) in _DIGITS and text.isdigit() and text[0] != "0" else 0
-    seconds = Decimal(text).scaleb(-scale) if _NUMBER.fullmatch(text) else _END
+    power = _UNITS.get(len(text), 0) if text.isdigit() and text[0] != "0" else 0
+    seconds = Decimal(text).scaleb(power) if _NUMBER.fullmatch(text) else _END
     if seconds >= _END:
         expected = "a time in s, or a whole number of ms, us or ns since 1970"
         raise InputError(f"{where}: expected {expected}, got {shorten(text)!r}")
@@ -48,10 +47,8 @@ def stamps_in_names(names: Sequence[str]) -> list[int]:
     """
     for name in names:
         if not _NAME.fullmatch(PurePosixPath(name).stem):
-            raise InputError(
-                f"{shorten(name)}: expected the time as the name of the file, such as 1403636579763555584.png (ns) or "
-                "12.345.png (s); rename the images, or give a file of times (read_stamps, or --times FILE)"
-            )
+            expected = "the time as the name of the file, such as 1403636579763555584.png (ns) or 12.345.png (s)"
+            raise InputError(f"{shorten(name)}: expected {expected}; rename the images, or give a file of times")
     return [parse_stamp(PurePosixPath(name).stem, shorten(name)) for name in names]
 
 
@@ -82,31 +79,32 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
     """
     path = Path(path)
     lines = [(where, line.split()) for where, line in _lines(path, "a text file of poses")]
-    num_words = len(lines[0][1]) if lines else 0
-    for where, words in lines:
-        if len(words) != num_words or num_words not in (_TUM + 1, _KITTI):
-            raise InputError(f"{where}: expected 8 numbers (TUM) or 12 (KITTI) in all lines, got {len(words)}")
     if len(lines) != len(names):
         raise InputError(f"{path}: expected a pose of each of the {len(names)} images, got {len(lines)}")
-    if num_words != _KITTI:
-        stamps = [parse_stamp(words[0], where) for where, words in lines]
-        lines = [(where, words[1:]) for where, words in lines]
-        image_stamps = stamps
-        with suppress(InputError):  # names that are no times
-            image_stamps = stamps_in_names(names)
-        before = -1
-        for (where, _), stamp, image_stamp, name in zip(lines, stamps, image_stamps, names, strict=True):
+    image_stamps = None
+    with suppress(InputError):  # names that are no times
+        image_stamps = stamps_in_names(names)
+    poses, before = [], -1
+    for row, (where, words) in enumerate(lines):
+        if len(words) != len(lines[0][1]) or len(words) not in (_TUM + 1, _KITTI):
+            raise InputError(f"{where}: expected 8 numbers (TUM) or 12 (KITTI) in all lines, got {len(words)}")
+        if len(words) != _KITTI:
+            stamp, words = parse_stamp(words[0], where), words[1:]
             if stamp <= before:
                 got = f"{_seconds(stamp)} after {_seconds(before)}"
                 raise InputError(f"{where}: expected ascending timestamps, got {got}; sort the lines by time")
-            if abs(stamp - image_stamp) > _LARGEST_GAP:
-                expected = f"the pose of {shorten(name)}, within 10 ms"
+            if image_stamps is not None and abs(stamp - image_stamps[row]) > _LARGEST_GAP:
+                expected = f"the pose of {shorten(names[row])}, within 10 ms"
                 raise InputError(f"{where}: expected {expected}, got one at {_seconds(stamp)}")
             before = stamp
-    for where, words in lines:
-        if not all(map(_is_finite, words)):
-            raise InputError(f"{where}: expected finite numbers, got {shorten(' '.join(words))!r}")
-    return [" ".join(words) for _, words in lines]
+        poses.append(" ".join(words))
+        try:
+            is_finite = all(math.isfinite(parse_number(word)) for word in words)
+        except ValueError:
+            is_finite = False
+        if not is_finite:
+            raise InputError(f"{where}: expected finite numbers, got {shorten(poses[-1])!r}")
+    return poses
 
 
 def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequence[int] | None = None) -> None:
@@ -118,15 +116,12 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
 
     Args:
         path: new text file.
-        poses: `[Q]` texts of 7 numbers (TUM) or 12 numbers (KITTI), as `read_poses` returns them; None = no place.
-        stamps: `[Q]` times in ns, for TUM; None for KITTI.
-
-    TUM: lines are in the order of time, and an image without a place has none. KITTI: a line is a frame, so all images
-    need a place.
+        poses: `[Q]` texts of 7 numbers (TUM) or 12 (KITTI), as `read_poses` returns them; None = no place, which a
+            frame of KITTI must have.
+        stamps: `[Q]` different times in ns, for TUM, whose lines are in their order; None for KITTI.
 
     Raises:
-        InputError: the file exists; there is no pose at all, or none of a KITTI frame; a pose has other numbers; or
-            two images have the same time.
+        InputError: the file exists; poses are missing or have other numbers; or two images have the same time.
     """
     path = Path(path)
     if len({*(stamps or ())}) < len(stamps or ()):
@@ -153,13 +148,6 @@ def _lines(path: Path, kind: str) -> list[tuple[str, str]]:
         text = path.read_text(encoding="utf-8-sig")
     lines = ((f"{path}: line {number}", line.strip()) for number, line in enumerate(text.split("\n"), start=1))
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
-
-
-def _is_finite(text: str) -> bool:
-    try:
-        return math.isfinite(parse_number(text))
-    except ValueError:
-        return False
 
 
 def _seconds(stamp: int) -> str:

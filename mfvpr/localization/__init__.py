@@ -7,9 +7,8 @@
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map (localize one image), map_images (the images of a map, and how they are added), predictions. Then their
-parts: describing, vectors, matching, declaration and map_calibration (what a map keeps in its file), route (a drive
-through a map).
+Read first: map (localize one image, step by step: add a step to `Map._localize`), map_images (the images of a map, and
+how they are added), predictions, route (a drive through a map), map_settings (settings and confidence in its file).
 """
 
 import lazy_loader

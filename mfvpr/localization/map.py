@@ -1,17 +1,21 @@
 """`Map`: localize one image in a folder of images whose places are known."""
 
 import math
-import operator
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
-from mfvpr.core.scorer import Scorer
-from mfvpr.core.types import Matches, Shortlist
+from mfvpr.core.batch import BIN_STEP, score_candidates
+from mfvpr.core.histogram import HistogramOfShifts
+from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
+from mfvpr.core.types import Features, Matches, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
 from mfvpr.evaluation.confidence import REFUSALS, Confidence
@@ -25,25 +29,32 @@ from mfvpr.evaluation.evidence import (
 )
 from mfvpr.evaluation.fusion import rank_by_scores
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.extractor import Extractor, Source
+from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.declaration import fit_to_map, read_system
-from mfvpr.localization.describing import Described, Image, is_file, load
-from mfvpr.localization.map_calibration import fit_on_drive, read_confidence, write_confidence
-from mfvpr.localization.map_images import MapImages, exclusive
-from mfvpr.localization.matching import match_and_score, padded_size, shift_of
+from mfvpr.localization.map_images import Described, Image, MapImages, exclusive, is_file, load
+from mfvpr.localization.map_settings import fit_on_drive, fit_to_map, read_confidence, read_system, write_confidence
 from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
 from mfvpr.localization.route import Route
 from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle
+from mfvpr.utils.fields import whole
 from mfvpr.utils.fingerprints import recipe_of
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
+from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
+
+Point = tuple[float, float]
+
+_PAIRS_AT_ONCE = 8  # a scorer takes the time of so many, also for a single image of a rare size
+_LEAST_SLOTS = 256  # of an image
+_ROWS = whole(0, 10**9)  # an argument that is a number of rows
 
 
 class Map(MapImages):
@@ -85,7 +96,7 @@ class Map(MapImages):
                 made with another system, or a new map of a system whose image size follows the images (`create`).
         """
         system = fit_to_map(Path(folder), system, None, runtime.log)
-        extractor, describer = _extractor(system), _describer(system)
+        extractor, describer = _parts_of(system)
         super().__init__(folder, system, extractor, describer, memory=runtime.memory)
         self.confidence = confidence or read_confidence(self._file, system)
         if threshold is not None and not 0 <= threshold <= 1:
@@ -175,12 +186,12 @@ class Map(MapImages):
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
-        recent = _whole_number("recent", recent)
-        before = None if before is None else _whole_number("before", before)
+        _ROWS.check("recent", recent)
+        (_ROWS | None).check("before", before)
         self._refresh_images()
         pixels, total = load(image), len(self)
         description, resized = self.describing.pixels(pixels, str(image) if is_file(image) else "image")
-        end = max(0, (total if before is None else min(before, total)) - recent)
+        end = max(0, (total if before is None else min(int(before), total)) - int(recent))
         localized = self._localize(description, end, pixels.shape[1::-1], reason_against_image(resized))
         if route is None:
             return localized
@@ -199,7 +210,7 @@ class Map(MapImages):
         """
         self._refresh_images()
         self.describing.image(noise_images()[0])
-        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
         counts = self._counts().tolist()
         rows = {padded_size(count, self._typical): row for row, count in enumerate(counts)}  # one of each size
         images = self._read_features([*rows.values()])
@@ -250,7 +261,7 @@ class Map(MapImages):
         rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
         if not len(rows):
             return None
-        matcher: Any = self.system.pipeline.matcher  # see `_extractor`
+        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
         candidates = self._read_features(rows.tolist())
         return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
 
@@ -277,18 +288,75 @@ class Map(MapImages):
         return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
 
 
-def _whole_number(name: str, value: Any) -> int:
-    """An argument from 0 as int; NumPy's whole numbers are allowed."""
-    try:
-        if (number := operator.index(value)) >= 0:
-            return number
-    except TypeError:
-        pass
-    got = clip_middle(" ".join(repr(value).split()), 80)
-    raise InputError(f"{name}: expected a whole number from 0, got {got}. Use an `int`.")
+def match_and_score(
+    query: Features, candidates: Sequence[Features], matcher: Matcher, scorers: Mapping[str, Scorer], typical: int
+) -> tuple[list[Matches], dict[str, Float[np.ndarray, " candidates"]]]:
+    """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
+
+    Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
+    on the other pairs. A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes
+    a few pairs at a time. `typical` is a usual number of keypoints, or the detector's limit. If no score is finite, an
+    InputError is raised.
+    """
+    padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
+    by_size = defaultdict[int, list[int]](list)
+    for place, candidate in enumerate(candidates):
+        by_size[padded_size(len(candidate.mask), typical)].append(place)
+    parts = [
+        (size, places[start : start + _PAIRS_AT_ONCE])
+        for size, places in sorted(by_size.items(), reverse=True)
+        for start in range(0, len(places), _PAIRS_AT_ONCE)
+    ]
+
+    def match_part(part: tuple[int, list[int]]) -> tuple[Matches, dict[str, np.ndarray]]:
+        size, places = part
+        images = stack_features([candidates[place] for place in places], size, total=_PAIRS_AT_ONCE)
+        pairs = np.stack([np.zeros(_PAIRS_AT_ONCE, np.int32), np.arange(_PAIRS_AT_ONCE, dtype=np.int32)], axis=1)
+        matches = match_pairs(padded_query, images, pairs, np.int32(len(places)), matcher)
+        scores = {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}
+        for name, values in scores.items():
+            require_scores(type(scorers[name]).__name__, values, _PAIRS_AT_ONCE)
+        return jax.device_get((matches, {name: values.astype(np.float32) for name, values in scores.items()}))
+
+    workers = min(available_cpus(), len(parts))
+    map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
+    matches, scores = {}, {name: np.zeros(len(candidates), np.float32) for name in scorers}
+    for (_, places), (of_part, scores_of_part) in zip(parts, map_parts(match_part, parts), strict=True):
+        for number, place in enumerate(places):
+            matches[place] = jax.tree.map(lambda leaf: leaf[number : number + 1], of_part)  # noqa: B023
+        for name, values in scores_of_part.items():
+            scores[name][places] = values[: len(places)]
+    for name, values in scores.items():
+        require_finite(name, values)
+    return [matches[place] for place in range(len(candidates))], scores
 
 
-def _extractor(system: System) -> Extractor:
+def padded_size(count: int, typical: int) -> int:
+    """Slots for an image: `typical` rounded up, or a power of 2 from 256 on: few sizes, so few programs."""
+    size, typical = 1 << (max(count, _LEAST_SLOTS) - 1).bit_length(), round_up(typical, STEP)
+    return min(size, typical) if typical >= count else size
+
+
+def shift_of(
+    scorers: Iterable[Scorer], pair: Matches, size: tuple[int, int]
+) -> tuple[Point | None, tuple[Point, Point] | None]:
+    """`shift` and `shift_interval` of a `Prediction` by the first histogram of shifts, from one pair.
+
+    Shifts of the resized images become px of the query image, whose size is (width, height).
+    """
+    scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
+    if scorer is None:
+        return None, None
+    histogram = fit_capacities(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
+    shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
+    stretch = np.divide(size, np.asarray(pair.image_size0)[0])
+    shift, interval = stretch * shift, stretch * interval
+    point, low, high = ((float(x), float(y)) if np.isfinite(x + y) else None for x, y in (shift, *interval))
+    return point, (low, high) if low and high else None
+
+
+def _parts_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
+    """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
     extractor, candidates = system.pipeline.extractor, system.pipeline.candidates
     if isinstance(extractor, Source):
         name = type(extractor).__name__
@@ -302,19 +370,14 @@ def _extractor(system: System) -> Extractor:
     if system.correlated or system.sequences:
         expected = "a system without frame correlation and sequences; mfvpr.Route follows a drive"
         raise InputError(f"a map ranks single images: expected {expected}")
-    return extractor
-
-
-def _describer(system: System) -> Extractor | VladFitting:
-    """The extractor of global descriptors, or the fitting of the vocabulary; an InputError if a map cannot use it."""
     retriever = system.pipeline.retriever
     if not isinstance(retriever, Retrieval) or not isinstance(retriever.search, ExactSearch):
         name = type(retriever).__name__
         raise InputError(f"{name}: a map retrieves by global descriptors without whitening; expected Retrieval(...)")
     if isinstance(describer := retriever.describer, Extractor):
-        return describer
-    is_same = recipe_of(describer.extractor) == recipe_of(system.pipeline.extractor)
+        return extractor, describer
+    is_same = recipe_of(describer.extractor) == recipe_of(extractor)
     if not is_same or not isinstance(describer.fitting, VladFitting):
         expected = "Aggregated(extractor, VladFitting(...)) of the same extractor"
         raise InputError(f"a map aggregates its local features: expected {expected}")
-    return describer.fitting
+    return extractor, describer.fitting

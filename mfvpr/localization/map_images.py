@@ -1,45 +1,49 @@
-"""The images of a map: names, places and global descriptors in memory, features on demand; and how images are added."""
+"""The images of a map: how they are described and added, their global descriptors in memory, features on demand."""
 
 import itertools
 import json
+import os
 import shutil
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from functools import wraps
+from dataclasses import dataclass, replace
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import ArrayLike
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
+from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.evidence import strength
 from mfvpr.evaluation.system import System
-from mfvpr.features.extractor import Extractor
+from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
 from mfvpr.features.feature_set import SHARE, check_features
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.declaration import check_declaration, declaration
-from mfvpr.localization.describing import Describing, Image, is_file
-from mfvpr.localization.vectors import Vectors
+from mfvpr.localization.map_settings import check_settings, kept_settings
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
-from mfvpr.utils.arrays import pack_arrays, unpack_arrays
+from mfvpr.storage.packing import pack_arrays, round_as_stored, unpack_arrays
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import canonical_name
-from mfvpr.utils.fingerprints import difference, recipe_of
-from mfvpr.utils.numerics import free_host_bytes
-from mfvpr.utils.progress import Track, no_progress
-from mfvpr.utils.runtime import Runtime
+from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.numerics import as_array, available_cpus, free_host_bytes
+from mfvpr.utils.runtime import Runtime, Track, no_progress, ordered_map
 
 _LEARNING = ".learning"  # the folder of features that a vocabulary is being learned from
 _AT_ONCE = 16  # images that are described without a cache
 _SAMPLE = 32  # images whose strength is measured; a sample has up to twice as many
+_FIRST_ROWS = 1024  # of global descriptors; twice as many whenever they are full
 
+Image = Path | str | ArrayLike
+Described = tuple[Features, np.ndarray]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -52,6 +56,125 @@ def exclusive(method: Method) -> Method:
             return method(self, *arguments, **options)
 
     return run  # pyright: ignore[reportReturnType]  # of the same arguments
+
+
+@dataclass(frozen=True)
+class Describing:
+    """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
+
+    extractor: Extractor  # of local features of one scale
+    describer: Extractor | Aggregation  # of global descriptors; may be the same extractor
+
+    def image(self, image: Image) -> Described:
+        """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
+        return self.pixels(load(image), str(image) if is_file(image) else "image")[0]
+
+    def pixels(self, pixels: Pixels, name: str) -> tuple[Described, Pixels]:
+        """Describe one image; also return it at the size of the extractor. `name` stands in errors."""
+        image, description = _extract(self.extractor, pixels, name)
+        features = round_as_stored(description.features)
+        if not isinstance(self.describer, Extractor):
+            [vector] = self.describer([features])
+            return (features, vector), image
+        if self.describer is not self.extractor:
+            _, description = _extract(self.describer, pixels, name)
+        if description.vector is None:
+            raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
+        return (features, np.asarray(description.vector, np.float32).reshape(-1)), image
+
+    def folder(self, images: ImageFolder, cache: FeatureCache) -> Iterator[dict[int, Described]]:
+        """Describe the images of a folder that a cache lacks: batches by row. The cache may skip bad images."""
+        [features] = cache.local(images, self.extractor)
+        vectors = cache.vectors(images, self.describer, images) if isinstance(self.describer, Extractor) else None
+        aggregate: Any = self.describer
+        bad, size = {**features.bad, **(vectors.bad if vectors else {})}, self.extractor.batch_size
+        if bad and not cache.skip_bad:
+            raise InputError(bad[min(bad)])
+        for reason in bad.values():
+            cache.warn(reason)
+        used = [row for row in range(len(images)) if row not in bad]
+        for start in range(0, len(used), size):
+            batch = dict(features.source.read(used[start : start + size]))  # also those without keypoints
+            if cache.root is None:
+                batch = {row: round_as_stored(local) for row, local in batch.items()}
+            values = vectors.values[[*batch]] if vectors else aggregate([*batch.values()])
+            yield dict(zip(batch, zip(batch.values(), values, strict=True), strict=True))
+
+
+def is_file(image: Image) -> TypeGuard[Path | str]:
+    """Whether an image is a path."""
+    return isinstance(image, str | os.PathLike)
+
+
+def load(image: Image) -> Pixels:
+    """Read an image file, or convert an array; an InputError if it is no image."""
+    if is_file(image):
+        return read_image(image)
+    expected = "image: expected a file or [H, W, 3] uint8 RGB, got"
+    try:
+        pixels = np.asarray(as_array(image))
+    except Exception as error:  # other libraries raise any error, torch for tensors with gradients
+        got = f"{type(image).__name__} ({' '.join(str(error).split())})"
+        raise InputError(f"{expected} {got}. Convert it to a NumPy array.") from None
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
+        got = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
+        raise InputError(f"{expected} {got}. Check that the camera gave an image.")
+    return pixels
+
+
+def _extract(extractor: Extractor, pixels: Pixels, name: str) -> tuple[Pixels, Description]:
+    """An image at the size of an extractor, and its description."""
+    image = resize(pixels, extractor.image_size, extractor.interpolation)
+    [description] = describe_images(image[None], extractor)
+    if description is None:
+        raise InputError(f"{name}: features are not finite (NaN or infinite)")
+    return image, description
+
+
+class Vectors:
+    """Global descriptors by row."""
+
+    def __init__(self) -> None:
+        self._values, self._is_candidate = np.zeros((0, 0), np.float32), np.zeros(0, bool)
+        self._total = 0  # rows that are used
+
+    @property
+    def length(self) -> int | None:
+        """D; None = there is no descriptor yet."""
+        return self._values.shape[1] or None
+
+    def __getitem__(self, row: int) -> Float[np.ndarray, " dimensions"]:
+        """The descriptor of a row."""
+        return self._values[row]
+
+    def append(self, vector: Float[np.ndarray, " dimensions"]) -> None:
+        """Store the descriptor of the next row."""
+        if self._total == len(self._values):
+            more = np.zeros((max(_FIRST_ROWS, self._total), len(vector)), np.float32)
+            self._values = np.concatenate([self._values.reshape(-1, len(vector)), more])
+            self._is_candidate = np.concatenate([self._is_candidate, np.zeros(len(more), bool)])
+        self._values[self._total] = vector
+        # An image without features has a zero descriptor and is never a candidate, as in `mfvpr.retrieval.Retrieval`.
+        self._is_candidate[self._total] = bool(np.isfinite(vector).all() and vector.any())
+        self._total += 1
+
+    def nearest(
+        self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
+    ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
+        """At most `number` rows `before` a row, and their products with the query, most similar first, then by row."""
+        total = self._total if before is None else max(0, min(self._total, before))
+        rows = np.flatnonzero(self._is_candidate[:total])
+        if not len(rows) or not query.any():
+            return rows[:0], np.zeros(0, np.float32)
+        # Own threads: those of BLAS spin while they wait, which costs a third of the time.
+        workers = available_cpus()
+        parts = np.array_split(self._values[:total], workers)
+        products = np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])
+        if len(rows) > number:
+            least = np.partition(products[rows], -number)[-number]
+            rows = rows[products[rows] >= least]
+        best = rows[np.argsort(-products[rows], kind="stable")][:number]
+        return best, products[best]
 
 
 class MapImages:
@@ -70,7 +193,7 @@ class MapImages:
         self.folder = Path(folder).absolute()  # the working directory may change
         self.system, self.extractor, self.candidates = system, extractor, int(system.pipeline.candidates)
         self._file, self._lock = MapFile(self.folder), threading.RLock()
-        check_declaration(self._file, system)
+        check_settings(self._file, system)
         try:
             self._recipe = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
         except TypeError as error:
@@ -125,12 +248,13 @@ class MapImages:
         """
         before = len(self)
         if not self._is_checked and (content := self._file.part("recipe")) is not None:
-            if differs := difference(json.loads(content), json.loads(json.dumps(self._recipe)), "recipe"):
+            kept, now = json.loads(content), json.loads(json.dumps(self._recipe))
+            if differing := " and ".join(name for name in now if kept.get(name) != now[name]):
                 fix = "Use the settings that it was made with, or name another folder"
-                raise InputError(f"{self.folder}: this map was made with {differs}. {fix}.")
+                raise InputError(f"{self.folder}: this map was made with another {differing}. {fix}.")
             self._is_checked = True
         if self._describing is None and (content := self._file.part("vocabulary")) is not None:
-            arrays = unpack_arrays(content, "vocabulary")
+            arrays = unpack_arrays(content)
             self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
         for row, entry in self._file.entries(before):
             self._vectors.append(entry.vector)
@@ -242,10 +366,10 @@ class MapImages:
 
     def _parts(self) -> dict[str, bytes]:
         """Recipe and settings, the first content of a new file; nothing if they are there."""
-        check_declaration(self._file, self.system)  # another process may have written it first
+        check_settings(self._file, self.system)  # another process may have written it first
         parts = {"recipe": self._recipe}
         if self.system.settings is not None:
-            parts["system"] = declaration(self.system.settings)
+            parts["system"] = kept_settings(self.system.settings)
         return {} if self._is_checked else {name: json.dumps(part).encode() for name, part in parts.items()}
 
     @contextmanager
@@ -261,7 +385,7 @@ class MapImages:
             cache = cache or FeatureCache(temporary, runtime=Runtime(progress=lambda label: track))
             vocabulary = self._fitting.fit(cache.local(images, self.extractor)[0])
             arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
-            self._file.write(self._parts() | {"vocabulary": pack_arrays(arrays, "vocabulary")})
+            self._file.write(self._parts() | {"vocabulary": pack_arrays(arrays)})
             self.refresh()
             yield cache
         finally:

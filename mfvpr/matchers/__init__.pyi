@@ -10,7 +10,5 @@ __all__ = [
 ]
 
 from .host_matcher import HostMatcher
-from .lightglue_matcher import LightGlueMatcher
 from .match_set import MatchSet, Scales
-from .matcher import Matcher, NearestNeighborMatcher, match_pairs
-from .soft import soft_match
+from .matcher import LightGlueMatcher, Matcher, NearestNeighborMatcher, match_pairs, soft_match

@@ -3,7 +3,6 @@
 import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,12 +12,10 @@ from jaxtyping import Int, Num
 
 from mfvpr.core.types import Features, Matches, Shortlist, per_match
 from mfvpr.features.feature_set import FeatureSet, Slots, Staged, memory_budget
-from mfvpr.matchers.match_set import QueryMatches, split_pairs
+from mfvpr.matchers.match_set import QueryMatches, Row, split_pairs
 from mfvpr.matchers.matcher import Matcher, match_pairs
-from mfvpr.utils import ragged
-from mfvpr.utils.numerics import Device, holds_function
-from mfvpr.utils.ragged import Row
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import Device, holds_function, repeat_last
+from mfvpr.utils.runtime import ordered_map
 
 QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
 PAIRS = 128  # per call
@@ -42,32 +39,7 @@ class Pair(NamedTuple):
     image_size1: Num[np.ndarray, "2"]
 
 
-@dataclass(frozen=True)
-class Sides:
-    """Features of queries and of the database on one device."""
-
-    queries: Slots
-    database: Slots
-
-    def stage(self, part: Part) -> tuple[Staged, Staged]:
-        """Read the features that are not on the device."""
-        return self.queries.stage(part.pairs[:, 0]), self.database.stage(part.pairs[:, 2])
-
-    def begin(self, staged: tuple[Staged, Staged], match: Callable[..., Matches]) -> Calls:
-        """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
-        arrays0, arrays1 = self.queries.put(staged[0]), self.database.put(staged[1])
-        capacities, slots = (
-            np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot")
-        )
-        calls = []
-        for shape in np.unique(capacities, axis=0):
-            members = np.flatnonzero((capacities == shape).all(axis=1))
-            sides = arrays0[int(shape[0])], arrays1[int(shape[1])]
-            for start in range(0, len(members), PAIRS):
-                positions = members[start : start + PAIRS]
-                pairs = ragged.repeat_last(slots[positions], PAIRS)
-                calls.append((positions, match(*sides, pairs, np.int32(len(positions)))))
-        return calls
+Sides = tuple[Slots, Slots]  # features of queries and of the database on one device
 
 
 def match_queries(
@@ -92,23 +64,29 @@ def match_queries(
     database_rows, budget = np.unique(indices), memory_budget(memory, devices)
     database_rows = database_rows[database_rows >= 0]
     sides = {
-        device: Sides(
-            Slots(queries, np.arange(len(queries)), 0, device), Slots(database, database_rows, budget, device)
-        )
+        device: (Slots(queries, np.arange(len(queries)), 0, device), Slots(database, database_rows, budget, device))
         for device in devices
     }
+
+    def stage(part: Part) -> tuple[Part, list[Staged]]:
+        """Read the features that are not on the device."""
+        return part, [slots.stage(part.pairs[:, side]) for slots, side in zip(sides[part.device], (0, 2), strict=True)]
+
     no_matches = _no_matches(queries, database, matcher)
     pairs: dict[tuple[int, int], Pair] = {}  # by (query, place), until the last pair of the query
     begun: deque[tuple[Part, Calls]] = deque()
     parts = _parts(counts0, counts1, indices, rows, sides)
-    staged = ordered_map(lambda part: (part, sides[part.device].stage(part)), parts, workers=1)
-    for step in itertools.chain(staged, [None]):
+    for step in itertools.chain(ordered_map(stage, parts, workers=1), [None]):
         if step is not None:
-            begun.append((step[0], sides[step[0].device].begin(step[1], match)))
+            begun.append((step[0], _begin(sides[step[0].device], step[1], match)))
         while len(begun) > (0 if step is None else len(devices)):
             part, calls = begun.popleft()
-            for call in calls:
-                pairs.update(_collect(part, *call))
+            for positions, padded in calls:
+                count = len(positions)
+                real = jax.tree.map(lambda values, count=count: np.asarray(values)[:count], padded)
+                places = map(tuple, part.pairs[positions, :2].tolist())
+                of_call = map(Pair, split_pairs(real), real.image_size0, real.image_size1)
+                pairs.update(zip(places, of_call, strict=True))
             for query in part.ends.tolist():
                 of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
                 keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
@@ -129,17 +107,25 @@ def _parts(
         rows = indices[batch]
         number, place = np.nonzero((rows >= 0) & (counts1[rows] > 0) & (counts0[batch] > 0)[:, None])
         pairs = np.stack([batch[number], place, rows[number, place]], axis=1)
-        groups = list(sides[device].database.parts(np.unique(pairs[:, 2])))  # database rows that fit at the same time
+        groups = list(sides[device][1].parts(np.unique(pairs[:, 2])))  # database rows that fit at the same time
         for group in groups[:-1]:
             yield Part(pairs[np.isin(pairs[:, 2], group)], device, batch[:0])
         yield Part(pairs[np.isin(pairs[:, 2], groups[-1:])], device, batch)
 
 
-def _collect(part: Part, positions: np.ndarray, matches: Matches) -> Iterator[tuple[tuple[int, int], Pair]]:
-    """((row of the query, place of the candidate), pair) of every pair of a call."""
-    real = jax.tree.map(lambda values: np.asarray(values)[: len(positions)], matches)
-    places = part.pairs[positions, :2].tolist()
-    return zip(map(tuple, places), map(Pair, split_pairs(real), real.image_size0, real.image_size1), strict=True)
+def _begin(sides: Sides, staged: Sequence[Staged], match: Callable[..., Matches]) -> Calls:
+    """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
+    arrays = [slots.put(rows) for slots, rows in zip(sides, staged, strict=True)]
+    capacities, slots = (np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot"))
+    calls = []
+    for shape in np.unique(capacities, axis=0):
+        members = np.flatnonzero((capacities == shape).all(axis=1))
+        features = [of_side[int(capacity)] for of_side, capacity in zip(arrays, shape, strict=True)]
+        for start in range(0, len(members), PAIRS):
+            positions = members[start : start + PAIRS]
+            pairs = repeat_last(slots[positions], PAIRS)
+            calls.append((positions, match(*features, pairs, np.int32(len(positions)))))
+    return calls
 
 
 def join_candidates(
@@ -147,7 +133,8 @@ def join_candidates(
 ) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
     """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
     matched_pairs = [pair for pair in pairs if pair is not None]
-    rows = ragged.join_rows([pair.matches for pair in matched_pairs] or [no_matches])
+    parts = [pair.matches for pair in matched_pairs] or [no_matches]
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     unknown = np.ones(2, np.float32)
     matches = Matches(
         **rows,

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
 from mfvpr.core.types import INDICES, Features, Matches, Shortlist, per_match
 from mfvpr.datasets.datasets import ImageFolder
@@ -16,7 +17,8 @@ from mfvpr.io.containers import shorten
 from mfvpr.io.matches import numbered_matches, point_matches
 from mfvpr.matchers.batched_matching import Pair, join_candidates
 from mfvpr.matchers.match_set import QueryMatches
-from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT, check_fields, list_of, setting, word_of
 from mfvpr.utils.numerics import as_array
 
 Inputs = Literal["images", "features"]
@@ -64,13 +66,11 @@ class HostMatcher:
 
         pipeline = mfvpr.Pipeline(extractor, retriever, HostMatcher(match, "network 1.0", image_size=(640, 480)))
 
-    The function returns the matches of one pair:
+    The function returns the matches of one pair, as arrays of any library with DLPack, on any device:
 
     - of two images: points `[M, 2]` of both, (x, y) px of these images, and optionally confidences `[M]` from 0 to 1;
       or a mapping with `matched_kpts0`, `matched_kpts1` and optionally `matched_confidences`, as vismatch returns it;
     - of two Features (NumPy, without padding): numbers of keypoints `[M]` of both, and optionally confidences `[M]`.
-
-    Arrays may be of NumPy, JAX, torch or any library with DLPack, on any device.
 
     Attributes:
         function: of the query and the candidate.
@@ -89,38 +89,21 @@ class HostMatcher:
 
     function: Callable[[Any, Any], Any] = field(metadata={"recipe": False})
     name: str
-    inputs: Inputs = "images"
-    image_size: tuple[int, int] | None = None
-    interpolation: Interpolation = "pil_bilinear"
-    batch_size: int | None = field(default=None, metadata={"recipe": False})
+    inputs: Inputs = setting("images", word_of(Inputs))
+    image_size: tuple[int, int] | None = setting(None, list_of(COUNT, 2) | None)
+    interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
+    batch_size: int | None = setting(None, COUNT | None, recipe=False)
 
     def __post_init__(self) -> None:
-        require_word("inputs", self.inputs, Inputs)
+        check_fields(self)
         if not self.name:
             raise InputError("name='': expected the name of the program and its weights, by which a cache knows them")
-        if self.batch_size is not None and not (type(self.batch_size) is int and self.batch_size >= 1):
-            raise InputError(f"batch_size={self.batch_size}: expected a whole number from 1, or None")
-        if self.image_size is not None:
-            if self.inputs == "features":
-                raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
-            if len(self.image_size) != 2 or not all(type(side) is int and side > 0 for side in self.image_size):
-                raise InputError(
-                    f"image_size={self.image_size}: expected whole numbers (width, height) above 0, or None"
-                )
+        if self.image_size is not None and self.inputs == "features":
+            raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
 
     def open(self, queries: Side, database: Side) -> "_CalledPairs":
         """See `PairSource`."""
         return _CalledPairs(self, queries, database)
-
-    def call(self, firsts: list[Any], seconds: list[Any]) -> Sequence[Any]:
-        """Results of the function for a batch of pairs; an `InputError` if it gives another number."""
-        if self.batch_size is None:
-            return [self.function(*pair) for pair in zip(firsts, seconds, strict=True)]
-        results = self.function(firsts, seconds)
-        if not isinstance(results, Sequence) or len(results) != len(seconds):
-            got = len(results) if isinstance(results, Sequence) else type(results).__name__
-            raise InputError(f"{self.name}: expected a list of the matches of {len(seconds)} pairs, got {got}")
-        return results
 
 
 @dataclass(frozen=True)
@@ -139,15 +122,20 @@ class _CalledPairs:
         return []
 
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
-        first, size = self._input(self.queries, query), self.matcher.batch_size or 1
+        first, (function, size) = self._input(self.queries, query), (self.matcher.function, self.matcher.batch_size)
         matches: dict[int, Matches | None] = dict.fromkeys(candidates)
-        for start in range(0, len(candidates) if first is not None else 0, size):
-            inputs = {row: self._input(self.database, row) for row in candidates[start : start + size]}
+        copy = partial(jax.tree.map, np.array)  # the function may change its arguments
+        for start in range(0, len(candidates) if first is not None else 0, size or 1):
+            inputs = {row: self._input(self.database, row) for row in candidates[start : start + (size or 1)]}
             inputs = {row: second for row, second in inputs.items() if second is not None}
-            # Copies, as the function may change its arguments.
-            results = (
-                self.matcher.call([_copy(first) for _ in inputs], [*map(_copy, inputs.values())]) if inputs else ()
-            )
+            if size is None:
+                results = [function(copy(first), copy(second)) for second in inputs.values()]
+            else:
+                results = function([copy(first) for _ in inputs], [*map(copy, inputs.values())]) if inputs else []
+            if not isinstance(results, Sequence) or len(results) != len(inputs):
+                got = len(results) if isinstance(results, Sequence) else type(results).__name__
+                expected = f"a list of the matches of {len(inputs)} pairs"
+                raise InputError(f"{self.matcher.name}: expected {expected}, got {got}")
             for (row, second), result in zip(inputs.items(), results, strict=True):
                 matches[row] = self._convert(query, row, result, first, second)
         return [matches[row] for row in candidates]
@@ -164,10 +152,8 @@ class _CalledPairs:
         if isinstance(result, Mapping):
             result = [result.get(name) for name in ("matched_kpts0", "matched_kpts1", "matched_confidences")]
         if not isinstance(result, tuple | list) or len(result) not in (2, 3) or result[0] is None or result[1] is None:
-            raise InputError(
-                f"{where}: expected two arrays and optionally confidences, or matched_kpts0 and "
-                f"matched_kpts1, got {type(result).__name__}"
-            )
+            expected = "two arrays and optionally confidences, or matched_kpts0 and matched_kpts1"
+            raise InputError(f"{where}: expected {expected}, got {type(result).__name__}")
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
         except InputError as error:
@@ -182,32 +168,24 @@ class _CalledPairs:
         return point_matches(where, values[0], values[1], confidence, *sizes)
 
 
-def _copy(image: Any) -> Any:
-    """Copy of an image or of features."""
-    return jax.tree.map(np.array, image)
-
-
 def match_queries(
     queries: Side, database: Side, candidates: Shortlist, rows: Sequence[int], source: PairSource
 ) -> Iterator[tuple[int, QueryMatches]]:
     """Match queries with their candidates on the host: (row, matches) in the order of `rows`."""
     indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
-    pairs = source.open(queries, database)
+    pairs, no_points = source.open(queries, database), np.zeros((0, 2), np.float32)
+    no_matches = per_match(point_matches("", no_points, no_points, None, (1, 1), (1, 1)))
+    no_matches |= dict.fromkeys(INDICES, np.zeros(0, np.int32)) if pairs.numbered else {}
     for query in rows:
         real = indices[query] >= 0
         matches = iter(pairs.read(query, indices[query][real].tolist()))
         of_query = [next(matches) if is_real else None for is_real in real]
-        yield query, QueryMatches(*_join(of_query, pairs.numbered), indices[query], scores[query])
-
-
-def _join(of_query: Sequence[Matches | None], numbered: bool) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
-    """Matches of all candidates, one after the other, and their numbers."""
-    pairs = [None if each is None else Pair(per_match(each), each.image_size0, each.image_size1) for each in of_query]
-    no_points = np.zeros((0, 2), np.float32)
-    example = point_matches("", no_points, no_points, None, (1, 1), (1, 1))
-    empty = per_match(example) | (dict.fromkeys(INDICES, np.zeros(0, np.int32)) if numbered else {})
-    if not numbered:
-        return join_candidates(pairs, empty, None, None)
-    counts = [(0, 0) if each is None else (each.count0, each.count1) for each in of_query]
-    count0, count1 = np.array(counts, np.int32).reshape(-1, 2).T
-    return join_candidates(pairs, empty, count0.max(initial=0), count1)
+        counts = [(0, 0) if each is None else (each.count0, each.count1) for each in of_query]
+        count0, count1 = np.array(counts, np.int32).reshape(-1, 2).T if pairs.numbered else (None, None)
+        joined = join_candidates(
+            [None if each is None else Pair(per_match(each), each.image_size0, each.image_size1) for each in of_query],
+            no_matches,
+            None if count0 is None else count0.max(initial=0),
+            count1,
+        )
+        yield query, QueryMatches(*joined, indices[query], scores[query])

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from mfvpr.core.types import Matches, per_match, per_pair
-from mfvpr.utils import ragged
+from mfvpr.features.feature_set import few_capacities, pad_rows
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import available_cpus, round_up
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.numerics import available_cpus, repeat_last, round_up
+from mfvpr.utils.runtime import ordered_map
 
 BATCH_SLOTS = 2**14  # slots of a batch of pairs: its votes stay in the cache
 PAIRS_STEP = 8
@@ -24,6 +24,7 @@ QUANTILES = (0.25, 0.5, 0.75, 0.95, 1.0)
 BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
 
+Row = Mapping[str, np.ndarray]  # matches [n, ...] by field
 Normalize = Literal["zscore", "none"]
 
 
@@ -86,13 +87,17 @@ class MatchSet:
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
-        rows = [self._row(by_query[query], query, place) for query, place in pairs]
-        entries, mask = ragged.pad_rows(rows, capacity, total=total)
+        rows = []
+        for query, place in pairs:  # views
+            end = self._ends[query, place]
+            part = slice(end - self.counts[query, place], end)
+            rows.append({name: values[part] for name, values in per_match(by_query[query]).items()})
+        entries, mask = pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
             values = [getattr(by_query[query], name) for query, _ in pairs]
             if name.endswith("1"):  # of all candidates
                 values = [of_query[place] for of_query, (_, place) in zip(values, pairs, strict=True)]
-            entries[name] = ragged.repeat_last(np.stack(values), len(mask))
+            entries[name] = repeat_last(np.stack(values), len(mask))
         return Matches(**entries, mask=mask)
 
     @cached_property
@@ -100,18 +105,14 @@ class MatchSet:
         """End of each candidate's matches among the matches of its query."""
         return np.cumsum(self.counts, axis=1)
 
-    def _row(self, matches: Matches, query: int, place: int) -> ragged.Row:
-        """Views of the matches of one pair, out of the matches of its query."""
-        end = self._ends[query, place]
-        return {name: values[end - self.counts[query, place] : end] for name, values in per_match(matches).items()}
-
     @cached_property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Sizes of query and database images, in all combinations."""
-        sizes = [
-            [np.reshape(query.image_size0, (-1, 2)), np.reshape(query.image_size1, (-1, 2))] for query in self.matches
-        ]
-        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
+        sizes = ([query.image_size0, query.image_size1] for query in self.matches)
+        sizes0, sizes1 = (
+            np.unique(np.concatenate([np.reshape(size, (-1, 2)) for size in side]), axis=0)
+            for side in zip(*sizes, strict=True)
+        )
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
@@ -135,10 +136,8 @@ class Scales:
         shapes = {match_set.counts.shape for match_set in self.match_sets}
         if len(shapes) != 1:
             raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
-        if self.weights is not None and len(self.weights) != len(self.match_sets):
-            raise InputError(
-                f"scales: expected a weight for each of {len(self.match_sets)} scales, got {len(self.weights)}"
-            )
+        if self.weights is not None and len(self.weights) != (number := len(self.match_sets)):
+            raise InputError(f"scales: expected a weight for each of {number} scales, got {len(self.weights)}")
 
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
@@ -157,10 +156,10 @@ def slots(match_set: MatchSet, *, settings: float = math.inf) -> Int[np.ndarray,
 
     Few settings or a small set have fewer sizes: padding then costs less time than compiling for another size.
     """
-    sizes = ragged.sizes(match_set.counts, QUANTILES, SLOTS_STEP)
+    sizes = few_capacities(match_set.counts, QUANTILES, SLOTS_STEP)
     sizes[-1] = max(sizes[-1], match_set.capacity)
-    sizes = ragged.prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
-    return ragged.smallest_capacities(sizes, match_set.counts)
+    sizes = prune_capacities(sizes, match_set.counts, PROGRAM_SLOTS / settings)
+    return sizes[np.searchsorted(sizes, match_set.counts)]
 
 
 def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]:
@@ -199,8 +198,8 @@ def batches(
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
     """Number of queries, at least 1, with matches and scores that fit into BLOCK_BYTES."""
-    bytes_of_query = block_bytes(match_set, num_settings, 1)
-    return max(1, min(len(scales(match_set)[0]), BLOCK_BYTES // max(bytes_of_query, 1)))
+    fitting = BLOCK_BYTES // max(block_bytes(match_set, num_settings, 1), 1)
+    return max(1, min(len(scales(match_set)[0]), fitting))
 
 
 def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
@@ -215,4 +214,27 @@ def split_pairs(matches: Matches) -> list[dict[str, np.ndarray]]:
     """Real matches of each of the pairs `[P, K, ...]`, by field. NumPy."""
     mask = np.asarray(matches.mask)
     flat = {name: np.asarray(values)[mask] for name, values in per_match(matches).items()}
-    return ragged.split(flat, mask.sum(axis=1))
+    return split_rows(flat, mask.sum(axis=1))
+
+
+def split_rows(flat: Row, counts: Int[np.ndarray, " rows"]) -> list[dict[str, np.ndarray]]:
+    """Rows of lengths `counts`, as views of arrays that hold one row after the other."""
+    ends = np.cumsum(counts)
+    return [
+        {name: values[end - count : end] for name, values in flat.items()}
+        for count, end in zip(counts.tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def prune_capacities(
+    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
+) -> Int[np.ndarray, " _"]:
+    """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
+    lengths = counts[counts > 0]
+    while len(capacities) > 1:
+        rows = np.bincount(np.searchsorted(capacities, lengths), minlength=len(capacities))
+        saved = rows[:-1] * np.diff(capacities)
+        if saved.min() >= saving:
+            break
+        capacities = np.delete(capacities, saved.argmin())
+    return capacities

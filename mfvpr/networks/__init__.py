@@ -1,8 +1,8 @@
 """Networks as Flax NNX modules: arrays in, arrays out.
 
-Images are `[B, H, W, 3]` float32. With a lower `precision` of products than "highest", keypoints move.
+Images are `[B, H, W, 3]` float32. Products have full float32 precision: with less, keypoints move.
 
-Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, convolution, sampling, imagenet.
+Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, layers.
 """
 
 import lazy_loader

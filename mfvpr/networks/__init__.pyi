@@ -15,12 +15,9 @@ __all__ = [
 
 from .aliked import Aliked
 from .d2net import D2Net
-from .gem import Gem
 from .lightglue import LightGlue
 from .mixvpr import MixVPR
-from .netvlad import NetVlad, VggNetVlad
+from .netvlad import Gem, NetVlad, VggNetVlad
 from .resnet import ResNet50
-from .selavpr import SelaVpr
-from .ssm import SsmVgg
-from .vgg import Vgg16
-from .vit import VisionTransformer
+from .vgg import SsmVgg, Vgg16
+from .vit import SelaVpr, VisionTransformer

@@ -1,45 +1,44 @@
 """ALIKED (Zhao et al., IEEE TIM 2023): keypoints and descriptors from a light network with deformable convolutions.
 
 The outputs of four blocks at full, 1/2, 1/8 and 1/32 resolution are reduced to a common width, enlarged and
-concatenated: a feature for each pixel. Descriptors are sampled from the features of unit length (`aliked_description`).
-Four small convolutions turn the features into a score map, whose peaks are the keypoints (`aliked_detection`).
+concatenated: a feature for each pixel. Four small convolutions turn the features into a score map, whose peaks are the
+keypoints (`detect`). Descriptors are sampled from the features of unit length (`Field`, `DescriptorHead`).
 """
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.aliked_description import DescriptorHead, field
-from mfvpr.networks.aliked_detection import Detections, detect
-from mfvpr.networks.imagenet import Images
-from mfvpr.networks.sampling import sample, upsample
+from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
+from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import over_batch
 
 STRIDE = 32  # px, of the coarsest map
-_POOLING = (1, 2, 4, 4)  # factors before the blocks
-_PIXELS = 4  # per step of `_narrow`; divides STRIDE
-
-
+RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
 VARIANTS = {  # published networks: widths of the blocks, numbers and sampling positions of a descriptor
     "aliked-t16": ((8, 16, 32, 64), 64, 16),
     "aliked-n16": ((16, 32, 64, 128), 128, 16),
     "aliked-n16rot": ((16, 32, 64, 128), 128, 16),
     "aliked-n32": ((16, 32, 64, 128), 128, 32),
 }
+_POOLING = (1, 2, 4, 4)  # factors before the blocks
+_PIXELS = 4  # per step of `_narrow`; divides STRIDE
+_CHUNK = 256  # keypoints per step of the descriptors
+_TEMPERATURE = 0.1  # of the refinement
 
 
 class DeformableConv(nnx.Module):
     """3 x 3 convolution with offsets of its nine taps from another convolution; zeros outside, no bias."""
 
-    def __init__(self, inputs: int, outputs: int, *, precision: str, rngs: nnx.Rngs) -> None:
-        init = nnx.initializers.lecun_normal()
-        self.kernel = nnx.Param(init(rngs.params(), (3, 3, inputs, outputs)))
-        self.offset = nnx.Conv(inputs, 18, (3, 3), padding=1, precision=precision, rngs=rngs)
-        self.precision = precision
+    def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs) -> None:
+        self.kernel = nnx.Param(nnx.initializers.lecun_normal()(rngs.params(), (3, 3, inputs, outputs)))
+        self.offset = conv(inputs, 18, use_bias=True, rngs=rngs)
 
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
         """Convolve a map; taps move by a quarter of the longer side at most.
@@ -55,7 +54,7 @@ class DeformableConv(nnx.Module):
 
         def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
             points, kernel = tap
-            return total + jnp.matmul(over_batch(sample)(x, points), kernel, precision=self.precision), None
+            return total + matmul(over_batch(sample)(x, points), kernel), None
 
         kernels = self.kernel[...].reshape(9, inputs, -1)
         total = jnp.zeros((*x.shape[:3], kernels.shape[-1]), x.dtype)
@@ -65,17 +64,11 @@ class DeformableConv(nnx.Module):
 class Block(nnx.Module):
     """Two 3 x 3 convolutions with batch normalization and SELU; an optional shortcut before the last SELU."""
 
-    def __init__(
-        self, inputs: int, outputs: int, *, deformable: bool, shortcut: bool, precision: str, rngs: nnx.Rngs
-    ) -> None:
-        def conv(inputs: int, outputs: int) -> nnx.Module:
-            if deformable:
-                return DeformableConv(inputs, outputs, precision=precision, rngs=rngs)
-            return _conv(inputs, outputs, precision=precision, rngs=rngs)
-
-        self.conv1, self.conv2 = conv(inputs, outputs), conv(outputs, outputs)
-        self.bn1, self.bn2 = (nnx.BatchNorm(outputs, use_running_average=True, rngs=rngs) for _ in range(2))
-        self.shortcut = nnx.Conv(inputs, outputs, (1, 1), precision=precision, rngs=rngs) if shortcut else None
+    def __init__(self, inputs: int, outputs: int, *, deformable: bool, shortcut: bool, rngs: nnx.Rngs) -> None:
+        convolution = DeformableConv if deformable else conv
+        self.conv1, self.conv2 = (convolution(width, outputs, rngs=rngs) for width in (inputs, outputs))
+        self.bn1, self.bn2 = (BatchNorm(outputs, rngs=rngs) for _ in range(2))
+        self.shortcut = conv(inputs, outputs, 1, use_bias=True, rngs=rngs) if shortcut else None
 
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
         out = self.bn2(self.conv2(nnx.selu(self.bn1(self.conv1(x)))))
@@ -92,20 +85,18 @@ class Aliked(nnx.Module):
         InputError: there is no such variant.
     """
 
-    def __init__(self, variant: str = "aliked-n16", *, precision: str = "highest", rngs: nnx.Rngs) -> None:
+    def __init__(self, variant: str = "aliked-n16", *, rngs: nnx.Rngs) -> None:
         if variant not in VARIANTS:
             raise InputError(f"ALIKED: expected one of {', '.join(VARIANTS)}, got {variant}")
         widths, self.dimension, positions = VARIANTS[variant]
-        options = {"precision": precision, "rngs": rngs}
         inputs = 3
         for place, width in enumerate(widths, start=1):
-            block = Block(inputs, width, deformable=place > 2, shortcut=place > 1, **options)
-            setattr(self, f"block{place}", block)
-            setattr(self, f"conv{place}", _conv(width, self.dimension // 4, 1, **options))
+            setattr(self, f"block{place}", Block(inputs, width, deformable=place > 2, shortcut=place > 1, rngs=rngs))
+            setattr(self, f"conv{place}", conv(width, self.dimension // 4, 1, rngs=rngs))
             inputs = width
         steps = ((self.dimension, 8, 1), (8, 4, 3), (4, 4, 3), (4, 1, 3))
-        self.score_head = nnx.List([_conv(*step, **options) for step in steps])
-        self.desc_head = DescriptorHead(self.dimension, positions, precision=precision, rngs=rngs)
+        self.score_head = nnx.List([conv(*step, rngs=rngs) for step in steps])
+        self.desc_head = DescriptorHead(self.dimension, positions, rngs=rngs)
 
     def __call__(
         self, images: Images
@@ -117,21 +108,9 @@ class Aliked(nnx.Module):
         levels, scores = self.levels(images)
         return jax.vmap(lambda levels: field(levels, *_inside(images)).dense())(levels), scores
 
-    def levels(
-        self, images: Images
-    ) -> tuple[list[Float[Array, "batch _ _ channels"]], Float[Array, "batch height width"]]:
-        """Parts of the features at each resolution of the padded images, and scores."""
-        (top, bottom), (left, right) = (_margins(size) for size in images.shape[1:3])
-        x = jnp.pad(images, ((0, 0), (top, bottom), (left, right), (0, 0)), mode="edge")
-        levels = []
-        for place, factor in enumerate(_POOLING, start=1):
-            x = getattr(self, f"block{place}")(_average_pool(x, factor))
-            levels.append(nnx.selu(getattr(self, f"conv{place}")(x)))
-        return levels, self._scores(levels)[:, *_inside(images)]
-
     def extract(
         self, images: Images, threshold: Array | float, capacity: int
-    ) -> tuple[Detections, Float[Array, "batch slots dimensions"]]:
+    ) -> tuple["Detections", Float[Array, "batch slots dimensions"]]:
         """Keypoints of images, and their descriptors of unit length."""
         levels, scores = self.levels(images)
 
@@ -141,6 +120,22 @@ class Aliked(nnx.Module):
 
         return over_batch(extract_one)(levels, scores)
 
+    def levels(
+        self, images: Images
+    ) -> tuple[list[Float[Array, "batch _ _ channels"]], Float[Array, "batch height width"]]:
+        """Parts of the features at each resolution of the padded images, and scores."""
+        rows, columns = _inside(images)
+        height, width = (-(-size // STRIDE) * STRIDE for size in images.shape[1:3])
+        margins = (rows.start, height - rows.stop), (columns.start, width - columns.stop)
+        x = jnp.pad(images, ((0, 0), *margins, (0, 0)), mode="edge")
+        levels = []
+        for place, factor in enumerate(_POOLING, start=1):
+            batch, height, width, channels = x.shape
+            x = x.reshape(batch, height // factor, factor, width // factor, factor, channels).mean(axis=(2, 4))
+            x = getattr(self, f"block{place}")(x)
+            levels.append(nnx.selu(getattr(self, f"conv{place}")(x)))
+        return levels, self._scores(levels)[:, rows, columns]
+
     def _scores(self, levels: list[Array]) -> Float[Array, "batch height width"]:
         """Scores of the padded images."""
         # The first convolution (1 x 1) and the enlargement are linear: it runs first, so that 8 channels are enlarged.
@@ -148,20 +143,14 @@ class Aliked(nnx.Module):
         parts = jnp.split(first.kernel[0, 0], len(levels))
         total = jnp.zeros((), levels[0].dtype)
         for level, part in zip(levels, parts, strict=True):
-            product = jnp.matmul(level, part, precision=first.precision)
-            total += upsample(product, levels[0].shape[1] // level.shape[1])
-        for conv in convolutions:
-            total = _narrow(conv, nnx.selu(total))
+            total += stretch(matmul(level, part), *levels[0].shape[1:3])
+        for convolution in convolutions:
+            total = _narrow(convolution, nnx.selu(total))
         return nnx.sigmoid(total[..., 0])
 
 
-def _conv(inputs: int, outputs: int, size: int = 3, *, precision: str, rngs: nnx.Rngs) -> nnx.Conv:
-    """Convolution without bias that keeps the size of a map."""
-    return nnx.Conv(inputs, outputs, (size, size), padding=size // 2, use_bias=False, precision=precision, rngs=rngs)
-
-
-def _narrow(conv: nnx.Conv, x: Array) -> Array:
-    """`conv(x)` for a 3 x 3 convolution with few channels, computed on groups of `_PIXELS` pixels of a row.
+def _narrow(convolution: nnx.Conv, x: Array) -> Array:
+    """`convolution(x)` of 3 x 3 px with few channels, computed on groups of `_PIXELS` pixels of a row.
 
     The pixels of a group become channels, and the kernel is padded with zeros. A CPU processes many channels at once,
     so this takes half of the time.
@@ -170,30 +159,238 @@ def _narrow(conv: nnx.Conv, x: Array) -> Array:
     group, source, target = np.indices((3, _PIXELS, _PIXELS))
     column = (group - 1) * _PIXELS + source - target + 1  # of the kernel, from pixel `source` of a group to `target`
     selection = (column[..., None] == np.arange(3)).astype(np.float32)
-    kernel = jnp.einsum("bstx,yxio->ybsito", selection, conv.kernel[...], precision=conv.precision)
-    out = jax.lax.conv_general_dilated(
-        x.reshape(batch, height, width // _PIXELS, _PIXELS * inputs),
-        kernel.reshape(3, 3, _PIXELS * inputs, -1),
-        window_strides=(1, 1),
-        padding="SAME",
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=conv.precision,
-    )
+    kernel = jnp.einsum("bstx,yxio->ybsito", selection, convolution.kernel[...], precision=PRECISION)
+    kernel = kernel.reshape(3, 3, _PIXELS * inputs, -1)
+    x = x.reshape(batch, height, width // _PIXELS, _PIXELS * inputs)
+    axes = ("NHWC", "HWIO", "NHWC")
+    out = jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=axes, precision=PRECISION)
     return out.reshape(batch, height, width, -1)
 
 
 def _inside(images: Array) -> tuple[slice, slice]:
     """Rows and columns of images within the padded images."""
-    (top, _), (left, _) = (_margins(size) for size in images.shape[1:3])
-    return slice(top, top + images.shape[1]), slice(left, left + images.shape[2])
+    height, width = images.shape[1:3]
+    top, left = (-size % STRIDE // 2 for size in (height, width))
+    return slice(top, top + height), slice(left, left + width)
 
 
-def _margins(size: int) -> tuple[int, int]:
-    """Pixels of padding before and after a side of this size."""
-    missing = -size % STRIDE
-    return missing // 2, missing - missing // 2
+class Level(NamedTuple):
+    """One map of a field, already enlarged in height; `columns` enlarge it in width."""
+
+    rows: Float[Array, "height _ channels"]
+    columns: Neighbors | None  # None if the rows have full width
 
 
-def _average_pool(x: Array, factor: int) -> Array:
-    batch, height, width, channels = x.shape
-    return x.reshape(batch, height // factor, factor, width // factor, factor, channels).mean(axis=(2, 4))
+class Field(NamedTuple):
+    """Features of all pixels, of unit length, computed only at requested pixels.
+
+    Descriptors need about half of the pixels, and the features of 320 x 320 px take 52 MB.
+    """
+
+    levels: tuple[Level, ...]
+    inverse_norm: Float[Array, "height width"]
+
+    def at(self, y: Int[Array, " pixels"], x: Int[Array, " pixels"]) -> Float[Array, "pixels dimensions"]:
+        """Features of pixels; 0 outside."""
+        height, width = self.inverse_norm.shape
+        inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        weight = jnp.where(inside, jnp.ones((), self.inverse_norm.dtype), 0)
+        y, x = jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1)
+        return jnp.concatenate(self._weighted_parts(y, x, weight), axis=-1)
+
+    def sample(self, points: Float[Array, "points 2"]) -> Float[Array, "points dimensions"]:
+        """Features at positions (x, y) px, bilinear; 0 outside."""
+        corners = [self._weighted_parts(*corner) for corner in around(points, *self.inverse_norm.shape)]
+        return jnp.concatenate([sum(parts[1:], start=parts[0]) for parts in zip(*corners, strict=True)], axis=-1)
+
+    def _weighted_parts(
+        self, y: Int[Array, " pixels"], x: Int[Array, " pixels"], weight: Float[Array, " pixels"]
+    ) -> list[Float[Array, "pixels _"]]:
+        """Parts of each level for the features of pixels inside the image, times `weight`."""
+        # Sums of separate parts are several times faster than sums of concatenated features.
+        weight *= _rows_at(self.inverse_norm.reshape(-1), y * self.inverse_norm.shape[1] + x)
+        parts = []
+        for rows, columns in self.levels:
+            flat, start = rows.reshape(-1, rows.shape[-1]), y * rows.shape[1]
+            if columns is None:
+                parts.append(weight[:, None] * _rows_at(flat, start + x))
+            else:
+                lower, upper, part = (jnp.asarray(values)[x] for values in columns)
+                before, after = _rows_at(flat, start + lower), _rows_at(flat, start + upper)
+                parts.append((weight * (1 - part))[:, None] * before + (weight * part)[:, None] * after)
+        return parts
+
+    def dense(self) -> Float[Array, "height width dimensions"]:
+        """All features."""
+        return jnp.concatenate(_enlarge(self.levels), axis=-1) * self.inverse_norm[..., None]
+
+
+def field(levels: Sequence[Float[Array, "_ _ channels"]], rows: slice, columns: slice) -> Field:
+    """Field of levels, the first of full size, cropped to `rows` and `columns`."""
+    height, width = levels[0].shape[:2]
+    parts = [Level(levels[0][rows, columns], None)]
+    for level in levels[1:]:
+        down, right = neighbors(level.shape[0], height, rows), neighbors(level.shape[1], width, columns)
+        parts.append(Level(between(level, down, -3), right))
+    squares = [jnp.sum(part * part, axis=-1) for part in _enlarge(parts)]
+    return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), EPSILON))
+
+
+def _enlarge(levels: Sequence[Level]) -> list[Array]:
+    return [rows if columns is None else between(rows, columns, -2) for rows, columns in levels]
+
+
+def _rows_at(rows: Array, places: Array) -> Array:
+    return rows.at[places].get(mode="promise_in_bounds")
+
+
+class DescriptorHead(nnx.Module):
+    """Samples features at `positions` places per keypoint, which depend on its 3 x 3 neighborhood."""
+
+    def __init__(self, dimension: int, positions: int, *, rngs: nnx.Rngs) -> None:
+        moves = 2 * positions
+        self.offset1 = conv(dimension, moves, use_bias=True, rngs=rngs)
+        self.offset2 = conv(moves, moves, 1, use_bias=True, rngs=rngs)
+        self.sample = conv(dimension, dimension, 1, rngs=rngs)
+        initial = nnx.initializers.lecun_normal()
+        self.agg_weights = nnx.Param(initial(rngs.params(), (positions, dimension, dimension)))
+
+    def __call__(
+        self, features: Field, keypoints: Float[Array, "slots 2"], count: int | Int[Array, ""]
+    ) -> Float[Array, "slots dimensions"]:
+        """Descriptors of unit length of keypoints (x, y) px; only the first `count` are valid.
+
+        Runs chunk by chunk, so that unused slots cost nothing.
+        """
+        slots, dimension = len(keypoints), self.agg_weights.shape[-1]
+        keypoints = jnp.pad(keypoints, ((0, -slots % _CHUNK), (0, 0)))
+
+        def describe(chunk: Array, descriptors: Array) -> Array:
+            start = chunk * _CHUNK
+            new = self._describe(features, jax.lax.dynamic_slice_in_dim(keypoints, start, _CHUNK))
+            return jax.lax.dynamic_update_slice_in_dim(descriptors, new, start, axis=0)
+
+        chunks = -(-jnp.minimum(count, slots) // _CHUNK)
+        start = jnp.zeros((len(keypoints), dimension), keypoints.dtype)
+        return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
+
+    def _describe(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "slots dimensions"]:
+        """Descriptors of all keypoints, place by place, so that intermediate values stay in the CPU's caches."""
+
+        def add(total: Array, place: tuple[Array, Array]) -> tuple[Array, None]:
+            move, mixing = place
+            sampled = nnx.selu(matmul(features.sample(keypoints + move), self.sample.kernel[0, 0]))
+            return total + matmul(sampled, mixing), None
+
+        start = jnp.zeros((len(keypoints), self.agg_weights.shape[-1]), keypoints.dtype)
+        descriptors, _ = jax.lax.scan(add, start, (self._moves(features, keypoints), self.agg_weights[...]))
+        return of_unit_length(descriptors)
+
+    def _moves(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "positions slots 2"]:
+        """Offsets (x, y) px of the places, a quarter of the longer side at most.
+
+        Neighborhoods beyond the border are zero, as in the original's compiled operator. (The original's fallback in
+        Python moves them inside instead.)
+        """
+        column, row = keypoints.astype(int).T  # truncated
+        reach = jnp.arange(-1, 2)
+        steps = jnp.stack(jnp.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(9, 2)
+
+        def add(total: Array, neighbor: tuple[Array, Array]) -> tuple[Array, None]:
+            step, kernel = neighbor
+            return total + matmul(features.at(row + step[0], column + step[1]), kernel), None
+
+        kernels = self.offset1.kernel[...].reshape(9, -1, self.offset1.out_features)
+        hidden, _ = jax.lax.scan(add, jnp.zeros((len(keypoints), kernels.shape[-1]), keypoints.dtype), (steps, kernels))
+        hidden = nnx.selu(hidden + bias_of(self.offset1)[None])
+        moves = matmul(hidden, self.offset2.kernel[0, 0]) + bias_of(self.offset2)[None]
+        limit = max(features.inverse_norm.shape) / 4
+        return jnp.clip(moves, -limit, limit).reshape(len(keypoints), 2, -1).transpose(2, 0, 1)
+
+
+class Detections(NamedTuple):
+    """Keypoints of one image, ordered by row, or by score if there are more than slots."""
+
+    keypoints: Float[Array, "slots 2"]  # (x, y) px
+    scores: Float[Array, " slots"]
+    mask: Bool[Array, " slots"]  # True on the first ones
+    count: Int[Array, ""]  # number of peaks; if above the slots, those with the lowest scores are missing
+
+
+def detect(score_map: Float[Array, "height width"], threshold: Array | float, capacity: int) -> Detections:
+    """Peaks of a map above `threshold`, refined to fractions of a pixel, in min(capacity, height * width) slots.
+
+    If no peak is above it, or `threshold` is 0, the map's mean is the threshold. (The original takes the mean if the
+    whole batch has no peak.)
+    """
+    width = score_map.shape[1]
+    scores, peaks = score_map.reshape(-1), _peaks(score_map).reshape(-1)
+    above = peaks & (scores > threshold) & (threshold > 0)
+    valid = jnp.where(jnp.any(above), above, peaks & (scores > jnp.mean(scores)))
+    count = jnp.sum(valid)
+    capacity = min(capacity, valid.size)
+    row_order = -jnp.arange(valid.size, dtype=scores.dtype)
+    key, place = jax.lax.top_k(jnp.where(valid, jnp.where(count > capacity, scores, row_order), -jnp.inf), capacity)
+    keypoints = _refine(score_map, place // width, place % width)
+    return Detections(keypoints, sample(score_map[..., None], keypoints)[..., 0], key > -jnp.inf, count)
+
+
+def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
+    """Local maxima, and in two more rounds those outside the neighborhoods of maxima; no border."""
+    is_peak = scores == _local_maximum(scores)
+    for _ in range(2):
+        suppressed = _local_maximum(is_peak)
+        remaining = jnp.where(suppressed, 0, scores)
+        is_peak |= (remaining == _local_maximum(remaining)) & ~suppressed
+    inside = [(jnp.arange(size) >= RADIUS) & (jnp.arange(size) < size - RADIUS) for size in scores.shape]
+    return is_peak & inside[0][:, None] & inside[1][None, :]
+
+
+def _local_maximum(values: Array) -> Array:
+    """Maximum around each pixel. Slices along each axis are faster than a window reduction."""
+    lowest = False if values.dtype == bool else -jnp.inf
+    for axis, size in enumerate(values.shape):
+        margin = [(0, 0), (0, 0)]
+        margin[axis] = (RADIUS, RADIUS)
+        padded = jnp.pad(values, margin, constant_values=lowest)
+        for shift in range(2 * RADIUS + 1):
+            values = jnp.maximum(values, jax.lax.slice_in_dim(padded, shift, shift + size, axis=axis))
+    return values
+
+
+def _refine(
+    score_map: Float[Array, "height width"], row: Int[Array, " slots"], column: Int[Array, " slots"]
+) -> Float[Array, "slots 2"]:
+    """Mean position (x, y) px around each peak, weighted by a softmax of the scores."""
+    height, width = score_map.shape
+    reach = jnp.arange(2 * RADIUS + 1)
+    padded = jnp.pad(score_map, RADIUS)
+    patches = padded[row[:, None, None] + reach[None, :, None], column[:, None, None] + reach[None, None, :]]
+    weights = jnp.exp((patches - jnp.max(patches, axis=(1, 2), keepdims=True)) / _TEMPERATURE)
+    total = jnp.sum(weights, axis=(1, 2))
+    away = (reach - RADIUS).astype(weights.dtype)
+    x = column.astype(weights.dtype) + jnp.sum(weights * away[None, None, :], axis=(1, 2)) / total
+    y = row.astype(weights.dtype) + jnp.sum(weights * away[None, :, None], axis=(1, 2)) / total
+    return jnp.stack([_there_and_back(x, width, total), _there_and_back(y, height, total)], axis=-1)
+
+
+def _there_and_back(position: Array, size: int, total: Array) -> Array:
+    """Scale a position to [-1, 1] and back, with the rounding of the original.
+
+    Whole numbers may become a little smaller, and the descriptor truncates them. For a divisor that all positions
+    share, XLA multiplies by the reciprocal, which rounds differently. A divisor that depends on `total` prevents this:
+    `total` is always positive, which XLA cannot know.
+    """
+    last = jnp.where(total > 0, jnp.asarray(size - 1, position.dtype), 1)
+    return ((position / last * 2 - 1) / 2 + 0.5) * last
+
+
+def over_batch(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.vmap(function)`; a batch of one goes without it, which takes a third of the time to trace."""
+
+    def call(*batch: Any) -> Any:
+        if len(jax.tree.leaves(batch)[0]) != 1:
+            return jax.vmap(function)(*batch)
+        return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], batch)))
+
+    return call

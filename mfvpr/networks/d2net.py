@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, Pixels, Preprocessing, of_unit_length, preprocess
-from mfvpr.networks.sampling import between, neighbors
+from mfvpr.networks.layers import Images, Pixels, Preprocessing, of_unit_length, preprocess
+from mfvpr.networks.sampling import sample, stretch
 from mfvpr.networks.vgg import Vgg16
 
 STRIDE = 4  # px between positions of the map
@@ -28,20 +28,17 @@ _EDGE_THRESHOLD = 5  # largest ratio of the principal curvatures
 
 
 class D2Net(nnx.Module):
-    """VGG16 to `conv4_3`. The third pooling only smooths, so the stride stays 4, and block 4 is dilated instead.
+    """VGG16 to `conv4_3` and a ReLU.
 
-    The published network ends with a ReLU (`relu`).
+    The third pooling only smooths, so the stride stays 4, and block 4 is dilated instead.
     """
 
-    def __init__(self, *, relu: bool = True, precision: str = "highest", rngs: nnx.Rngs) -> None:
-        pools = ("max", "max", "average")
-        self.vgg = Vgg16("conv4_3", pools=pools, dilations=(1, 1, 1, 2), precision=precision, rngs=rngs)
-        self.relu = relu
+    def __init__(self, *, rngs: nnx.Rngs) -> None:
+        self.vgg = Vgg16("conv4_3", pools=("max", "max", "average"), dilations=(1, 1, 1, 2), rngs=rngs)
 
     def __call__(self, images: Images) -> Float[Array, "batch height//4-1 width//4-1 512"]:
         """Dense maps of preprocessed images."""
-        dense = self.vgg(images, uniform=_repeats(images))
-        return nnx.relu(dense) if self.relu else dense
+        return nnx.relu(self.vgg(images, uniform=_repeats(images)))
 
 
 def _repeats(images: Images) -> Bool[Array, ""]:
@@ -109,7 +106,7 @@ def extract(
     pixels = preprocess(images, preprocessing)
     height, width = images.shape[1:3]
     sizes = [(int(height * scale), int(width * scale)) for scale in scales]
-    maps = [model(_stretch(_stretch(pixels, columns, axis=2), rows, axis=1)) for rows, columns in sizes]
+    maps = [model(stretch(pixels, rows, columns)) for rows, columns in sizes]
     ratios = [(width / columns, height / rows) for rows, columns in sizes]
     return jax.vmap(lambda levels: detect(levels, ratios, share))(maps)
 
@@ -122,18 +119,15 @@ def detect(
     """Keypoints of one image from its dense maps, one for each scale, the smallest first.
 
     A map with keypoints is added to the next map. Positions that one map detects are not detected in later maps. Scores
-    of the n-th map are divided by n.
-
-    Args:
-        ratios: (width, height) of the image, divided by those of each scale.
-        share: slots per position of a map; 1 has room for all keypoints.
+    of the n-th map are divided by n. `ratios` are (width, height) of the image, divided by those of each scale; `share`
+    as in `extract`.
     """
     detections: list[Detections] = []
     coarser = detected = None
     for dense, ratio in zip(maps, ratios, strict=True):
         rows, columns, _ = dense.shape
         if coarser is not None:
-            dense = dense + _stretch(_stretch(coarser, columns, axis=1), rows, axis=0)
+            dense = dense + stretch(coarser, rows, columns)
         seen = survey(dense)
         if detected is not None:
             detected = detected[_nearest(len(detected), rows)][:, _nearest(detected.shape[1], columns)]
@@ -144,6 +138,12 @@ def detect(
         scaled = level.keypoints * jnp.array(ratio, jnp.float32)[None]
         detections.append(level._replace(keypoints=scaled, scores=level.scores / (len(detections) + 1)))
     return tuple(detections)
+
+
+def _nearest(length: int, size: int) -> Int[np.ndarray, " {size}"]:
+    """Indices below `length`, evenly spread and rounded down."""
+    position = np.arange(size, dtype=np.float32) * (np.float32(length) / np.float32(size))
+    return np.minimum(np.floor(position).astype(int), length - 1)
 
 
 def survey(dense: Float[Array, "height width channels"]) -> Survey:
@@ -165,25 +165,15 @@ def survey(dense: Float[Array, "height width channels"]) -> Survey:
             value = dense[row, column, channel]
             around[down, right] = jnp.where(inside, value, 0)
             is_peak &= ~inside | (value <= score)
-    passes, step = _parabola(around)
-    return Survey(channel, score, is_peak & passes, step)
-
-
-def _parabola(
-    around: dict[tuple[int, int], Float[Array, "height width"]],
-) -> tuple[Bool[Array, "height width"], Float[Array, "height width 2"]]:
-    """Whether a position is no edge, and the step to the maximum, from the values at (down, right) of the position."""
-    center = around[0, 0]
-    ii = around[-1, 0] - 2 * center + around[1, 0]
-    jj = around[0, -1] - 2 * center + around[0, 1]
+    # Derivatives by row and column: the curvatures tell an edge, a Newton step leads to the parabola's maximum.
+    ii = around[-1, 0] - 2 * around[0, 0] + around[1, 0]
+    jj = around[0, -1] - 2 * around[0, 0] + around[0, 1]
     ij = (around[-1, -1] - around[-1, 1] - around[1, -1] + around[1, 1]) / 4
-    i = (around[1, 0] - around[-1, 0]) / 2
-    j = (around[0, 1] - around[0, -1]) / 2
-    det = ii * jj - ij * ij
-    trace = ii + jj
+    i, j = (around[1, 0] - around[-1, 0]) / 2, (around[0, 1] - around[0, -1]) / 2
+    det, trace = ii * jj - ij * ij, ii + jj
     is_blob = (det > 0) & (trace * trace / det <= (_EDGE_THRESHOLD + 1) ** 2 / _EDGE_THRESHOLD)
     step = jnp.stack([ij / det * j - jj / det * i, ij / det * i - ii / det * j], axis=-1)
-    return is_blob, step
+    return Survey(channel, score, is_peak & is_blob, step)
 
 
 def select(dense: Float[Array, "height width channels"], seen: Survey, capacity: int) -> Detections:
@@ -201,40 +191,11 @@ def select(dense: Float[Array, "height width channels"], seen: Survey, capacity:
     _, strongest = lax.top_k(jnp.where(valid, seen.score.reshape(-1), -jnp.inf), min(capacity, valid.size))
     order = jnp.sort(jnp.where(valid, order, jnp.iinfo(order.dtype).max)[strongest])
     place = order % valid.size
-    position = position.reshape(-1, 2)[place]
+    points = position.reshape(-1, 2)[place][:, ::-1]
     return Detections(
-        keypoints=position[:, ::-1] * STRIDE + 1.5,
-        descriptors=_interpolate(dense, position),
+        keypoints=points * STRIDE + 1.5,
+        descriptors=of_unit_length(sample(dense, points)),
         scores=seen.score.reshape(-1)[place],
         mask=order < jnp.iinfo(order.dtype).max,
         count=jnp.sum(valid),
     )
-
-
-def _interpolate(
-    dense: Float[Array, "height width channels"], position: Float[Array, "slots 2"]
-) -> Float[Array, "slots channels"]:
-    """Vectors of unit length of a map at positions, bilinear."""
-    low, high = jnp.floor(position), jnp.ceil(position)
-    after = position - low
-    before = 1 - after
-    (top, left), (bottom, right) = low.astype(int).T, high.astype(int).T
-    vectors = (
-        (before[:, 0] * before[:, 1])[:, None] * dense[top, left]
-        + (before[:, 0] * after[:, 1])[:, None] * dense[top, right]
-        + (after[:, 0] * before[:, 1])[:, None] * dense[bottom, left]
-        + (after[:, 0] * after[:, 1])[:, None] * dense[bottom, right]
-    )
-    return of_unit_length(vectors)
-
-
-def _stretch(values: Array, size: int, *, axis: int) -> Array:
-    """Linear interpolation to `size` values along an axis; the first and last values stay."""
-    length = values.shape[axis]
-    return values if size == length else between(values, neighbors(length, size), axis)
-
-
-def _nearest(length: int, size: int) -> Int[np.ndarray, " {size}"]:
-    """Indices below `length`, evenly spread and rounded down."""
-    position = np.arange(size, dtype=np.float32) * (np.float32(length) / np.float32(size))
-    return np.minimum(np.floor(position).astype(int), length - 1)

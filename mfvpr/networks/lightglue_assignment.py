@@ -3,7 +3,6 @@
 Masked keypoints do not affect other keypoints, and their own states are meaningless.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -51,29 +50,21 @@ class Block(NamedTuple):
         return states + self.update(jax.nn.gelu(hidden, approximate=False))
 
 
-class Rotation(NamedTuple):
-    """Rotary position encoding: cosines and sines of angles that turn pairs of numbers of a head."""
+def within(
+    block: Block, states: States, mask: Bool[Array, " keypoints"], rotation: Float[Array, "2 keypoints angles"]
+) -> States:
+    """States after self-attention of the keypoints of one image, masked by `mask`.
 
-    cosine: Float[Array, "keypoints angles"]
-    sine: Float[Array, "keypoints angles"]
+    The rotation encodes positions: cosines and sines of angles that turn pairs of numbers of a head, half a head apart.
+    """
+    queries, keys, values = _heads(block.inputs(states), 3, 2 * rotation.shape[2])
+    cosine, sine = rotation[:, None]
 
-    @classmethod
-    def of(cls, positions: Float[Array, "keypoints 2"], frequencies: Float[Array, "2 angles"]) -> "Rotation":
-        """Rotation for positions and frequencies."""
-        angles = product(positions, frequencies)
-        return cls(jnp.cos(angles), jnp.sin(angles))
-
-    def __call__(self, values: Heads) -> Heads:
-        """Turn values; the first half of each head is paired with the second."""
-        first, second = jnp.split(values, 2, axis=-1)
-        cosine, sine = self.cosine[None], self.sine[None]
+    def rotate(numbers: Heads) -> Heads:
+        first, second = jnp.split(numbers, 2, axis=-1)
         return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
 
-
-def within(block: Block, states: States, mask: Bool[Array, " keypoints"], rotation: Rotation) -> States:
-    """States after self-attention of the keypoints of one image, masked by `mask`."""
-    queries, keys, values = _heads(block.inputs(states), 3, 2 * rotation.cosine.shape[1])
-    weights, total = _weights(product(rotation(queries), rotation(keys).swapaxes(1, 2)), mask, 2)
+    weights, total = _weights(product(rotate(queries), rotate(keys).swapaxes(1, 2)), mask, 2)
     return block.update_states(states, product(weights, values) / total)
 
 
@@ -146,20 +137,27 @@ def assignment(
     Returns:
         At most 0; -inf if either keypoint is padding, or its descriptor or position is not finite.
     """
-    sides = _finite(features0), _finite(features1)
-    masks = [side.mask for side in sides]
-    rotations = [Rotation.of(_normalize(side), weights.frequencies) for side in sides]
+    sides = _side(features0, weights.frequencies), _side(features1, weights.frequencies)
+    masks = sides[0].mask, sides[1].mask
     num_layers, head = len(weights.layers.projection.bias), 2 * weights.frequencies.shape[1]
 
     def run_layer(progress: _Progress) -> _Progress:
         layer = _at(weights.layers, progress.layers)
-        states0, states1 = (within(layer.within, *side) for side in zip(progress.states, masks, rotations, strict=True))
-        states = across(layer.across, (states0, states1), (masks[0], masks[1]), head)
+        states0, states1 = (
+            within(layer.within, states, side.mask, side.rotation)
+            for states, side in zip(progress.states, sides, strict=True)
+        )
+        states = across(layer.across, (states0, states1), masks, head)
         done = jnp.zeros((), bool)
         if depth_confidence is not None:
             threshold = 0.8 + 0.1 * jnp.exp(-4 * progress.layers.astype(states[0].dtype) / num_layers)
             confidence = _at(weights.confidences, progress.layers)
-            done = _confident_share(confidence, states, masks, threshold) > depth_confidence
+            unsure = [
+                jnp.sum(mask & (jax.nn.sigmoid(confidence(side)[:, 0]) < threshold))
+                for side, mask in zip(states, masks, strict=True)
+            ]
+            total = jnp.maximum(jnp.sum(masks[0]) + jnp.sum(masks[1]), 1)
+            done = 1 - (unsure[0] + unsure[1]) / total > depth_confidence
         return _Progress(progress.layers + 1, states, done)
 
     def is_running(progress: _Progress) -> Array:
@@ -167,8 +165,35 @@ def assignment(
 
     inputs = weights.input(sides[0].descriptors), weights.input(sides[1].descriptors)
     start = _Progress(jnp.zeros((), jnp.int32), inputs, jnp.zeros((), bool))
-    layers, states, _ = jax.lax.while_loop(is_running, run_layer, start)
-    return _assignment(_at(weights.layers, layers - 1), *states, *masks)
+    layers, (states0, states1), _ = jax.lax.while_loop(is_running, run_layer, start)
+
+    layer = _at(weights.layers, layers - 1)
+    similarity = product(layer.projection(states0), layer.projection(states1).T)
+    real = masks[0][:, None] & masks[1][None]
+    similarity = jnp.where(real, similarity, jnp.finfo(similarity.dtype).min)  # -inf gives NaN if none is real
+    matchable0, matchable1 = (jax.nn.log_sigmoid(layer.matchability(states)[:, 0]) for states in (states0, states1))
+    both = jax.nn.log_softmax(similarity, axis=0) + jax.nn.log_softmax(similarity, axis=1)
+    return masked(both + matchable0[:, None] + matchable1[None], real, -jnp.inf)
+
+
+class _Side(NamedTuple):
+    """Keypoints of one image."""
+
+    descriptors: Float[Array, "keypoints dimensions"]
+    mask: Bool[Array, " keypoints"]
+    rotation: Float[Array, "2 keypoints angles"]
+
+
+def _side(features: Features, frequencies: Float[Array, "2 angles"]) -> _Side:
+    """Mask features with values that are not finite, and set masked values to zero.
+
+    The rotation is by positions in units of half of the image's longer side, from its center.
+    """
+    finite = [jnp.all(jnp.isfinite(values), axis=-1) for values in (features.descriptors, features.keypoints)]
+    mask, size = features.mask & finite[0] & finite[1], features.image_size
+    positions = (masked(features.keypoints, mask) - size[None] / 2) / (jnp.max(size) / 2)
+    angles = product(positions, frequencies)
+    return _Side(masked(features.descriptors, mask), mask, jnp.stack([jnp.cos(angles), jnp.sin(angles)]))
 
 
 class _Progress(NamedTuple):
@@ -181,43 +206,3 @@ class _Progress(NamedTuple):
 
 def _at(stacked: Tree, layer: Array) -> Tree:
     return jax.tree.map(lambda leaf: leaf[layer], stacked)
-
-
-def _confident_share(confidence: Affine, states: Sequence[Array], masks: Sequence[Array], threshold: Array) -> Array:
-    """Share of both sides' keypoints with a confidence above the threshold."""
-    unsure = [
-        jnp.sum(mask & (jax.nn.sigmoid(confidence(side)[:, 0]) < threshold))
-        for side, mask in zip(states, masks, strict=True)
-    ]
-    return 1 - sum(unsure[1:], start=unsure[0]) / jnp.maximum(jnp.sum(masks[0]) + jnp.sum(masks[1]), 1)
-
-
-def _assignment(
-    layer: PackedLayer,
-    states0: Float[Array, "keypoints0 width"],
-    states1: Float[Array, "keypoints1 width"],
-    mask0: Bool[Array, " keypoints0"],
-    mask1: Bool[Array, " keypoints1"],
-) -> Float[Array, "keypoints0 keypoints1"]:
-    """Assignment after a layer."""
-    similarity = product(layer.projection(states0), layer.projection(states1).T)
-    real = mask0[:, None] & mask1[None]
-    similarity = jnp.where(real, similarity, jnp.finfo(similarity.dtype).min)  # -inf gives NaN if none is real
-    matchable0, matchable1 = (jax.nn.log_sigmoid(layer.matchability(states)[:, 0]) for states in (states0, states1))
-    both = jax.nn.log_softmax(similarity, axis=0) + jax.nn.log_softmax(similarity, axis=1)
-    return masked(both + matchable0[:, None] + matchable1[None], real, -jnp.inf)
-
-
-def _finite(features: Features) -> Features:
-    """Mask features with values that are not finite, and set masked values to zero."""
-    finite = [jnp.all(jnp.isfinite(values), axis=-1) for values in (features.descriptors, features.keypoints)]
-    mask = features.mask & finite[0] & finite[1]
-    return Features(
-        masked(features.keypoints, mask), masked(features.descriptors, mask), features.scores, mask, features.image_size
-    )
-
-
-def _normalize(features: Features) -> Float[Array, "keypoints 2"]:
-    """Keypoints in units of half of the image's longer side, from its center."""
-    size = features.image_size
-    return (features.keypoints - size[None] / 2) / (jnp.max(size) / 2)

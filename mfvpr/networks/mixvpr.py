@@ -5,21 +5,19 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
+from mfvpr.networks.layers import Images, LayerNorm, Linear, bias_of, matmul, of_unit_length, preprocess
 from mfvpr.networks.resnet import ResNet50
 
 IMAGE_SIZE = (320, 320)  # px, width and height; the mixers' weights depend on it
 _CHANNELS, _POSITIONS = 1024, 20 * 20  # of the backbone's maps
-_NORM_EPSILON = 1e-5  # as published; Flax's default of 1e-6 changes descriptors if maps are faint
 
 
 class FeatureMixer(nnx.Module):
     """Perceptron on the positions of each map, with a shortcut: LayerNorm, Linear, ReLU, Linear."""
 
-    def __init__(self, size: int, *, precision: str, rngs: nnx.Rngs) -> None:
-        self.norm = nnx.LayerNorm(size, epsilon=_NORM_EPSILON, use_fast_variance=False, rngs=rngs)
-        self.linear1 = nnx.Linear(size, size, precision=precision, rngs=rngs)
-        self.linear2 = nnx.Linear(size, size, precision=precision, rngs=rngs)
+    def __init__(self, size: int, *, rngs: nnx.Rngs) -> None:
+        self.norm = LayerNorm(size, epsilon=1e-5, rngs=rngs)  # published; a smaller one changes faint maps
+        self.linear1, self.linear2 = (Linear(size, size, rngs=rngs) for _ in range(2))
 
     def __call__(self, maps: Float[Array, "batch channels positions"]) -> Float[Array, "batch channels positions"]:
         return maps + self.linear2(nnx.relu(self.linear1(self.norm(maps))))
@@ -33,15 +31,12 @@ class MixVPR(nnx.Module):
         out_rows: values per map after the projection; published: 4, 2, 2.
     """
 
-    def __init__(
-        self, out_channels: int = 1024, out_rows: int = 4, *, precision: str = "highest", rngs: nnx.Rngs
-    ) -> None:
+    def __init__(self, out_channels: int = 1024, out_rows: int = 4, *, rngs: nnx.Rngs) -> None:
         self.dimension = out_channels * out_rows
-        self.precision = precision
-        self.backbone = ResNet50("layer3", precision=precision, rngs=rngs)
-        self.mix = nnx.List([FeatureMixer(_POSITIONS, precision=precision, rngs=rngs) for _ in range(4)])
-        self.channel_proj = nnx.Linear(_CHANNELS, out_channels, precision=precision, rngs=rngs)
-        self.row_proj = nnx.Linear(_POSITIONS, out_rows, precision=precision, rngs=rngs)
+        self.backbone = ResNet50("layer3", rngs=rngs)
+        self.mix = nnx.List([FeatureMixer(_POSITIONS, rngs=rngs) for _ in range(4)])
+        self.channel_proj = Linear(_CHANNELS, out_channels, rngs=rngs)
+        self.row_proj = Linear(_POSITIONS, out_rows, rngs=rngs)
 
     preprocess = staticmethod(preprocess)
 
@@ -63,9 +58,7 @@ class MixVPR(nnx.Module):
             maps = mixer(maps)
         # Both projections are linear and act on different axes. The rows, of which few remain, are projected first,
         # which saves a sixth of the time; the channels' bias is then summed over the rows' kernel.
-        channels, rows = self.channel_proj, self.row_proj
-        kernel = rows.kernel[...]
-        bias = jnp.outer(kernel.sum(0), channels.bias[...]) + rows.bias[...][:, None]  # pyright: ignore  (never None)
-        narrow = jnp.matmul(maps, kernel, precision=self.precision).swapaxes(1, 2)
-        projected = jnp.matmul(narrow, channels.kernel[...], precision=self.precision) + bias[None]
+        kernel = self.row_proj.kernel[...]
+        bias = jnp.outer(kernel.sum(0), bias_of(self.channel_proj)) + bias_of(self.row_proj)[:, None]
+        projected = matmul(matmul(maps, kernel).swapaxes(1, 2), self.channel_proj.kernel[...]) + bias[None]
         return of_unit_length(projected.swapaxes(1, 2).reshape(len(maps), self.dimension))

@@ -1,6 +1,8 @@
-"""NetVLAD (Arandjelovic et al., CVPR 2016): sums of differences between a map's vectors and cluster centers.
+"""Global descriptors from a backbone's map: NetVLAD, and generalized means.
 
-Patch-NetVLAD (Hausler et al., CVPR 2021) also sums over each square of the map, which gives descriptors of patches.
+NetVLAD (Arandjelovic et al., CVPR 2016) sums the differences between a map's vectors and cluster centers. Patch-NetVLAD
+(Hausler et al., CVPR 2021) also sums over each square of the map, which gives descriptors of patches. Generalized means
+(Radenovic et al., TPAMI 2019) are those of CosPlace (CVPR 2022).
 """
 
 from typing import Literal
@@ -11,12 +13,24 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.imagenet import Images, Pixels, of_unit_length, preprocess
-from mfvpr.networks.resnet import PointwiseConv
+from mfvpr.networks.layers import (
+    PRECISION,
+    GeneralizedMean,
+    Images,
+    Linear,
+    Pixels,
+    PointwiseConv,
+    matmul,
+    of_unit_length,
+    preprocess,
+)
+from mfvpr.networks.resnet import ResNet50
 from mfvpr.networks.vgg import Vgg16, require_position
 
 CHANNELS = 512  # of VGG16's conv5_3
 Order = Literal["clusters", "channels"]  # the outer axis of a descriptor
+
+_BACKBONES = {"vgg16": (Vgg16, 512), "resnet50": (ResNet50, 2048)}  # with the channels of their maps
 
 
 class Statistic(nnx.Variable):
@@ -33,17 +47,16 @@ class NetVlad(nnx.Module):
         order: "clusters" gives V as `[K, D]`, as PyTorch's codes, "channels" as `[D, K]`, as the original.
     """
 
-    def __init__(self, clusters: int, order: Order = "clusters", *, precision: str, rngs: nnx.Rngs) -> None:
-        self.assignment = PointwiseConv(CHANNELS, clusters, precision=precision, rngs=rngs)
+    def __init__(self, clusters: int, order: Order = "clusters", *, rngs: nnx.Rngs) -> None:
+        self.assignment = PointwiseConv(CHANNELS, clusters, rngs=rngs)
         self.centers = nnx.Param(jnp.zeros((clusters, CHANNELS), jnp.float32))
         self.order = order
-        self.precision = precision
 
     def __call__(self, maps: Float[Array, "batch rows columns channels"]) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length."""
         x = of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
         share = self._shares(x)
-        sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=self.precision)
+        sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=PRECISION)
         return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
 
     def patches(
@@ -56,12 +69,12 @@ class NetVlad(nnx.Module):
         for axis in (1, 2):  # a product with ones and zeros; differences of cumulative sums round more
             inside = np.subtract.outer(np.arange(sums.shape[axis]), np.arange(sums.shape[axis] - size + 1))
             band = jnp.asarray((inside >= 0) & (inside < size), sums.dtype)
-            sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=self.precision), 0, axis)
+            sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=PRECISION), 0, axis)
         return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
 
     def _shares(self, x: Float[Array, "*batch channels"]) -> Float[Array, "*batch clusters"]:
         """Shares of the clusters for vectors of unit length."""
-        return nnx.softmax(jnp.matmul(x, self.assignment.kernel[0, 0], precision=self.precision), axis=-1)
+        return nnx.softmax(matmul(x, self.assignment.kernel[0, 0]), axis=-1)
 
     def _descriptors(self, sums: Float[Array, "*batch clusters channels"]) -> Float[Array, "*batch dimensions"]:
         sums = of_unit_length(sums)
@@ -80,20 +93,14 @@ class VggNetVlad(nnx.Module):
     """
 
     def __init__(
-        self,
-        clusters: int = 64,
-        outputs: int | None = 4096,
-        *,
-        original: bool = False,
-        precision: str = "highest",
-        rngs: nnx.Rngs,
+        self, clusters: int = 64, outputs: int | None = 4096, *, original: bool = False, rngs: nnx.Rngs
     ) -> None:
-        self.vgg = Vgg16(precision=precision, rngs=rngs)
-        self.pool = NetVlad(clusters, "channels" if original else "clusters", precision=precision, rngs=rngs)
+        self.vgg = Vgg16(rngs=rngs)
+        self.pool = NetVlad(clusters, "channels" if original else "clusters", rngs=rngs)
         self.dimension = outputs or clusters * CHANNELS
         self.has_components = outputs is not None
         if outputs is not None:
-            self.projection = nnx.Linear(clusters * CHANNELS, outputs, precision=precision, rngs=rngs)
+            self.projection = Linear(clusters * CHANNELS, outputs, rngs=rngs)
         self.original = original
         if original:
             self.average = Statistic(jnp.zeros(3, jnp.float32))
@@ -120,3 +127,27 @@ class VggNetVlad(nnx.Module):
 
     def _project(self, descriptors: Float[Array, "*batch _"]) -> Float[Array, "*batch dimensions"]:
         return of_unit_length(self.projection(descriptors)) if self.has_components else descriptors
+
+
+class Gem(nnx.Module):
+    """Generalized mean of a backbone's last map, of unit length at each position, and a projection to `outputs`.
+
+    The backbone is VGG16 to `conv5_3`, before its ReLU, or ResNet-50 without its classifier.
+    """
+
+    def __init__(
+        self, backbone: Literal["vgg16", "resnet50"] = "resnet50", outputs: int = 2048, *, rngs: nnx.Rngs
+    ) -> None:
+        backbone_class, channels = _BACKBONES[backbone]
+        self.backbone = backbone_class(rngs=rngs)
+        self.pool = GeneralizedMean()
+        self.projection = Linear(channels, outputs, rngs=rngs)
+        self.dimension = outputs
+        self.has_components = False
+
+    require = staticmethod(require_position)
+    preprocess = staticmethod(preprocess)
+
+    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+        """Descriptors of unit length of preprocessed images."""
+        return of_unit_length(self.projection(self.pool(of_unit_length(self.backbone(images)))))

@@ -5,50 +5,35 @@ Batch normalization uses its running statistics, since the network only extracts
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 from flax import nnx
 from jax import lax
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.convolution import Conv3x3
-from mfvpr.networks.imagenet import Images
+from mfvpr.networks.layers import BatchNorm, Conv3x3, Images, PointwiseConv, conv
 
 _EXPANSION = 4  # channels of a block's output per channel inside
 _LAYERS = {"layer1": (3, 64), "layer2": (4, 128), "layer3": (6, 256), "layer4": (3, 512)}  # blocks, channels inside
 
 
-class PointwiseConv(nnx.Module):
-    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as a matrix product, which is faster on a CPU."""
-
-    def __init__(self, inputs: int, outputs: int, *, stride: int = 1, precision: str, rngs: nnx.Rngs) -> None:
-        initial = nnx.initializers.he_normal()
-        self.kernel = nnx.Param(initial(rngs.params(), (1, 1, inputs, outputs), jnp.float32))
-        self.stride = stride
-        self.precision = precision
-
-    def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
-        return jnp.matmul(x[:, :: self.stride, :: self.stride], self.kernel[0, 0], precision=self.precision)
-
-
 class Bottleneck(nnx.Module):
     """1 x 1, 3 x 3 and 1 x 1 convolutions with a shortcut, which is a 1 x 1 convolution if the width changes."""
 
-    def __init__(self, inputs: int, width: int, *, stride: int, precision: str, rngs: nnx.Rngs) -> None:
+    def __init__(self, inputs: int, width: int, *, stride: int, rngs: nnx.Rngs) -> None:
         outputs = _EXPANSION * width
-        self.conv1 = PointwiseConv(inputs, width, precision=precision, rngs=rngs)
-        self.bn1 = _norm(width, rngs=rngs)
+        self.conv1 = PointwiseConv(inputs, width, rngs=rngs)
+        self.bn1 = BatchNorm(width, rngs=rngs)
         if stride == 1:
-            self.conv2 = Conv3x3(width, width, use_bias=False, precision=precision, rngs=rngs)
+            self.conv2 = Conv3x3(width, width, use_bias=False, rngs=rngs)
         else:
-            self.conv2 = _conv(width, width, 3, stride=stride, precision=precision, rngs=rngs)
-        self.bn2 = _norm(width, rngs=rngs)
-        self.conv3 = PointwiseConv(width, outputs, precision=precision, rngs=rngs)
-        self.bn3 = _norm(outputs, rngs=rngs)
+            self.conv2 = conv(width, width, stride=stride, rngs=rngs)
+        self.bn2 = BatchNorm(width, rngs=rngs)
+        self.conv3 = PointwiseConv(width, outputs, rngs=rngs)
+        self.bn3 = BatchNorm(outputs, rngs=rngs)
         self.has_projection = inputs != outputs
         if self.has_projection:
-            self.shortcut = PointwiseConv(inputs, outputs, stride=stride, precision=precision, rngs=rngs)
-            self.shortcut_bn = _norm(outputs, rngs=rngs)
+            self.shortcut = PointwiseConv(inputs, outputs, stride=stride, rngs=rngs)
+            self.shortcut_bn = BatchNorm(outputs, rngs=rngs)
 
     def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
         shortcut = self.shortcut_bn(self.shortcut(x)) if self.has_projection else x
@@ -63,18 +48,17 @@ class ResNet50(nnx.Module):
     `last` is the last layer: "layer1" to "layer4", of 256, 512, 1024, 2048 channels and stride 4, 8, 16, 32.
     """
 
-    def __init__(self, last: str = "layer4", *, precision: str = "highest", rngs: nnx.Rngs) -> None:
+    def __init__(self, last: str = "layer4", *, rngs: nnx.Rngs) -> None:
         names = tuple(_LAYERS)
         self.layers = names[: names.index(last) + 1]
-        self.conv1 = _conv(3, 64, 7, stride=2, precision=precision, rngs=rngs)
-        self.bn1 = _norm(64, rngs=rngs)
+        self.conv1 = conv(3, 64, 7, stride=2, rngs=rngs)
+        self.bn1 = BatchNorm(64, rngs=rngs)
         inputs = 64
         for name in self.layers:
             blocks, width = _LAYERS[name]
             layer = nnx.List([])
             for place in range(blocks):
-                stride = 2 if place == 0 and name != "layer1" else 1
-                layer.append(Bottleneck(inputs, width, stride=stride, precision=precision, rngs=rngs))
+                layer.append(Bottleneck(inputs, width, stride=2 if place == 0 and name != "layer1" else 1, rngs=rngs))
                 inputs = _EXPANSION * width
             setattr(self, name, layer)
 
@@ -86,17 +70,6 @@ class ResNet50(nnx.Module):
             for block in getattr(self, name):
                 x = block(x)
         return x
-
-
-def _conv(inputs: int, outputs: int, size: int, *, stride: int, precision: str, rngs: nnx.Rngs) -> nnx.Conv:
-    """Convolution with equal padding on all sides; with a stride, "SAME" pads one row and column fewer before."""
-    return nnx.Conv(
-        inputs, outputs, (size, size), strides=stride, padding=size // 2, use_bias=False, precision=precision, rngs=rngs
-    )
-
-
-def _norm(channels: int, *, rngs: nnx.Rngs) -> nnx.BatchNorm:
-    return nnx.BatchNorm(channels, use_running_average=True, epsilon=1e-5, rngs=rngs)
 
 
 def _compute_once(function: Callable[[Array, Array], Array], x: Array, y: Array) -> Array:

@@ -49,14 +49,13 @@ def around(
             yield jnp.clip(y, 0, height - 1), jnp.clip(x, 0, width - 1), jnp.where(inside, across * along, 0)
 
 
-def upsample(
-    dense: Float[Array, "*batch height width channels"], factor: int
-) -> Float[Array, "*batch {factor}*height {factor}*width channels"]:
-    """Enlarge maps, with aligned corner pixels."""
-    if factor == 1:
-        return dense
-    for axis in (-3, -2):
-        dense = between(dense, neighbors(dense.shape[axis], factor * dense.shape[axis]), axis)
+def stretch(
+    dense: Float[Array, "*batch height width channels"], rows: int, columns: int
+) -> Float[Array, "*batch {rows} {columns} channels"]:
+    """Resize maps, with aligned corner pixels."""
+    for axis, size in ((-2, columns), (-3, rows)):
+        if dense.shape[axis] != size:
+            dense = between(dense, neighbors(dense.shape[axis], size), axis)
     return dense
 
 

@@ -1,4 +1,4 @@
-"""VGG16 (Simonyan & Zisserman, ICLR 2015) up to a named convolution: a backbone of several networks."""
+"""VGG16 (Simonyan & Zisserman, ICLR 2015) up to a named convolution: a backbone of several networks, and SSM-VPR's."""
 
 from typing import Literal
 
@@ -7,11 +7,11 @@ from flax import nnx
 from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.convolution import Conv3x3
-from mfvpr.networks.imagenet import Images
+from mfvpr.networks.layers import Conv3x3, Images, preprocess
 from mfvpr.utils.errors import InputError
 
 STRIDE = 16  # px between positions of the last block's map
+STAGE1_STRIDE, STAGE2_STRIDE = 16, 8  # px between positions of SSM-VPR's maps
 Pool = Literal["max", "max_ceil", "average"]
 
 _WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
@@ -37,9 +37,8 @@ class Vgg16(nnx.Module):
         self,
         last: str = "conv5_3",
         *,
-        pools: tuple[Pool, ...] = ("max", "max", "max", "max"),
-        dilations: tuple[int, ...] = (1, 1, 1, 1, 1),
-        precision: str = "highest",
+        pools: tuple[Pool, ...] = ("max",) * 4,
+        dilations: tuple[int, ...] = (1,) * 5,
         rngs: nnx.Rngs,
     ) -> None:
         names = tuple(LAYERS)
@@ -47,8 +46,7 @@ class Vgg16(nnx.Module):
         self.pools = pools
         inputs = 3
         for name in self.layers:
-            dilation = dilations[_block(name) - 1]
-            setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilation, precision=precision, rngs=rngs))
+            setattr(self, name, Conv3x3(inputs, LAYERS[name], dilation=dilations[int(name[4]) - 1], rngs=rngs))
             inputs = LAYERS[name]
 
     def __call__(
@@ -58,9 +56,22 @@ class Vgg16(nnx.Module):
         x = images
         for name in self.layers[: self.layers.index(layer or self.layers[-1]) + 1]:
             if name != self.layers[0]:
-                x = _POOLS[self.pools[_block(name) - 2]](x) if name.endswith("_1") else nnx.relu(x)
+                x = _pool_relu(x, self.pools[int(name[4]) - 2]) if name.endswith("_1") else nnx.relu(x)
             x = getattr(self, name)(x, uniform)
         return x
+
+
+def _pool_relu(x: Array, pool: Pool) -> Array:
+    """ReLU and pooling. A maximum comes first, which gives the same with a quarter of the work."""
+    if pool == "average":
+        x = nnx.relu(x)
+        return (x[:, :-1, :-1] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, 1:, 1:]) / 4
+    if pool == "max_ceil":
+        x = jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2), (0, 0)), mode="edge")
+    height, width = x.shape[1] // 2 * 2, x.shape[2] // 2 * 2
+    # Slices: a window reduction does not fuse with its neighbors on a CPU.
+    rows = jnp.maximum(x[:, 0:height:2, :width], x[:, 1:height:2, :width])
+    return nnx.relu(jnp.maximum(rows[:, :, 0::2], rows[:, :, 1::2]))
 
 
 def require_position(size: tuple[int, int]) -> None:
@@ -69,28 +80,18 @@ def require_position(size: tuple[int, int]) -> None:
         raise InputError(f"image_size={list(size)}: expected {STRIDE} x {STRIDE} px or more")
 
 
-def _block(name: str) -> int:
-    return int(name[len("conv")])
+class SsmVgg(nnx.Module):
+    """The network of SSM-VPR (Camara et al., ICRA 2020): two maps of a VGG16, trained on Places365.
 
+    Stage 1, which chooses the shortlist, uses `conv5_2`; stage 2, which ranks it, uses `conv4_2`; both before their
+    ReLU. Pooling rounds sizes up, so a map has ceil(H / stride) x ceil(W / stride) positions.
+    """
 
-def _max_pool(x: Array) -> Array:
-    """Maximum, then ReLU, which equals the other order with a quarter of the work."""
-    # Slices: a window reduction does not fuse with its neighbors on a CPU.
-    height, width = x.shape[1] // 2 * 2, x.shape[2] // 2 * 2
-    top, bottom = x[:, 0:height:2, :width], x[:, 1:height:2, :width]
-    rows = jnp.maximum(top, bottom)
-    return nnx.relu(jnp.maximum(rows[:, :, 0::2], rows[:, :, 1::2]))
+    def __init__(self, *, rngs: nnx.Rngs) -> None:
+        self.vgg = Vgg16("conv5_2", pools=("max_ceil",) * 4, rngs=rngs)
 
+    preprocess = staticmethod(preprocess)  # published with "torch", although the weights were trained with "caffe"
 
-def _max_pool_ceil(x: Array) -> Array:
-    """As `_max_pool`, but keep an odd last row or column."""
-    odd = ((0, 0), (0, x.shape[1] % 2), (0, x.shape[2] % 2), (0, 0))
-    return _max_pool(jnp.pad(x, odd, mode="edge"))
-
-
-def _average_pool(x: Array) -> Array:
-    x = nnx.relu(x)
-    return (x[:, :-1, :-1] + x[:, :-1, 1:] + x[:, 1:, :-1] + x[:, 1:, 1:]) / 4
-
-
-_POOLS = {"max": _max_pool, "max_ceil": _max_pool_ceil, "average": _average_pool}
+    def __call__(self, images: Images, stage: Literal[1, 2]) -> Float[Array, "batch rows columns 512"]:
+        """The map of a stage, of preprocessed images."""
+        return self.vgg(images, {1: "conv5_2", 2: "conv4_2"}[stage])

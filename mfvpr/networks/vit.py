@@ -1,4 +1,4 @@
-"""Vision transformers (Dosovitskiy et al., ICLR 2021) as in DINOv2 (Oquab et al., TMLR 2024)."""
+"""Vision transformers (Dosovitskiy et al., ICLR 2021) as in DINOv2 (Oquab et al., TMLR 2024) and SelaVPR."""
 
 from typing import Literal, NamedTuple
 
@@ -9,17 +9,25 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.gem import GeneralizedMean
-from mfvpr.networks.imagenet import Images, of_unit_length, preprocess
+from mfvpr.networks.layers import (
+    PRECISION,
+    GeneralizedMean,
+    Images,
+    LayerNorm,
+    Linear,
+    matmul,
+    of_unit_length,
+    preprocess,
+)
 from mfvpr.utils.errors import InputError
 
 Pooling = Literal["cls", "gem"]
 
 PATCH = 14  # px a side
+LOCAL = 128  # channels of SelaVPR's local map
 _TRAINED = 37  # patches per side of the training images (518 px), which the positions fit
 _OFFSET = 0.1  # added to the number of patches for the positions' scale, as published
 _EPSILON = 1e-6  # of the normalization
-_EXPANSION = 4  # of the hidden values
 _CUBIC = -0.75  # torch's parameter of bicubic interpolation
 
 
@@ -46,28 +54,25 @@ class BlockOutput(NamedTuple):
 class Patches(nnx.Module):
     """Linear map of each patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
 
-    def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
+    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         initial = nnx.initializers.lecun_normal()
         self.kernel = nnx.Param(initial(rngs.params(), (PATCH, PATCH, 3, width), jnp.float32))
         self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
-        self.precision = precision
 
     def __call__(self, images: Images) -> Float[Array, "batch (height//14)*(width//14) dimensions"]:
         batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
         pixels = images.reshape(batch, rows, PATCH, columns, PATCH, 3).swapaxes(2, 3)
         kernel = self.kernel[...].reshape(-1, self.kernel.shape[-1])
-        products = jnp.matmul(pixels.reshape(batch, rows * columns, -1), kernel, precision=self.precision)
-        return products + self.bias[...][None, None]
+        return matmul(pixels.reshape(batch, rows * columns, -1), kernel) + self.bias[...][None, None]
 
 
 class Attention(nnx.Module):
     """Multi-head self-attention of tokens."""
 
-    def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
-        self.qkv = nnx.Linear(width, 3 * width, precision=precision, rngs=rngs)
-        self.output = nnx.Linear(width, width, precision=precision, rngs=rngs)
+    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs) -> None:
+        self.qkv = Linear(width, 3 * width, rngs=rngs)
+        self.output = Linear(width, width, rngs=rngs)
         self.heads = heads
-        self.precision = precision
 
     def split(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "3 batch heads tokens width//heads"]:
         """Queries, keys and values of each head."""
@@ -77,30 +82,31 @@ class Attention(nnx.Module):
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         queries, keys, values = self.split(x)
         queries = queries * queries.shape[-1] ** -0.5
-        logits = jnp.matmul(queries, keys.swapaxes(2, 3), precision=self.precision)
+        logits = matmul(queries, keys.swapaxes(2, 3))
         weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
-        context = jnp.matmul(weights, values, precision=self.precision) / jnp.sum(weights, axis=-1, keepdims=True)
+        context = matmul(weights, values) / jnp.sum(weights, axis=-1, keepdims=True)
         return self.output(jnp.moveaxis(context, 1, 2).reshape(x.shape))
 
 
 class Perceptron(nnx.Module):
-    """Two linear layers with GELU between them."""
+    """Two linear layers with GELU or ReLU between them."""
 
-    def __init__(self, width: int, *, precision: str, rngs: nnx.Rngs) -> None:
-        self.hidden = nnx.Linear(width, _EXPANSION * width, precision=precision, rngs=rngs)
-        self.output = nnx.Linear(_EXPANSION * width, width, precision=precision, rngs=rngs)
+    def __init__(self, width: int, hidden: int, *, relu: bool = False, rngs: nnx.Rngs) -> None:
+        self.hidden, self.output = Linear(width, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
+        self.relu = relu
 
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
-        return self.output(jax.nn.gelu(self.hidden(x), approximate=False))
+        hidden = self.hidden(x)
+        return self.output(nnx.relu(hidden) if self.relu else jax.nn.gelu(hidden, approximate=False))
 
 
 class Block(nnx.Module):
     """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x))."""
 
-    def __init__(self, width: int, heads: int, *, precision: str, rngs: nnx.Rngs) -> None:
-        self.norm1, self.norm2 = (_norm(width, rngs) for _ in range(2))
-        self.attention = Attention(width, heads, precision=precision, rngs=rngs)
-        self.perceptron = Perceptron(width, precision=precision, rngs=rngs)
+    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs) -> None:
+        self.norm1, self.norm2 = (LayerNorm(width, epsilon=_EPSILON, rngs=rngs) for _ in range(2))
+        self.attention = Attention(width, heads, rngs=rngs)
+        self.perceptron = Perceptron(width, 4 * width, rngs=rngs)
         self.scale1, self.scale2 = (nnx.Param(jnp.ones(width, jnp.float32)) for _ in range(2))
 
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
@@ -116,27 +122,17 @@ class VisionTransformer(nnx.Module):
     """
 
     def __init__(
-        self,
-        width: int,
-        depth: int,
-        heads: int,
-        *,
-        registers: int = 0,
-        block: type[Block] = Block,
-        precision: str = "highest",
-        rngs: nnx.Rngs,
+        self, width: int, depth: int, heads: int, *, registers: int = 0, block: type[Block] = Block, rngs: nnx.Rngs
     ) -> None:
-        self.patches = Patches(width, precision=precision, rngs=rngs)
+        self.patches = Patches(width, rngs=rngs)
         self.first = nnx.Param(jnp.zeros(width, jnp.float32))  # the class token
         self.positions = nnx.Param(jnp.zeros((1 + _TRAINED**2, width), jnp.float32))
         if registers:
             self.registers = nnx.Param(jnp.zeros((registers, width), jnp.float32))
         self.has_registers = registers > 0
-        blocks = (block(width, heads, precision=precision, rngs=rngs) for _ in range(depth))
-        self.blocks = nnx.List(list(blocks))
-        self.norm = _norm(width, rngs)
+        self.blocks = nnx.List([block(width, heads, rngs=rngs) for _ in range(depth)])
+        self.norm = LayerNorm(width, epsilon=_EPSILON, rngs=rngs)
         self.width = width
-        self.precision = precision
 
     preprocess = staticmethod(preprocess)
 
@@ -146,7 +142,7 @@ class VisionTransformer(nnx.Module):
         for block in self.blocks:
             x = block(x)
         x = self.norm(x)
-        return Tokens(x[:, 0], self._maps(x, images))
+        return Tokens(x[:, 0], _maps(x, images))
 
     def with_block(self, images: Images, index: int) -> tuple[Tokens, BlockOutput]:
         """Normalized tokens of preprocessed images, and the output of the block with this index."""
@@ -157,36 +153,50 @@ class VisionTransformer(nnx.Module):
         place, block = index % len(self.blocks), self.blocks[index]
         parts = block.attention.split(block.norm1(states[place]))
         joined = jnp.moveaxis(parts, 2, 3).reshape(3, *states[place].shape)
-        attention = jnp.mean(_class_attention(parts[0], parts[1], self.precision), axis=1)
-        last, token, query, key, value, weights = (
-            self._maps(values, images) for values in (x, self.norm(states[place + 1]), *joined, attention)
-        )
-        return Tokens(x[:, 0], last), BlockOutput(token, query, key, value, weights)
+        of_class = parts[0, :, :, :1] * parts.shape[-1] ** -0.5  # query of the class token, the first
+        attention = jax.nn.softmax(matmul(of_class, parts[1].swapaxes(2, 3))[:, :, 0], axis=-1)
+        values = (self.norm(states[place + 1]), *joined, jnp.mean(attention, axis=1))
+        return Tokens(x[:, 0], _maps(x, images)), BlockOutput(*(_maps(each, images) for each in values))
 
     def _embed(self, images: Images) -> Float[Array, "batch tokens dimensions"]:
         """Class token, registers and patches with their positions, the input of the first block."""
-        maps = self.patches(images) + self._positions(images.shape[1] // PATCH, images.shape[2] // PATCH)[None]
+        positions = _resize_positions(self.positions[...][1:], images.shape[1] // PATCH, images.shape[2] // PATCH)
         first = (self.first[...] + self.positions[...][0])[None]
         extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
-        return jnp.concatenate([jnp.broadcast_to(extra, (len(images), *extra.shape)), maps], axis=1)
+        extra = jnp.broadcast_to(extra, (len(images), *extra.shape))
+        return jnp.concatenate([extra, self.patches(images) + positions[None]], axis=1)
 
-    def _maps(
-        self, x: Float[Array, "batch tokens *dimensions"], images: Images
-    ) -> Float[Array, "batch rows columns *dimensions"]:
-        """Values of the patches' tokens, which are the last."""
-        rows, columns = images.shape[1] // PATCH, images.shape[2] // PATCH
-        return x[:, -rows * columns :].reshape(len(x), rows, columns, *x.shape[2:])
 
-    def _positions(self, rows: int, columns: int) -> Float[Array, "{rows}*{columns} width"]:
-        """Position encodings of the patches: the learned ones, resized without antialiasing."""
-        learned = self.positions[...][1:]
-        if rows == columns == _TRAINED:
-            return learned
-        grid = learned.reshape(_TRAINED, _TRAINED, -1)
-        for axis, count in enumerate((rows, columns)):
-            resized = jnp.tensordot(_bicubic(_TRAINED, count), grid, axes=(1, axis), precision=self.precision)
-            grid = jnp.moveaxis(resized, 0, axis)
-        return grid.reshape(rows * columns, -1)
+def _maps(
+    x: Float[Array, "batch tokens *dimensions"], images: Images
+) -> Float[Array, "batch rows columns *dimensions"]:
+    """Values of the patches' tokens, which are the last."""
+    rows, columns = images.shape[1] // PATCH, images.shape[2] // PATCH
+    return x[:, -rows * columns :].reshape(len(x), rows, columns, *x.shape[2:])
+
+
+def _resize_positions(
+    learned: Float[Array, "positions width"], rows: int, columns: int
+) -> Float[Array, "{rows}*{columns} width"]:
+    """Position encodings of the patches: the learned ones, resized by bicubic interpolation; edges repeat.
+
+    Places are `_TRAINED / (count + 0.1)` apart, and there is no antialiasing, as published.
+    """
+    if rows == columns == _TRAINED:
+        return learned
+    grid = learned.reshape(_TRAINED, _TRAINED, -1)
+    for axis, count in enumerate((rows, columns)):
+        places = (np.arange(count) + 0.5) * _TRAINED / (count + _OFFSET) - 0.5
+        before, matrix = np.floor(places).astype(int), np.zeros((count, _TRAINED))
+        for step in (-1, 0, 1, 2):
+            distance = np.abs(places - (before + step))
+            near = ((_CUBIC + 2) * distance - (_CUBIC + 3)) * distance**2 + 1
+            far = ((distance - 5) * distance + 8) * distance * _CUBIC - 4 * _CUBIC
+            pixel = np.clip(before + step, 0, _TRAINED - 1)
+            np.add.at(matrix, (np.arange(count), pixel), np.where(distance <= 1, near, far))
+        resized = jnp.tensordot(jnp.asarray(matrix, jnp.float32), grid, axes=(1, axis), precision=PRECISION)
+        grid = jnp.moveaxis(resized, 0, axis)
+    return grid.reshape(rows * columns, -1)
 
 
 def require_patches(size: tuple[int, int]) -> None:
@@ -211,7 +221,7 @@ class TokenDescriptor(nnx.Module):
         self.dimension = network.width
         self.has_components = False
 
-    preprocess = staticmethod(VisionTransformer.preprocess)
+    preprocess = staticmethod(preprocess)
     require = staticmethod(require_patches)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
@@ -220,26 +230,68 @@ class TokenDescriptor(nnx.Module):
         return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
 
 
-def _class_attention(
-    queries: Float[Array, "batch heads tokens size"], keys: Float[Array, "batch heads tokens size"], precision: str
-) -> Float[Array, "batch heads tokens"]:
-    """Attention of the class token, the first, to all tokens: a softmax."""
-    scaled = queries[:, :, :1] * queries.shape[-1] ** -0.5
-    return jax.nn.softmax(jnp.matmul(scaled, keys.swapaxes(2, 3), precision=precision)[:, :, 0], axis=-1)
+class AdaptedBlock(Block):
+    """A block with one adapter behind its attention, and one beside its perceptron, which counts a fifth.
+
+    An adapter is a perceptron with half as many hidden values and ReLU.
+    """
+
+    def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs) -> None:
+        super().__init__(width, heads, rngs=rngs)
+        self.serial, self.parallel = (Perceptron(width, width // 2, relu=True, rngs=rngs) for _ in range(2))
+
+    def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
+        attended = self.attention(self.norm1(x))
+        x = x + self.scale1[...][None, None] * (attended + self.serial(attended))
+        normalized = self.norm2(x)
+        return x + self.scale2[...][None, None] * (self.perceptron(normalized) + 0.2 * self.parallel(normalized))
 
 
-def _norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
-    return nnx.LayerNorm(width, epsilon=_EPSILON, use_fast_variance=False, rngs=rngs)
+class Upsampling(nnx.Module):
+    """Transposed 3 x 3 convolution, stride 2, padding 1.
+
+    `kernel` `[3, 3, C, D]` adds position (i, j) of the input to (2 i + row - 1, 2 j + column - 1); `bias` is `[D]`.
+    """
+
+    def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs) -> None:
+        self.kernel = nnx.Param(nnx.initializers.he_normal()(rngs.params(), (3, 3, inputs, outputs), jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
+
+    def __call__(
+        self, x: Float[Array, "batch rows columns inputs"]
+    ) -> Float[Array, "batch 2*rows-1 2*columns-1 outputs"]:
+        """Multiply by the whole kernel at once, then add neighbors, which avoids products with zeros."""
+        parts = jnp.tensordot(x, self.kernel[...], axes=(3, 2), precision=PRECISION)  # [B, h, w, 3, 3, D]
+        for axis in (1, 2):  # n positions add three outputs each, which become 2 n - 1
+            before, here, after = (jnp.take(parts, place, axis=3) for place in range(3))
+            between = after + jnp.roll(before, -1, axis)  # the last is dropped
+            pairs = jnp.stack([here, between], axis=axis + 1)
+            merged = pairs.reshape(*pairs.shape[:axis], -1, *pairs.shape[axis + 2 :])
+            parts = jax.lax.slice_in_dim(merged, 0, merged.shape[axis] - 1, axis=axis)
+        return parts + self.bias[...][None, None, None]
 
 
-def _bicubic(size: int, count: int) -> Float[Array, "{count} {size}"]:
-    """Matrix of the interpolation at `count` places, `size / (count + 0.1)` apart; edges repeat."""
-    places = (np.arange(count) + 0.5) * size / (count + _OFFSET) - 0.5
-    before, matrix = np.floor(places).astype(int), np.zeros((count, size))
-    for step in (-1, 0, 1, 2):
-        distance = np.abs(places - (before + step))
-        near = ((_CUBIC + 2) * distance - (_CUBIC + 3)) * distance**2 + 1
-        far = ((distance - 5) * distance + 8) * distance * _CUBIC - 4 * _CUBIC
-        pixel = np.clip(before + step, 0, size - 1)
-        np.add.at(matrix, (np.arange(count), pixel), np.where(distance <= 1, near, far))
-    return jnp.asarray(matrix, jnp.float32)
+class SelaVpr(nnx.Module):
+    """SelaVPR (Lu et al., ICLR 2024): DINOv2 with adapters, its generalized mean, and a dense map of local features.
+
+    The map's grid is four times as fine as the patches. The arguments are those of `VisionTransformer`; ViT-L is
+    published, with 4 registers and without.
+    """
+
+    def __init__(
+        self, width: int = 1024, depth: int = 24, heads: int = 16, *, registers: int = 0, rngs: nnx.Rngs
+    ) -> None:
+        self.backbone = VisionTransformer(width, depth, heads, registers=registers, block=AdaptedBlock, rngs=rngs)
+        self.pool = GeneralizedMean()
+        self.upsampling1, self.upsampling2 = Upsampling(width, 256, rngs=rngs), Upsampling(256, LOCAL, rngs=rngs)
+        self.dimension = width
+
+    preprocess = staticmethod(preprocess)
+
+    def __call__(
+        self, images: Images
+    ) -> tuple[Float[Array, "batch dimensions"], Float[Array, "batch 4*(height//14)-3 4*(width//14)-3 128"]]:
+        """Global descriptors and local descriptors of unit length of preprocessed images."""
+        maps = self.backbone(images).maps
+        local = self.upsampling2(nnx.relu(self.upsampling1(maps)))
+        return of_unit_length(self.pool(of_unit_length(maps))), of_unit_length(local)

@@ -1,7 +1,7 @@
 """Reports of a learning comparison: table, text, JSON values, learned weights, and figures."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from mfvpr.baselines.learned_weight import LearnedWeight, write_weight
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import mcnemar, path_test, recall_interval
-from mfvpr.report.plots import curves_figure, weights_figure
+from mfvpr.report.plots import GRAY, MARK, PALE, panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_interval, format_values
 from mfvpr.tuning.learning.comparison import Comparison
@@ -21,6 +21,7 @@ from mfvpr.tuning.learning.training import Fit
 from mfvpr.utils.numerics import compiled
 
 SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
+BINS = 12  # of these matches, by the value of an input
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -111,8 +112,8 @@ def comparison_figures(comparison: Comparison) -> list[Figure]:
     """Curves of the trainings, and the learned weights over their inputs."""
     histories = {name: fit.history for name, fit in _fits(comparison).items()}
     return [
-        ("curves.png", partial(curves_figure, histories=histories)),
-        ("weights.png", partial(_weights_figure, comparison=comparison, weights=_weights(comparison))),
+        ("curves.png", partial(_draw_curves, histories=histories)),
+        ("weights.png", partial(_draw_weights, comparison=comparison, weights=_weights(comparison))),
     ]
 
 
@@ -125,20 +126,52 @@ def _weights(comparison: Comparison) -> dict[str, LearnedWeight]:
     return {name: fit.parameters["weight"] for name, fit in fits.items() if "weight" in fit.parameters}
 
 
-def _weights_figure(path: Path, comparison: Comparison, weights: Mapping[str, LearnedWeight]) -> None:
-    """Draw the weights of the matches of some queries that are reported on."""
+def _draw_curves(path: Path, histories: Mapping[str, Sequence[tuple[int, float | None, float | None]]]) -> None:
+    """Draw loss and validation over the steps, one panel for each training, whose history has None where unknown."""
+    figure, axes = panels(len(histories), 3.4, 2.6)
+    for panel, (name, history) in zip(axes, histories.items(), strict=True):
+        for place, label, color in ((1, "loss", PALE), (2, "validation", MARK)):
+            points = [(row[0], row[place]) for row in history if row[place] is not None]
+            panel.plot(*zip(*points, strict=True), label=label, color=color, marker=".", markersize=4)
+        panel.set_title(name, fontsize=9)
+        panel.set_xlabel("step", fontsize=8)
+        panel.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def _draw_weights(path: Path, comparison: Comparison, weights: Mapping[str, LearnedWeight]) -> None:
+    """Draw the mean match weight over each input, in bins of equally many matches of some queries reported on.
+
+    A dotted line is the share of these matches that belong to a correct candidate.
+    """
     protocol, queries = comparison.protocol, np.concatenate([half.report for half in comparison.protocol.halves])
     shown = queries[np.linspace(0, len(queries) - 1, min(SHOWN_QUERIES, len(queries))).astype(int)]
     positives = protocol.positives[protocol.main].take(shown).contains(comparison.candidates.indices[shown])
-    first = next(iter(weights.values()))
-    pairs = [(comparison.match_set[query], correct) for query, correct in zip(shown, positives, strict=True)]
-    inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches, _ in pairs])
-    correct = np.concatenate([np.repeat(correct, matches.mask.sum(axis=1)) for matches, correct in pairs])
-    by_training = {}
+    first, query_matches = next(iter(weights.values())), [comparison.match_set[query] for query in shown]
+    inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches in query_matches])
+    counts = np.concatenate([matches.mask.sum(axis=1) for matches in query_matches])
+    correct, by_training = np.repeat(positives.reshape(-1), counts), {}
     for name, weight in weights.items():
-        weighed = [np.asarray(_weigh(weight, matches))[matches.mask] for matches, _ in pairs]
+        weighed = [np.asarray(_weigh(weight, matches))[matches.mask] for matches in query_matches]
         by_training[name] = np.concatenate(weighed)
-    weights_figure(path, first.names, inputs, by_training, correct)
+    figure, axes = panels(len(first.names), 3.2, 2.6)
+    for panel, name, values in zip(axes, first.names, inputs.T, strict=True):
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+        bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+        members = [bin_of == used for used in np.unique(bin_of)]
+        centers = [values[member].mean() for member in members]
+        for label, weight in by_training.items():
+            panel.plot(centers, [weight[member].mean() / weight.mean() for member in members], label=label, marker=".")
+        panel.set_title(name, fontsize=9)
+        panel.grid(alpha=0.3)
+        share = panel.twinx()
+        share.plot(centers, [100 * correct[member].mean() for member in members], color=GRAY, linestyle=":")
+        share.tick_params(labelsize=7, labelcolor=GRAY)
+    axes[0].legend(fontsize=7)
+    axes[0].set_ylabel("weight / mean weight", fontsize=8)
+    figure.suptitle("dotted: % of these matches that belong to a correct candidate", fontsize=9)
+    save_figure(figure, path)
 
 
 _weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))

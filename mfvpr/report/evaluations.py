@@ -1,7 +1,7 @@
-"""The report of an evaluation: recall, and confidences of the first predictions."""
+"""The report of an evaluation in memory: recall, confidences of the first predictions, and their tables."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
-from mfvpr.datasets.ground_truth import Truth, middle, threshold_words
+from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.confidence import (
     CalibrationData,
@@ -20,9 +20,11 @@ from mfvpr.evaluation.confidence import (
     PrecisionRecall,
     absent_rankings,
     calibration_data,
+    chance_calibration_error,
     precision_recall,
+    reliability,
 )
-from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason, Recall
+from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
 from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.report.runs import file_names
@@ -30,6 +32,8 @@ from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
+SHARES = tuple(share / 20 for share in range(21))  # of queries that are re-ranked
+_UNITS: Mapping[str, Unit] = {"tolerance": "frames", "radius": "m"}  # of a threshold, by its name in rows
 
 
 @dataclass(frozen=True)
@@ -83,30 +87,25 @@ class EvaluationReport:
         """The data set's query sequences."""
         return self.ranked.dataset.sequences
 
-    @cached_property
-    def recall(self) -> dict[str, Recall]:
-        """Recall by system."""
-        return self.ranked.recall(self.thresholds, self.ks)
+    def rows(self) -> list[dict[str, Any]]:
+        """Recall by K of every system, threshold and sequence; behind several sequences, of their means.
 
-    def parts(self, system: str) -> Iterator[tuple[str, Float[np.ndarray, "tolerances ks"]]]:
-        """(sequence, recall), and behind several sequences their means."""
-        recall = self.recall[system]
-        yield from zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True)
-        if len(self.sequences) > 1:
-            yield from zip(MEANS, (recall.mean, recall.pooled), strict=True)
-
-    def rows(self, system: str) -> list[dict[str, Any]]:
-        """Threshold and recall by K; for several sequences, of each sequence and their means."""
-        truth = self.sequences[0].truth
-        if truth is None or not self.thresholds:
-            return [{"recall_at": {}}]
-        name, rows = {"frames": "tolerance", "m": "radius"}.get(truth.unit), []
-        for sequence, recall in self.parts(system):
-            for threshold, values in zip(self.thresholds, recall, strict=True):
-                row: dict[str, Any] = {"sequence": sequence} if len(self.sequences) > 1 else {}
-                row |= {name: threshold} if name else {}
-                recall_at = {str(k): round(float(value), 6) for k, value in zip(self.ks, values, strict=True)}
-                rows.append(row | {"recall_at": recall_at})
+        A row has "system" and "decides", with several sequences "sequence", the "tolerance" or "radius", and
+        "recall_at", which is empty without ground truth.
+        """
+        truth, rows = self.sequences[0].truth, list[dict[str, Any]]()
+        if truth is None:
+            names = self.ranked.systems
+            return [{"system": name, "decides": name == self.headline, "recall_at": {}} for name in names]
+        for system, recall in self.ranked.recall(self.thresholds, self.ks).items():
+            parts = dict(zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True))
+            if len(parts) > 1:
+                parts |= zip(MEANS, (recall.mean, recall.pooled), strict=True)
+            for (sequence, values), place in itertools.product(parts.items(), range(len(self.thresholds))):
+                row: dict[str, Any] = {"system": system, "decides": system == self.headline}
+                row |= {"sequence": sequence} if len(parts) > 1 else {}
+                row |= {name: self.thresholds[place] for name, unit in _UNITS.items() if unit == truth.unit}
+                rows.append(row | {"recall_at": dict(zip(self.ks, values[place].tolist(), strict=True))})
         return rows
 
     @cached_property
@@ -138,24 +137,34 @@ class EvaluationReport:
         return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
 
     @cached_property
+    def both_probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
+        """Confidence by system, of the queries as they are, and without the images of their place; NaN = unknown.
+
+        Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        """
+        names = self.calibration if self.confidences is None else self.confidences
+        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in names if name in self.ranked.systems}
+        for name, (present, absent) in probabilities.items():
+            if self.confidences is not None:
+                fitted, pairs = self.confidences[name], [*self._pairs(name)]
+                present[:] = np.concatenate([fitted(*pair) for pair in pairs])
+                if self.thresholds:
+                    parts = zip(pairs, self._truths, strict=True)
+                    without = [absent_rankings(*pair, truth, self.threshold) for pair, truth in parts]
+                    absent[:] = np.concatenate([fitted(*pair) for pair in without])
+                continue
+            for half in self.path_halves():
+                tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
+                if np.isfinite(tune.present).all(axis=1).any():
+                    confidence = tune.fit()
+                    present[half.report] = confidence.probability(report.present)
+                    absent[half.report] = confidence.probability(report.absent)
+        return probabilities
+
+    @property
     def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
         """Confidence by system, NaN without a prediction, or without anything to fit on."""
-        if self.confidences is None:
-            return {name: present for name, (present, _) in self._cross_fitted.items()}
-        known = {name: fitted for name, fitted in self.confidences.items() if name in self.ranked.systems}
-        return {name: np.concatenate([fitted(*pair) for pair in self._pairs(name)]) for name, fitted in known.items()}
-
-    @cached_property
-    def absent_probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
-        """Confidence by system of the queries without the images of their place; nothing without ground truth."""
-        if self.confidences is None or not self.thresholds:
-            return {name: absent for name, (_, absent) in self._cross_fitted.items()}
-        probabilities = {}
-        for name in self.probabilities:
-            pairs = zip(self._pairs(name), self._truths, strict=True)
-            absent = (absent_rankings(*pair, truth, self.threshold) for pair, truth in pairs)
-            probabilities[name] = np.concatenate([self.confidences[name](*pair) for pair in absent])
-        return probabilities
+        return {name: present for name, (present, _) in self.both_probabilities.items()}
 
     @cached_property
     def calibration(self) -> dict[str, CalibrationData]:
@@ -197,21 +206,6 @@ class EvaluationReport:
             values["confidence"] = self.probabilities[system]
         return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
 
-    @cached_property
-    def _cross_fitted(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
-        """Confidence on each half of the path by a fit on the other, without what shows places of both.
-
-        Of the queries as they are, and without the images of their place.
-        """
-        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in self.calibration}
-        for name, data in self.calibration.items():
-            for half in self.path_halves():
-                tune, report = data.take(half.tune), data.take(half.report)
-                if np.isfinite(tune.present).all(axis=1).any():
-                    fitted = map(tune.fit().probability, (report.present, report.absent))
-                    probabilities[name][:, half.report] = [*fitted]
-        return probabilities
-
     def _pairs(self, system: str) -> Iterator[tuple[Ranked, Ranked]]:
         """Rankings of each sequence by a system, and by retrieval."""
         return zip(self.ranked.systems[system], self.ranked.systems[RETRIEVAL], strict=True)
@@ -232,18 +226,77 @@ def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
     return run / "sequences" / file_names(sequences)[sequences[place]] if len(sequences) > 1 else run
 
 
-def recall_table(evaluation: EvaluationReport) -> Table:
-    """R@first k at every threshold, and all ks at the middle one; a line for each system, and sequence."""
-    thresholds, ks, truth = evaluation.thresholds, evaluation.ks, evaluation.sequences[0].truth
-    if truth is None or not thresholds:
-        raise InputError(f"{evaluation.ranked.dataset.name}: there is no ground truth, so no recall; see `predictions`")
-    cells = [(place, 0) for place in range(len(thresholds))]
-    cells += [(len(thresholds) // 2, depth) for depth in range(1, len(ks))]
-    labels = [f"R@{ks[depth]}{threshold_words(truth.unit, thresholds[place])}" for place, depth in cells]
-    several, lines = len(evaluation.sequences) > 1, []
-    for system in evaluation.ranked.systems:
-        for name, recall in evaluation.parts(system):
-            names = [system, name] if several else [system]
-            lines.append([*names, *(f"{100 * recall[cell]:.1f}" for cell in cells)])
-    names = ["system", "sequence"] if several else ["system"]
-    return Table([*names, *labels], lines, text_columns=len(names))
+def recall_table(rows: Iterable[Mapping[str, Any]]) -> Table:
+    """Recall in % from rows of `EvaluationReport.rows`, which may have a "data set", too.
+
+    R@first k at every threshold, and all ks at the middle one; a line for each data set, system, and sequence.
+
+    Raises:
+        InputError: no row has recalls.
+    """
+    names, groups = ("data set", "system", "sequence"), dict[tuple[str | None, ...], list[Mapping[str, Any]]]()
+    for row in rows:
+        if row["recall_at"]:
+            groups.setdefault(tuple(row.get(name) for name in names), []).append(row)
+    if not groups:
+        raise InputError("table: there is no ground truth, so no recall; see `predictions`")
+    lines = []
+    for texts, group in groups.items():
+        first, *deeper = group[0]["recall_at"]
+        cells = [(row, first) for row in group] + [(group[len(group) // 2], k) for k in deeper]
+        line = {name: text for name, text in zip(names, texts, strict=True) if text is not None}
+        for row, k in cells:
+            words = [threshold_words(unit, row[name]) for name, unit in _UNITS.items() if name in row]
+            line[f"R@{k}{''.join(words)}"] = f"{100 * row['recall_at'][k]:.1f}"
+        lines.append(line)
+    known = dict.fromkeys(name for line in lines for name in line)
+    header = sorted(known, key=lambda name: names.index(name) if name in names else len(names))
+    text_columns = len({*header} & {*names})
+    return Table(header, [[line.get(name, "") for name in header] for line in lines], text_columns)
+
+
+def confidence_table(evaluation: EvaluationReport) -> Table:
+    """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; counts of queries.
+
+    All in percent but the counts, which need `least_confidence`. "ECE" is the expected calibration error of the queries
+    as they are, "by chance" that of a perfectly calibrated confidence. "ECE with absent" counts each query once more
+    without the images of its place, as the fits do.
+    """
+    header = [f"{name} by {by}" for by in ("score", "confidence") for name in ("AP", "R@100P", "R@99P")]
+    header += ["ECE", "by chance", "ECE with absent"]
+    rows = []
+    for name, probabilities in evaluation.probabilities.items():
+        fractions = []
+        for curve in evaluation.curves(name).values():
+            fractions += [curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99)]
+        correct = evaluation.hits(name)
+        fractions += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
+        both = np.concatenate(evaluation.both_probabilities[name])
+        fractions.append(reliability(both, np.append(correct, np.zeros(len(correct), bool))).calibration_error)
+        known = 3 if np.isnan(probabilities).all() else len(fractions)  # an unknown confidence has empty cells
+        cells = [f"{100 * value:.1f}" for value in fractions[:known]] + [""] * (len(fractions) - known)
+        if evaluation.least_confidence is not None:
+            refused = evaluation.refusals(name)
+            counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
+            cells += [str(int(selection.sum())) for selection in counts]
+        rows.append([name, *cells])
+    if evaluation.least_confidence is not None:
+        header += ["correct", "incorrect", "refused", "of these correct"]
+    return Table(["system", *header], rows)
+
+
+def recalls_by_share(evaluation: EvaluationReport) -> dict[str, Float[np.ndarray, " shares"]]:
+    """Recall at 1, by `SHARES`, of the systems that re-rank the queries with the lowest confidence of retrieval.
+
+    It is empty where the confidence of retrieval is not known.
+    """
+    if RETRIEVAL not in evaluation.probabilities:
+        return {}
+    unsure = np.argsort(np.nan_to_num(evaluation.probabilities[RETRIEVAL], nan=-1.0), kind="stable")
+    by_retrieval = evaluation.hits(RETRIEVAL)[unsure].astype(int)
+    counts = np.round(np.array(SHARES) * len(unsure)).astype(int)
+    recalls = {}
+    for name in (name for name in evaluation.ranked.systems if name != RETRIEVAL):
+        gains = np.concatenate([[0], np.cumsum(evaluation.hits(name)[unsure] - by_retrieval)])
+        recalls[name] = (by_retrieval.sum() + gains[counts]) / len(unsure)
+    return recalls

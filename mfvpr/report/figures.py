@@ -1,9 +1,13 @@
-"""Figures of images: the paper's histogram figure, which has a pair beside its shifts; contact sheets of data sets."""
+"""Figures of images: a pair beside its histogram of shifts, for queries and localized images; contact sheets."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Shaped, UInt8
 from matplotlib.axes import Axes
@@ -11,24 +15,31 @@ from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
+from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.types import Matches
 from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.datasets.image_reading import resize
-from mfvpr.evaluation.stages import Explanation
-from mfvpr.report.plots import panels, save_figure
+from mfvpr.datasets.ground_truth import threshold_words
+from mfvpr.datasets.image_reading import read_image, resize
+from mfvpr.evaluation.confidence import reliability
+from mfvpr.evaluation.stages import Explanation, explain
+from mfvpr.localization.map import Map
+from mfvpr.localization.predictions import Localization
+from mfvpr.report.evaluations import EvaluationReport
+from mfvpr.report.plots import panels, reliability_figure, save_figure
+from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle, printable
+from mfvpr.utils.files import clip_middle, path_inside, printable
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
-_TITLE_LENGTH, _CAPTION_LENGTH = 140, 100  # characters that fit
+_GRAY = 150  # of an image that is not at hand
+_TITLE_LENGTH, _CAPTION_LENGTH, _NAME_LENGTH = 140, 100, 40  # characters that fit; of an image's name in a title
+_MAP_NAME_LENGTH = 80  # characters of a name or a place of a map
 _PAIRS, _PAIRS_IN_A_ROW = 12, 2  # of a contact sheet; at least two of each sequence
 _SIDE, _WIDTH = 320, 3.2  # of an image on the sheet: px of the longer side, inches
 _SHEET_CAPTION_LENGTH = 44  # characters
-
-LabeledImage = tuple[np.ndarray | None, str]  # pixels, None if they cannot be read, and a caption
 
 
 @dataclass(frozen=True)
@@ -75,40 +86,22 @@ def histogram_figure(
     save_figure(figure, path, bbox_inches="tight", pad_inches=0.15, metadata=metadata)
 
 
-def with_longest_side(image: UInt8[np.ndarray, "_ _ 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Resize an image so that its longer side has so many pixels."""
-    scale = side / max(image.shape[:2])
-    return resize(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
-
-
-def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.ndarray, "_ _ 3"]) -> float:
-    """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
-    (height, width), (new_height, new_width) = original.shape[:2], smaller.shape[:2]
-    return (height / new_height) / (width / new_width)
-
-
 def _draw_pair(axes: Axes, query: np.ndarray, candidate: Candidate) -> None:
     """Draw query and candidate side by side, with the heaviest matches."""
-    offset, image, matches, explanation = (
-        query.shape[1] + _GAP,
-        candidate.image,
-        candidate.matches,
-        candidate.explanation,
-    )
+    offset, image, words = query.shape[1] + _GAP, candidate.image, "query | candidate"
     canvas = np.full((max(len(query), len(image)), offset + image.shape[1], 3), 255, np.uint8)
     canvas[: len(query), : query.shape[1]] = query
     canvas[: len(image), offset:] = image
     axes.imshow(canvas)
     axes.set_axis_off()
-    words = "query | candidate"
+    matches, explanation = candidate.matches, candidate.explanation
     if matches is not None and explanation is not None:
         count = int(matches.mask.sum())
         weights = np.where(matches.mask, explanation.weights, -np.inf)
         heaviest = np.lexsort((matches.distance, -weights))[: min(_MATCHES, count)]  # of equal weights the nearest
         start, end = matches.points0[heaviest], matches.points1[heaviest] + [offset, 0]
         colors = np.where(explanation.agrees[heaviest], _AGREES, _DIFFERS)
-        lines = np.stack([start, end], axis=1)
-        axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.8, alpha=0.9))
+        axes.add_collection(LineCollection([*zip(start, end, strict=True)], colors=colors, linewidths=0.8, alpha=0.9))
         for points in (start, end):
             axes.scatter(points[:, 0], points[:, 1], s=7, c=colors, linewidths=0)
         drawn, agree = explanation.agrees[heaviest].sum(), explanation.agrees.sum()
@@ -128,15 +121,164 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     direction = explanation.direction.replace("_", " ")
     axes.set_xlabel(f"shift x, px ({direction})\nsquare: tallest bin, cross: refined peak", fontsize=8)
     axes.set_ylabel("shift y, px")
-    if explanation.score <= 0:
-        axes.set_title("histogram of shifts: no votes", fontsize=9)
-        return image
-    corner_x, corner_y = explanation.shift - half
-    axes.add_patch(Rectangle((corner_x, corner_y), 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
-    axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
-    words = "histogram of shifts: score {:.4g}, peak at ({:.1f}, {:.1f}) px"
-    axes.set_title(words.format(explanation.score, *explanation.peak), fontsize=9)
+    words = "no votes"
+    if explanation.score > 0:
+        corner = explanation.shift - half
+        axes.add_patch(Rectangle(corner, 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
+        axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
+        x, y = explanation.peak
+        words = f"score {explanation.score:.4g}, peak at ({x:.1f}, {y:.1f}) px"
+    axes.set_title(f"histogram of shifts: {words}", fontsize=9)
     return image
+
+
+def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.ndarray, "_ _ 3"]) -> float:
+    """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
+    (height, width), (new_height, new_width) = original.shape[:2], smaller.shape[:2]
+    return (height / new_height) / (width / new_width)
+
+
+def query_figures(report: EvaluationReport, shown: int | Sequence[int]) -> list[Figure]:
+    """The paper's figure for a few queries, correct and incorrect ones, spread over each sequence.
+
+    `shown` is a number of queries, or their rows.
+    """
+    figures: list[Figure] = []
+    for place in range(len(report.sequences)):
+        drawings, folder = SequenceFigures(report, place), report.folder(Path(), place).name
+        for query, verdict in drawings.verdicts(shown).items():
+            name = (Path(folder) / f"{verdict}_{query:04d}.png").as_posix()
+            figures.append((name, partial(drawings.draw, query=query, verdict=verdict)))
+    return figures
+
+
+class SequenceFigures:
+    """The figures of one sequence."""
+
+    def __init__(self, report: EvaluationReport, place: int) -> None:
+        """Take the parts of the sequence at a place, by the system that decides."""
+        headline = report.headline
+        self._report, self._sequence = report, report.sequences[place]
+        self._matched, self._database = report.ranked.matched[place], report.ranked.dataset.database
+        self._ranked, self._correct = report.ranked.systems[headline][place], report.is_correct(headline, place)
+        self._reasons = report.by_sequence(report.reasons(headline))[place]
+        self._positives = report.positives[place]
+
+    def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
+        """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
+        has_prediction = self._ranked.rows[:, 0] >= 0
+        words = ["best"] if self._correct is None else ["correct", "incorrect"]
+        is_first = np.ones(len(has_prediction), bool) if self._correct is None else self._correct[:, 0]
+        verdicts = np.where(is_first, words[0], words[-1])
+        if not isinstance(selection, int):
+            return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
+        chosen: dict[int, str] = {}
+        for word, numbers in zip(words, np.array_split(range(selection), len(words)), strict=True):
+            queries = np.flatnonzero(has_prediction & (verdicts == word))
+            spread = np.linspace(0, len(queries) - 1, min(len(numbers), len(queries))).round().astype(int)
+            chosen |= dict.fromkeys(queries[spread].tolist(), word)
+        return chosen
+
+    def title(self, query: int, verdict: str) -> str:
+        """The score, whether the prediction is correct within the threshold, and both names."""
+        truth, prediction = self._sequence.truth, self._database.names[self._ranked.rows[query, 0]]
+        within = "" if truth is None else " at" + threshold_words(truth.unit, self._report.threshold)
+        names = f"{_short(self._sequence.images.names[query])} -> {_short(prediction)}"
+        note = f" (no place: {reason})" if (reason := self._reasons[query]) else ""
+        return f"{self._report.headline}, {verdict}{within}: {names}{note}"
+
+    def draw(self, path: Path, query: int, verdict: str) -> None:
+        """Draw the prediction, and below an incorrect one a correct one."""
+        candidates = [self._candidate(query, 0, verdict)]
+        candidates += self.correct_candidates(query) if verdict == "incorrect" else []
+        sequence, prediction = self._sequence, self._database.names[self._ranked.rows[query, 0]]
+        values = self._report.headline, sequence.name, verdict, sequence.images.names[query], prediction
+        about, original = dict(zip(ABOUT, values, strict=True)), sequence.images.read(query)
+        image = self._resize(original)
+        aspect = pixel_aspect_of(original, image)
+        histogram_figure(path, image, candidates, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
+
+    def correct_candidates(self, query: int) -> list[Candidate]:
+        """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
+        truth = self._sequence.truth
+        if self._correct is None or self._positives is None or truth is None or not self._positives.counts[query]:
+            return []
+        if self._correct[query].any():
+            return [self._candidate(query, int(np.argmax(self._correct[query])), "correct")]
+        nearest, rows = truth.place(query), self._positives.of(query)
+        row = nearest if nearest is not None and nearest in rows else int(rows[0])
+        return [self._shown(row, "correct", f"not among the {self._ranked.rows.shape[1]} candidates")]
+
+    def _candidate(self, query: int, rank: int, verdict: str) -> Candidate:
+        """The candidate at a rank from 0."""
+        row, score = int(self._ranked.rows[query, rank]), self._ranked.scores[query, rank]
+        place = int(np.flatnonzero(self._matched.candidates.indices[query] == row)[0])
+        pair = jax.tree.map(lambda values: values[place], self._matched.matches[0][query])
+        explanation = explain(self._report.histogram or HistogramOfShifts(), pair)
+        return self._shown(row, verdict, f"rank {rank + 1}, score {score:.5g}", pair, explanation)
+
+    def _shown(self, row: int, verdict: str, words: str, *matched: Any) -> Candidate:
+        caption = f"{verdict}: {_short(self._database.names[row])}, {words}"
+        return Candidate(self._resize(self._database.read(row)), caption, *matched)
+
+    def _resize(self, image: np.ndarray) -> np.ndarray:
+        extractor = self._report.ranked.system.pipeline.extractor
+        size = extractor.image_size
+        return image if size is None else resize(image, size, extractor.interpolation)
+
+
+def _short(name: str) -> str:
+    return clip_middle(printable(name), _NAME_LENGTH)
+
+
+def localization_figure(
+    path: Path,
+    known: Map,
+    name: str,
+    image: UInt8[np.ndarray, "height width 3"],
+    localization: Localization,
+    *,
+    root: Path | None = None,
+) -> None:
+    """Write the figure of one prediction: the image beside the best candidate, their matches, the histogram of shifts.
+
+    `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be read is drawn
+    gray, as are all without a folder. An InputError if the candidate's name leads out of the folder.
+    """
+    prediction, extractor, matches = localization.prediction, known.extractor, localization.matches
+    width, height = extractor.image_size
+    candidate = Candidate(np.full((height, width, 3), _GRAY, np.uint8), "no candidate")
+    if matches is not None:
+        best = prediction.alternatives[0].name
+        shown, note = candidate.image, " (its image is not at hand)"
+        if root is not None:
+            file = path_inside(root, best)
+            with suppress(InputError):  # the map keeps features, not images
+                shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
+        scorers = known.system.scorers.values()
+        histogram = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), HistogramOfShifts())
+        p = "" if prediction.confidence is None else f", confidence {prediction.confidence:.2f}"
+        caption = f"{clip_middle(best, _MAP_NAME_LENGTH)}{note}, score {prediction.score:.5g}{p}"
+        candidate = Candidate(shown, caption, matches, explain(histogram, matches))
+    query = resize(image, extractor.image_size, extractor.interpolation)
+    place = f"no place ({prediction.reason})" if prediction.place is None else str(prediction.place)
+    title = f"{clip_middle(name, _MAP_NAME_LENGTH)} -> {clip_middle(place, _MAP_NAME_LENGTH)}"
+    about = {"image": name, "place": str(prediction.place)}
+    histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
+
+
+def reliability_figures(report: EvaluationReport) -> list[Figure]:
+    """Reliability of the confidences, with ground truth; other curves of confidences are on the page."""
+    if not report.thresholds or not report.probabilities:
+        return []
+    bins = {name: reliability(values, report.hits(name)) for name, values in report.probabilities.items()}
+    return [("reliability.png", partial(reliability_figure, reliabilities=bins))]
+
+
+def with_longest_side(image: UInt8[np.ndarray, "_ _ 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Resize an image so that its longer side has so many pixels."""
+    scale = side / max(image.shape[:2])
+    return resize(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
 
 
 def contact_sheet(path: Path, dataset: Dataset) -> None:
@@ -144,14 +286,14 @@ def contact_sheet(path: Path, dataset: Dataset) -> None:
 
     Without ground truth, queries stand alone.
     """
+    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[tuple[np.ndarray | None, str]]]()
 
-    def read(folder: ImageFolder, row: int, sequence: str) -> LabeledImage:
+    def read(folder: ImageFolder, row: int, sequence: str) -> tuple[np.ndarray | None, str]:
         try:
             return with_longest_side(folder.read(row), _SIDE), f"{sequence} {folder.names[row]}".strip()
         except InputError:
             return None, f"{folder.names[row]} cannot be read"
 
-    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[LabeledImage]]()
     for sequence in dataset.sequences:
         for query in np.unique(np.linspace(0, len(sequence.images) - 1, each).round().astype(int)).tolist():
             place = None if sequence.truth is None else sequence.truth.place(query)

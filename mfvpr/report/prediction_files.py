@@ -80,16 +80,11 @@ def write_poses(
     by_name = dict(zip(database, read_poses(poses, database), strict=True))
     texts = []
     for image in images:
-        if image.place is None:
-            texts.append(None)
-        elif not image.candidates:
-            words = "expected the name of its place, got no alternatives; localize with alternatives=1 or more"
-            raise InputError(f"{shorten(image.name)}: {words}")
-        elif (name := image.candidates[0][0]) not in by_name:
-            words = f"expected a database image with a pose, got {shorten(name)}; name the folder of the database"
-            raise InputError(f"{shorten(image.name)}: {words}")
-        else:
-            texts.append(by_name[name])
+        name = image.candidates[0][0] if image.candidates else None
+        if image.place is not None and name not in by_name:
+            words = "localize with alternatives=1 or more, and name the folder of the database"
+            raise InputError(f"{shorten(image.name)}: expected a database image with a pose, got {name}; {words}")
+        texts.append(None if image.place is None or name is None else by_name[name])
     write_trajectory(path, texts, stamps)
 
 
@@ -114,14 +109,10 @@ def shortlist_of(images: Sequence[LocalizedImage], database: Sequence[str]) -> S
     indices, scores = np.full((len(images), depth), -1, np.int32), np.zeros((len(images), depth), np.float32)
     for query, image in enumerate(images):
         for rank, (name, score) in enumerate(image.candidates):
-            _require_known(name, rows, "an image of the database")
+            if name not in rows:
+                raise InputError(f"{shorten(name)}: expected an image of the database; the data set has changed")
             indices[query, rank], scores[query, rank] = rows[name], score
     return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-
-
-def _require_known(name: str, known: Mapping[str, int], expected: str) -> None:
-    if name not in known:
-        raise InputError(f"{shorten(name)}: expected {expected}, got none; the data set has changed since the run")
 
 
 def read_lines(path: Path) -> list[LocalizedImage]:
@@ -154,10 +145,11 @@ def read_lines(path: Path) -> list[LocalizedImage]:
 def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:
     """Localized images of a sequence of an evaluation, from the files in its folder; refused queries have no place."""
     candidates, cells = dict[str, list[tuple[str, float]]](), dict[str, dict[str, str]]()
-    known = {name: row for row, name in enumerate(queries)}
+    known = {*queries}
     with reading(folder / "predictions.csv", mend="expected the folder of an evaluation"):
         for row in read_csv(folder / "predictions.csv"):
-            _require_known(row["query"], known, "a query of the data set")
+            if row["query"] not in known:
+                raise InputError(f"{shorten(row['query'])}: expected a query of the data set, which has changed")
             if row["database"] != NO_PLACE:
                 candidates.setdefault(row["query"], []).append((row["database"], float(row["score"])))
     for name in ("top_predictions.csv", "shifts.csv"):

@@ -9,13 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
+from mfvpr.report import pages
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.prediction_files import CandidateLayout, write_candidates
+from mfvpr.report.run_files import save_run
 from mfvpr.report.runs import claim_run_folder, file_names, write_table
 from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache
@@ -98,7 +100,7 @@ class Result:
     cache: FeatureCache
 
     def __repr__(self) -> str:
-        return f"Result({', '.join(self._names(0))}; {', '.join(self._names(1))})"
+        return f"Result({'; '.join(map(', '.join, self._names))})"
 
     @property
     def only(self) -> RankedDataset:
@@ -115,20 +117,14 @@ class Result:
 
         Data sets without ground truth are left out; an InputError if there is no other.
         """
-        several_data, several_systems = (len(self._names(place)) > 1 for place in (0, 1))
-        rows, reports = list[dict[str, str]](), self._reports(thresholds, ks)
-        for (dataset, system), report in [part for part in reports if part[1].thresholds] or reports:
-            table = recall_table(report)
-            for line in table.rows:
-                row = ({"data set": dataset} if several_data else {}) | dict(zip(table.header, line, strict=True))
-                if not several_systems:
-                    rows.append(row)
-                elif row["system"] == report.headline:
-                    rows.append(row | {"system": system})
-        names = dict.fromkeys(name for row in rows for name in row)
-        texts = [name for name in ("data set", "system", "sequence") if name in names]
-        header = texts + [name for name in names if name not in texts]
-        return Table(header, [[row.get(name, "") for name in header] for row in rows], len(texts))
+        several_data, several_systems = (len(names) > 1 for names in self._names)
+        rows = []
+        for row in self._rows(thresholds, ks):
+            system = row["system"] if several_systems else row["score"]
+            dropped = {name: row[name] for name in row if name != "data set" or several_data}
+            if row["decides"] or not several_systems:
+                rows.append(dropped | {"system": system})
+        return recall_table(rows)
 
     def to_latex(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> str:
         """`table` as a `tabular` for the booktabs package."""
@@ -137,12 +133,9 @@ class Result:
     def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
         """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold."""
         rows = []
-        for (dataset, system), report in self._reports(thresholds, ks):
-            for score in report.ranked.systems:
-                names = {"data set": dataset, "system": system, "score": score, "decides": score == report.headline}
-                for row in report.rows(score):
-                    recall = {f"R@{k}": value for k, value in row.pop("recall_at").items()}
-                    rows.append(names | row | recall)
+        for row in self._rows(thresholds, ks):
+            recall = {f"R@{k}": value for k, value in row.pop("recall_at").items()}
+            rows.append(row | recall)
         return data_frame(rows)
 
     @cached_property
@@ -166,13 +159,11 @@ class Result:
         Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table. A folder
         that is not empty raises an `InputError`.
         """
-        from mfvpr.report.run_files import save_run  # here, since SciPy's statistics take 0.3 s
-
         folders, several, reports = list[Path](), len(self.parts) > 1, self._reports(thresholds, ks)
-        files = [file_names(self._names(place)) for place in (0, 1)]
+        dataset_files, system_files = map(file_names, self._names)
         with claim_run_folder(Path(folder)) as root:
             for (dataset, system), report in reports:
-                folders.append(root / files[0][dataset] / files[1][system] if several else root)
+                folders.append(root / dataset_files[dataset] / system_files[system] if several else root)
                 save_run(folders[-1], report, self.cache)
             if several and any(report.thresholds for _, report in reports):
                 write_table(root, self.table(thresholds, ks), f"recall in %, {self!r}")
@@ -194,17 +185,26 @@ class Result:
 
     def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""
-        from mfvpr.report.pages import one_run, several_runs
-
         with tempfile.TemporaryDirectory() as root:
             folders = self.save(Path(root) / "run", thresholds, ks)
             if len(folders) > 1:
-                several_runs.write_comparison(folders, Path(path))
+                pages.write_comparison(folders, Path(path))
             else:
-                one_run.write_report(folders[0], Path(path))
+                pages.write_report(folders[0], Path(path))
 
-    def _names(self, place: Literal[0, 1]) -> list[str]:
-        return list(dict.fromkeys(names[place] for names in self.parts))
+    @property
+    def _names(self) -> tuple[list[str], list[str]]:
+        """Names of the data sets, and of the systems."""
+        datasets, systems = (list(dict.fromkeys(names)) for names in zip(*self.parts, strict=True))
+        return datasets, systems
 
     def _reports(self, thresholds: Thresholds, ks: Sequence[int]) -> list[tuple[tuple[str, str], EvaluationReport]]:
         return [(names, EvaluationReport(ranked, thresholds or (), ks)) for names, ranked in self.parts.items()]
+
+    def _rows(self, thresholds: Thresholds, ks: Sequence[int]) -> list[dict[str, Any]]:
+        """Rows of `EvaluationReport.rows` of all parts; the final score is "score"."""
+        rows = []
+        for (dataset, system), report in self._reports(thresholds, ks):
+            for row in report.rows():
+                rows.append({"data set": dataset, "system": system, "score": row.pop("system"), **row})
+        return rows

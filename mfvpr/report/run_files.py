@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,21 +14,26 @@ from mfvpr.datasets.contents import Contents, fingerprints, readings
 from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
-from mfvpr.evaluation.dataset_ranking import RankedDataset
+from mfvpr.evaluation.confidence import write_confidences
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.fusion import FinalScore, Fusion
 from mfvpr.evaluation.protocol import places_along_path
-from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
 from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.evaluation.stages import Scales, dominant_shifts
-from mfvpr.evaluation.statistics import McNemar, PathTest, mcnemar, path_test
-from mfvpr.report.confidences import write_confidence
-from mfvpr.report.evaluations import NO_PLACE, EvaluationReport, recall_table
+from mfvpr.evaluation.statistics import mcnemar, path_test
+from mfvpr.report.evaluations import (
+    NO_PLACE,
+    SHARES,
+    EvaluationReport,
+    confidence_table,
+    recall_table,
+    recalls_by_share,
+)
 from mfvpr.report.runs import file_names, write_about, write_json, write_table, writing
-from mfvpr.report.tables import Table, format_number, write_csv
+from mfvpr.report.tables import format_number, write_csv
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.files import write_text
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 SHIFTS = ("shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "width", "height")  # px, of shifts.csv
 
@@ -73,21 +78,18 @@ def parameters(
 
 def heading(report: EvaluationReport, description: RunDescription) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
-
-    def skipped(number: int) -> str:
-        return f" ({number} skipped)" if number else ""
-
     dataset, matched, stages = report.ranked.dataset, report.ranked.matched, description.stages
     bad_queries = sum(len(sequence.bad_queries) for sequence in matched)
     bad_database = len({row for sequence in matched for row in sequence.bad_database})
+    skipped = [f" ({number} skipped)" if number else "" for number in (bad_queries, bad_database)]
     matching = stages["matching"]
     check = f"cross_check={matching['cross_check']}" if "cross_check" in matching else matching["name"]
     check = "" if check in ("cross_check=mutual", "import", "MatchFiles") else f", {check}"
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
-        f"{dataset.name}{incomplete}: {report.num_queries} queries{several}{skipped(bad_queries)}, "
-        f"{len(dataset.database)} database images{skipped(bad_database)}, "
+        f"{dataset.name}{incomplete}: {report.num_queries} queries{several}{skipped[0]}, "
+        f"{len(dataset.database)} database images{skipped[1]}, "
         f"{_num_candidates(report)} candidates ({stages['retrieval']['name']}), "
         f"{matched_content(stages)}{check}; {description.truth_words}"
     )
@@ -102,75 +104,8 @@ def matched_content(stages: Mapping[str, Mapping[str, Any]]) -> str:
     return f"matches of {matching['name']}" if is_of_images else f"{stages['features']['name']} features"
 
 
-def write_run_folder(folder: Path, report: EvaluationReport, description: RunDescription) -> None:
-    """Write all files of a run folder but run.json and the figures."""
-    dataset, truth = report.ranked.dataset, report.sequences[0].truth
-    common = {
-        "candidates": _num_candidates(report),
-        "queries": report.num_queries,
-        "dataset": dataset.name,
-        "data_fingerprint": fingerprints(description.contents),
-        "versions": versions(),
-    }
-    results = common | {
-        **description.stages,
-        "database": len(dataset.database),
-        "incomplete": list(published_differences(dataset)),
-        "ground_truth": ground_truth(report, description),
-        "reading": readings(description.contents),
-        "seconds": report.ranked.seconds,
-    }
-    rows = []
-    for name, score in report.ranked.system.final_scores.items():
-        system = {
-            "system": name,
-            "scorer": " + ".join(score.scorers) or "none",
-            "decides": name == report.headline,
-            "parameters": description.parameters[name],
-        }
-        rows += [system | recall | results for recall in report.rows(name)]
-    write_json(folder / "results.json", rows)
-    if report.thresholds:
-        write_table(folder, recall_table(report), heading(report, description))
-    write_rankings(folder, report)
-    write_gains(folder, report)
-    provenance = common | {  # of confidences, which are fitted on these data
-        "absent_queries": report.calibration[report.headline].num_absent if truth else 0,
-        "correct_within": [middle(report.thresholds), truth.unit] if truth else None,
-        "ground_truth": description.truth,
-        "settings": description.settings,
-        "command": description.command,
-    }
-    write_confidence(folder, report, provenance)
-    if report.histogram is not None:
-        _write_shifts(folder, report, report.histogram)
-    _write_changes(folder, report)
-    _write_skipped(folder, report.ranked)
-
-
-def _write_shifts(folder: Path, evaluation: EvaluationReport, scorer: HistogramOfShifts) -> None:
-    """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
-
-    A line has the refined dominant shift of the query's middle, and its 95 % interval; empty if no match votes. Their
-    px are those of the resized images, whose width and height follow. Queries that are refused have no line, features
-    of several scales no file.
-    """
-    names = evaluation.ranked.dataset.database.names
-    refused = evaluation.by_sequence(evaluation.refusals(evaluation.headline))
-    for place, ranked in enumerate(evaluation.ranked.systems[evaluation.headline]):
-        matched = evaluation.ranked.matched[place]
-        if isinstance(matched.by_scale, Scales):
-            continue
-        predictions = ranked.rows[:, 0]
-        queries = np.flatnonzero((predictions >= 0) & ~refused[place])
-        places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
-        shifts, intervals, sizes = dominant_shifts(scorer, matched.by_scale, queries, places)
-        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
-        lines = []
-        for query, row in zip(queries, numbers, strict=True):
-            pair = matched.sequence.images.names[query], names[predictions[query]]
-            lines.append([*pair, *map(format_number, row)])
-        write_csv(evaluation.folder(folder, place) / "shifts.csv", ["query", "prediction", *SHIFTS], lines)
+def _num_candidates(report: EvaluationReport) -> int:
+    return num_candidates(report.ranked.system.pipeline.candidates, report.ranked.dataset.database)
 
 
 def ground_truth(report: EvaluationReport, description: RunDescription) -> dict[str, Any]:
@@ -216,24 +151,80 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
         write_about(new, settings, ground_truth(report, description))
 
 
-def _num_candidates(report: EvaluationReport) -> int:
-    return num_candidates(report.ranked.system.pipeline.candidates, report.ranked.dataset.database)
+def write_run_folder(folder: Path, report: EvaluationReport, description: RunDescription) -> None:
+    """Write all files of a run folder but run.json and the figures."""
+    dataset, truth = report.ranked.dataset, report.sequences[0].truth
+    common = {
+        "candidates": _num_candidates(report),
+        "queries": report.num_queries,
+        "dataset": dataset.name,
+        "data_fingerprint": fingerprints(description.contents),
+        "versions": versions(),
+    }
+    results = common | {
+        **description.stages,
+        "database": len(dataset.database),
+        "incomplete": list(published_differences(dataset)),
+        "ground_truth": ground_truth(report, description),
+        "reading": readings(description.contents),
+        "seconds": report.ranked.seconds,
+    }
+    lines, rows = [], report.rows()
+    for row in rows:
+        name = row["system"]
+        scorers = report.ranked.system.final_scores[name].scorers
+        about = {"scorer": " + ".join(scorers) or "none", "parameters": description.parameters[name]}
+        recall_at = {str(k): round(recall, 6) for k, recall in row["recall_at"].items()}
+        lines.append(row | {"recall_at": recall_at} | about | results)
+    write_json(folder / "results.json", lines)
+    write_rankings(folder, report)
+    _write_changes(folder, report)
+    _write_skipped(folder, report)
+    if report.histogram is not None:
+        _write_shifts(folder, report, report.histogram)
+    if report.headline in report.probabilities:
+        _write_top_predictions(folder, report)
+    if truth is None:
+        return
+    write_table(folder, recall_table(rows), heading(report, description))
+    write_gains(folder, report)
+    _write_confidence(folder, report)
+    provenance = common | {  # of confidences, which are fitted on these data
+        "absent_queries": report.calibration[report.headline].num_absent,
+        "correct_within": [middle(report.thresholds), truth.unit],
+        "ground_truth": description.truth,
+        "settings": description.settings,
+        "command": description.command,
+    }
+    calibration = report.calibration.items()
+    fits = {name: data.fit() for name, data in calibration if np.isfinite(data.present).all(axis=1).any()}
+    write_confidences(folder / "confidence.json", fits, provenance)
 
 
-def write_rankings(folder: Path, evaluation: EvaluationReport) -> None:
+def _names(report: EvaluationReport, rows: np.ndarray) -> Any:
+    """Names of database images, "" for row -1."""
+    return np.array([*report.ranked.dataset.database.names, ""], object)[rows]
+
+
+def _cell(correct: np.ndarray | None, *place: Any) -> int | str:
+    """1 or 0, or empty where it is unknown what is correct."""
+    return "" if correct is None else int(correct[place])
+
+
+def write_rankings(folder: Path, report: EvaluationReport) -> None:
     """Write `predictions/` and `failures/` of every system, those of the headline's into the folder itself.
 
     Only there, queries of low confidence have the prediction `NO_PLACE`.
     """
-    database, files = evaluation.ranked.dataset.database.names, file_names([*evaluation.ranked.systems])
-    refused = evaluation.by_sequence(evaluation.refusals(evaluation.headline))
-    for place, sequence in enumerate(evaluation.sequences):
-        target, names = evaluation.folder(folder, place), (sequence.images.names, database)
-        for name, parts in evaluation.ranked.systems.items():
-            ranked, correct = parts[place], evaluation.is_correct(name, place)
+    database, files = report.ranked.dataset.database.names, file_names([*report.ranked.systems])
+    refused = report.by_sequence(report.refusals(report.headline))
+    for place, sequence in enumerate(report.sequences):
+        target, names = report.folder(folder, place), (sequence.images.names, database)
+        for name, parts in report.ranked.systems.items():
+            ranked, correct = parts[place], report.is_correct(name, place)
             write_predictions(target / "predictions" / f"{files[name]}.csv", *names, ranked, correct)
             write_failures(target / "failures" / f"{files[name]}.csv", *names, ranked, correct)
-            if name == evaluation.headline:
+            if name == report.headline:
                 write_failures(target / "failures.csv", *names, ranked, correct)
                 write_predictions(target / "predictions.csv", *names, ranked, correct, refused[place])
 
@@ -258,8 +249,7 @@ def write_predictions(
             candidate, score = (database[row], format_number(ranked.scores[query, rank])) if row >= 0 else ("", "")
             names = (NO_PLACE, candidate) if is_refused else (candidate, "")
             if rank == 0 if is_refused else row >= 0:
-                is_correct = "" if correct is None else int(correct[query, rank])
-                yield [queries[query], rank + 1, names[0], score, is_correct, names[1]]
+                yield [queries[query], rank + 1, names[0], score, _cell(correct, query, rank), names[1]]
 
     write_csv(path, ("query", "rank", "database", "score", "correct", "refused"), lines())
 
@@ -289,98 +279,127 @@ def write_failures(
     write_csv(path, ("query", "prediction", "rank", "correct_image", "score", "margin"), lines)
 
 
-def _write_skipped(folder: Path, ranked: RankedDataset) -> None:
-    """Write `skipped.csv` with images that could not be used and the reasons, if there are any."""
-    names = ranked.dataset.database.names
-    bad_rows = {bad for matched in ranked.matched for bad in matched.bad_database.items()}
-    lines = sorted(("database", names[row], reason) for row, reason in bad_rows)
-    for matched in ranked.matched:
-        queries = matched.sequence.images.names
-        lines += [("queries", queries[row], reason) for row, reason in matched.bad_queries.items()]
-    if lines:
-        write_csv(folder / "skipped.csv", ["folder", "image", "reason"], lines)
-
-
-def _write_changes(folder: Path, evaluation: EvaluationReport) -> None:
-    """Write `changes.csv` with the queries whose first prediction a sequence changes, if the system has sequences.
-
-    `correct_before` and `correct_after` are 1 or 0, or empty where it is unknown.
-    """
-    names, systems = evaluation.ranked.dataset.database.names, evaluation.ranked.systems
-    scores = evaluation.ranked.system.final_scores.values()
-    sequences = [(score.name, score.base) for score in scores if isinstance(score.step, DriveFilter)]
-    lines = []
-    for (name, base), (place, sequence) in itertools.product(sequences, enumerate(evaluation.sequences)):
-        rows = [systems[system][place].rows[:, 0] for system in (base, name)]
-        correct = [evaluation.is_correct(system, place) for system in (base, name)]
+def _write_changes(folder: Path, report: EvaluationReport) -> None:
+    """Write `changes.csv` with the queries whose first prediction a sequence changes, if the system has sequences."""
+    scores = report.ranked.system.final_scores.values()
+    filtered, lines = [score for score in scores if isinstance(score.step, DriveFilter)], []
+    for score, (place, sequence) in itertools.product(filtered, enumerate(report.sequences)):
+        systems = score.base, score.name
+        rows = np.stack([report.ranked.systems[str(name)][place].rows[:, 0] for name in systems])
+        correct, images = [report.is_correct(str(name), place) for name in systems], _names(report, rows)
         for query in np.flatnonzero(rows[0] != rows[1]):
-            cells = []
-            for row, is_correct in zip(rows, correct, strict=True):
-                cells.append(names[row[query]] if row[query] >= 0 else "")
-                cells.append("" if is_correct is None else int(is_correct[query, 0]))
-            lines.append([name, sequence.name, sequence.images.names[query], *cells])
-    if sequences:
+            before, after = ([images[turn, query], _cell(correct[turn], query, 0)] for turn in (0, 1))
+            lines.append([score.name, sequence.name, sequence.images.names[query], *before, *after])
+    if filtered:
         header = ["system", "sequence", "query", "before", "correct_before", "after", "correct_after"]
         write_csv(folder / "changes.csv", header, lines)
 
 
-class Difference(NamedTuple):
-    """Tests of two systems on the first predictions of all queries of all sequences."""
-
-    first: str
-    second: str
-    mcnemar: McNemar
-    path: PathTest
-
-    @property
-    def cells(self) -> list[str]:
-        """A line of `differences.csv`."""
-        only_first, only_second, p_value = self.mcnemar
-        return [self.first, self.second, str(only_first), str(only_second), *map(format_number, (p_value, *self.path))]
+def _write_skipped(folder: Path, report: EvaluationReport) -> None:
+    """Write `skipped.csv` with images that could not be used and the reasons, if there are any."""
+    names, matched = report.ranked.dataset.database.names, report.ranked.matched
+    bad_rows = {bad for sequence in matched for bad in sequence.bad_database.items()}
+    lines = sorted(("database", names[row], reason) for row, reason in bad_rows)
+    for part in matched:
+        queries = part.sequence.images.names
+        lines += [("queries", queries[row], reason) for row, reason in part.bad_queries.items()]
+    if lines:
+        write_csv(folder / "skipped.csv", ["folder", "image", "reason"], lines)
 
 
-def differences(evaluation: EvaluationReport) -> list[Difference]:
-    """Tests of every two systems, in their order, with ground truth."""
-    path = np.argsort(_places(evaluation), kind="stable")
-    hits = {name: evaluation.hits(name)[path] for name in evaluation.ranked.systems}
-    tests = []
-    for (first, first_hits), (second, second_hits) in itertools.combinations(hits.items(), 2):
-        pair = first_hits, second_hits
-        tests.append(Difference(first, second, mcnemar(*pair), path_test(*pair)))
-    return tests
+def _write_shifts(folder: Path, report: EvaluationReport, scorer: HistogramOfShifts) -> None:
+    """Write `shifts.csv` of every sequence: shifts of the headline's first predictions, candidate minus query, px.
+
+    A line has the refined dominant shift of the query's middle, and its 95 % interval; empty if no match votes. Their
+    px are those of the resized images, whose width and height follow. Queries that are refused have no line, features
+    of several scales no file.
+    """
+    refused = report.by_sequence(report.refusals(report.headline))
+    for place, ranked in enumerate(report.ranked.systems[report.headline]):
+        matched = report.ranked.matched[place]
+        if isinstance(matched.by_scale, Scales):
+            continue
+        predictions = ranked.rows[:, 0]
+        queries = np.flatnonzero((predictions >= 0) & ~refused[place])
+        places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
+        shifts, intervals, sizes = dominant_shifts(scorer, matched.by_scale, queries, places)
+        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
+        images, lines = _names(report, predictions), []
+        for query, row in zip(queries, numbers, strict=True):
+            lines.append([matched.sequence.images.names[query], images[query], *map(format_number, row)])
+        write_csv(report.folder(folder, place) / "shifts.csv", ["query", "prediction", *SHIFTS], lines)
 
 
-def _places(evaluation: EvaluationReport) -> np.ndarray:
-    """`[Q]` places of all queries along the map; those of one sequence without positions are in their order."""
-    truth = evaluation.sequences[0].truth
-    if truth is None or (len(evaluation.sequences) == 1 and truth.unit != "m"):
-        return np.arange(evaluation.num_queries)
-    known = [positives for positives in evaluation.positives if positives is not None]
-    return places_along_path(stack_positives(known), truth.unit)
+def _write_top_predictions(folder: Path, report: EvaluationReport) -> None:
+    """Write `top_predictions.csv` of every sequence.
+
+    `score`, `confidence` and `correct` are of the first candidate, also where the prediction is `NO_PLACE` for a
+    `reason`; `refused` is then its name, and `outcome` is "refused". `absent_confidence` is the confidence of the query
+    without the images of its place. `in_database` is 1 where the database shows the query's place; elsewhere `NO_PLACE`
+    is correct.
+    """
+    header = ["query", "prediction", "refused", "score", "confidence", "absent_confidence", "correct", "outcome"]
+    header += ["reason", "in_database"]
+    name, outcomes = report.headline, {"": "", 0: "incorrect", 1: "correct"}
+    values = map(report.by_sequence, (report.reasons(name), *report.both_probabilities[name]))
+    for place, (ranked, *parts) in enumerate(zip(report.ranked.systems[name], *values, strict=True)):
+        is_correct, positives = report.is_correct(name, place), report.positives[place]
+        in_database = None if positives is None else positives.counts > 0
+        lines, images = [], _names(report, ranked.rows[:, 0])
+        for query, (image, reason, *both) in enumerate(zip(report.sequences[place].images.names, *parts, strict=True)):
+            predictions = [NO_PLACE, images[query]] if reason else [images[query], ""]
+            numbers = [format_number(ranked.scores[query, 0])]
+            numbers += ["" if np.isnan(p) else repr(float(p)) for p in both]  # rounding may move them to another bin
+            correct = _cell(is_correct, query, 0)
+            verdict = [correct, "refused" if reason else outcomes[correct], reason or "", _cell(in_database, query)]
+            lines.append([image, *predictions, *numbers, *verdict])
+        write_csv(report.folder(folder, place) / "top_predictions.csv", header, lines)
 
 
-def write_gains(folder: Path, evaluation: EvaluationReport) -> None:
-    """Write `gains.csv` of every sequence, `differences.csv` and `differences.md`; nothing without ground truth.
+def write_gains(folder: Path, report: EvaluationReport) -> None:
+    """Write `gains.csv` of every sequence, and `differences.csv`; with ground truth.
 
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
     one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need.
     """
-    if not evaluation.thresholds:
-        return
-    systems, places = [*evaluation.ranked.systems], evaluation.by_sequence(_places(evaluation))
+    systems, places, truth = [*report.ranked.systems], np.arange(report.num_queries), report.sequences[0].truth
+    if truth is not None and (len(report.sequences) > 1 or truth.unit == "m"):  # else in the order of the queries
+        known = [positives for positives in report.positives if positives is not None]
+        places = places_along_path(stack_positives(known), truth.unit)
     header = ["query", "place", *(column for name in systems for column in (name, f"{name} rank"))]
-    for part, sequence in enumerate(evaluation.sequences):
-        columns = [sequence.images.names, places[part].tolist()]
+    for part, sequence in enumerate(report.sequences):
+        columns = [sequence.images.names, report.by_sequence(places)[part].tolist()]
         for name in systems:
-            correct = np.asarray(evaluation.is_correct(name, part), bool)
+            correct = np.asarray(report.is_correct(name, part), bool)
             ranks = np.where(correct.any(axis=1), np.argmax(correct, axis=1) + 1, 0)
             columns += [correct[:, 0].astype(int).tolist(), [rank or "" for rank in ranks.tolist()]]
-        write_csv(evaluation.folder(folder, part) / "gains.csv", header, zip(*columns, strict=True))
-    tests, counts = differences(evaluation), {}
-    for first, second, test, path in tests:
-        counts[first, second] = f"{test.only_first} (p {path.p_value:.2g})"
-        counts[second, first] = f"{test.only_second} (p {path.p_value:.2g})"
-    rows = [[name, *(counts.get((name, other), "") for other in systems)] for name in systems]
+        write_csv(report.folder(folder, part) / "gains.csv", header, zip(*columns, strict=True))
+    path, lines = np.argsort(places, kind="stable"), []
+    hits = {name: report.hits(name)[path] for name in systems}
+    for first, second in itertools.combinations(systems, 2):
+        lines.append([first, second, *difference_cells(hits[first], hits[second])])
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "design_effect", "path_p"]
-    write_csv(folder / "differences.csv", header, [test.cells for test in tests])
-    write_text(folder / "differences.md", Table(["only this is correct, not", *systems], rows).markdown())
+    write_csv(folder / "differences.csv", header, lines)
+
+
+def difference_cells(hits: Bool[np.ndarray, " queries"], others: Bool[np.ndarray, " queries"]) -> list[str]:
+    """Tests of hits of two systems along a path: queries that only one of them predicts correctly, McNemar's p,
+    design effect and p along the path.
+    """
+    only_first, only_second, p_value = mcnemar(hits, others)
+    return [str(only_first), str(only_second), *map(format_number, (p_value, *path_test(hits, others)))]
+
+
+def _write_confidence(folder: Path, report: EvaluationReport) -> None:
+    """Write tables and curves of confidences, with ground truth."""
+    table, recalls = confidence_table(report), recalls_by_share(report)
+    write_csv(folder / "confidence.csv", table.header, table.rows)
+    shares = zip(SHARES, *recalls.values(), strict=True) if RETRIEVAL in report.probabilities else ()
+    lines = [[f"{share:.2f}", *(f"{100 * recall:.1f}" for recall in row)] for share, *row in shares]
+    names = [name for name in report.ranked.systems if name != RETRIEVAL]
+    write_csv(folder / "rerank_share.csv", ["re-ranked", *names], lines)
+    points = []
+    for name in report.ranked.systems:
+        for by, curve in report.curves(name).items():
+            points += [[name, by, *map(format_number, point)] for point in zip(*curve, strict=True)]
+    write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)

@@ -11,7 +11,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.report.tables import Table, format_values, read_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import lock_folder, write_text
-from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import fingerprint, versions
 
 _UNFINISHED = ".unfinished"
 LAST = "results.json"  # the file of a run that appears last
@@ -28,12 +26,7 @@ LAST = "results.json"  # the file of a run that appears last
 _MOST_BYTES = 200  # a file system takes 255, and `replacing` adds some
 _PLAIN = re.compile(r'(?!\.)[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]*[^\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff. ]')
 
-Figure = tuple[str, Callable[[Path], None]]  # name of the file, and what draws it there
-
-
-def new_run_folder(root: Path, name: str) -> Path:
-    """The path `root/name/<time>`, for `claim_run_folder`."""
-    return root / name / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+Figure = tuple[str, Callable[[Path], Any]]  # name of the file, and what draws it there
 
 
 @contextmanager
@@ -51,10 +44,10 @@ def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False)
         InputError: the folder cannot be made or written to, is not empty, or another run uses it.
     """
     first, above = folder, [parent for parent in folder.absolute().parents if not parent.exists()]
+    if folder.is_symlink() or folder.is_file():
+        raise InputError(f"{folder}: expected a new or empty run folder, got a link or a file; name another")
     with ExitStack() as stack:
         try:
-            if folder.is_symlink() or folder.is_file():
-                raise InputError(f"{folder}: expected a new or empty run folder, got a link or a file; name another")
             for number in itertools.count(2):
                 try:
                     folder.mkdir(parents=True, exist_ok=not numbered)
@@ -64,13 +57,12 @@ def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False)
             in_use = InputError(f"{folder}: another run is using this folder; wait until it ends, or name another")
             with suppress(OSError):  # a file system without locks of folders, such as NFS
                 stack.enter_context(lock_folder(folder, in_use))
-            names = {path.name for path in folder.iterdir()}
-            if own and LAST not in names:
-                for path in folder.iterdir():
-                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-            elif names - {_UNFINISHED}:  # the folder stays as it is
+            paths = [*folder.iterdir()]
+            names = {path.name for path in paths} - {_UNFINISHED}
+            if names and (not own or LAST in names):  # the folder stays as it is
                 raise InputError(f"{folder}: expected a new or empty run folder; name another")
-            shutil.rmtree(folder / _UNFINISHED, ignore_errors=True)  # of a run that was killed
+            for path in paths:  # of a run that was killed
+                shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
             with tempfile.TemporaryFile(dir=folder):
                 pass
         except OSError as error:
@@ -132,7 +124,19 @@ def write_table(folder: Path, table: Table, heading: str, *, name: str = "table"
 
 def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path) -> None:
     """Add a finished run to the joint table in the folder of its multirun; jobs may end at the same time."""
-    job = {"job": number, "overrides": dict(overrides), "run": str(run), "rows": list(_rows(run))}
+    results = json.loads((run / LAST).read_text("utf-8"))
+    if isinstance(results, dict) and "axes" in results:  # of a sweep, the chosen setting
+        row = {"system": results["scorer"]["method"]}
+        for verdict in results["report"]:
+            column = f"R@1{threshold_words(results['unit'], verdict['threshold'])}"
+            row[column] = f"{100 * verdict['chosen']['recall']:.1f}"
+        rows = [row | {"chosen": " / ".join(map(format_values, results["chosen"]))}]
+    elif (run / "table.csv").exists():
+        table = read_csv(run / "table.csv")
+        rows = [{"system" if name == "score" else name: cell for name, cell in row.items()} for row in table]
+    else:
+        rows = [{"system": next(row["system"] for row in results if row["decides"])}]
+    job = {"job": number, "overrides": dict(overrides), "run": str(run), "rows": rows}
     multirun.mkdir(parents=True, exist_ok=True)
     with lock_folder(multirun, None):
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
@@ -148,22 +152,6 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
         table = Table(["job", *differing, *columns, "run"], lines, text_columns=len(differing) + 2)
         write_table(multirun, table, f"{len(jobs)} jobs")
         write_json(multirun / LAST, {"jobs": jobs})
-
-
-def _rows(run: Path) -> Iterator[dict[str, str]]:
-    """Cells by column of every system of a run: an evaluation, a sweep or a learning comparison."""
-    results = json.loads((run / LAST).read_text("utf-8"))
-    if isinstance(results, dict) and "axes" in results:
-        row = {"system": results["scorer"]["method"]}
-        for verdict in results["report"]:
-            column = f"R@1{threshold_words(results['unit'], verdict['threshold'])}"
-            row[column] = f"{100 * verdict['chosen']['recall']:.1f}"
-        yield row | {"chosen": " / ".join(map(format_values, results["chosen"]))}
-    elif (run / "table.csv").exists():
-        for row in read_csv(run / "table.csv"):
-            yield {"system" if name == "score" else name: cell for name, cell in row.items()}
-    else:
-        yield {"system": next(row["system"] for row in results if row["decides"])}
 
 
 def file_names(names: Sequence[str]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 import itertools
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,23 +11,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure as Canvas
+from matplotlib.patches import Rectangle
 
 from mfvpr import evaluation
 from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import runs
-from mfvpr.report.plots import heat_map_figure, save_figure, trials_figure
+from mfvpr.report.plots import MARK, PALE, panels, save_figure
 from mfvpr.report.runs import Figure, file_names
 from mfvpr.report.tables import Table, data_frame, format_estimate, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Axes, Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
-from mfvpr.utils.versions import versions
+from mfvpr.utils.fingerprints import versions
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-TOP = 10
+TOP = 10  # settings of the summary
 MAX_HEAT_MAPS = 6
+_FLAT_LENGTH = 9  # letters of a column's value that fit beside the next one's
 
 
 @dataclass(frozen=True, repr=False)
@@ -215,44 +217,72 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
     """Heat maps of every pair of axes with several values; of a search that tried no complete grid, all trials."""
     names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1]
     if not outcome.is_grid:
-        values = {name: [setting[name] for setting in outcome.settings] for name in names}
-        recall = outcome.recall[:, outcome.protocol.main]
-        return [("trials.png", partial(trials_figure, recall=recall, values=values, label=_label(outcome)))]
+        return [("trials.png", partial(_draw_trials, outcome=outcome, names=names))]
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     files = file_names([" + ".join(filter(None, pair)) for pair in pairs])
     figures = []
     for (first, second), file in zip(pairs[:MAX_HEAT_MAPS], files.values(), strict=False):
-        figures.append((f"{file}.png", partial(_draw, outcome, first, second)))
+        figures.append((f"{file}.png", lambda path, pair=(first, second): save_figure(_heat_map(outcome, *pair), path)))
     return figures
 
 
-def _draw(outcome: Outcome, first: str, second: str, path: Path) -> None:
-    save_figure(_heat_map(outcome, first, second), path)
+def _draw_trials(path: Path, outcome: Outcome, names: Sequence[str]) -> None:
+    """Draw recall over the trials, with the best so far, and over the values of each parameter."""
+    figure, [first, *axes] = panels(1 + len(names), 3.4, 2.6, sharey=True)
+    percent = 100 * outcome.recall[:, outcome.protocol.main]
+    first.plot(np.maximum.accumulate(percent), color=MARK, label="best so far")
+    first.plot(percent, ".", color=PALE)
+    first.set_xlabel("trial; 0 = the scorer's own values", fontsize=8)
+    first.set_ylabel(_label(outcome), fontsize=8)
+    first.legend(fontsize=7)
+    for panel, name in zip(axes, names, strict=True):
+        values = [setting[name] for setting in outcome.settings]
+        is_number = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+        places = values if is_number else list(map(str, values))
+        panel.scatter(places, percent, s=12, c=np.arange(len(percent)), cmap="viridis")  # later trials are brighter
+        panel.plot(places[int(np.argmax(percent))], percent.max(), "s", fillstyle="none", color=MARK, markersize=9)
+        panel.set_xlabel(name, fontsize=8)
+    save_figure(figure, path)
 
 
 def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
-    """Heat map over two axes (the first may be ""), the others at the best setting (of all queries)."""
+    """Heat map of recall over two axes (the first may be ""), the others at the best setting (of all queries).
+
+    The best setting is framed; a circle marks the scorer's own values, if the grid has them.
+    """
     axes, protocol = outcome.axes, outcome.protocol
     values = {"": [""]} | {name: list(map(format_value, axis)) for name, axis in axes.values.items()}
-    recall = outcome.recall[: axes.size, protocol.main].reshape(*map(len, values.values()))
+    recall = 100 * outcome.recall[: axes.size, protocol.main].reshape(*map(len, values.values()))
     flat_best = evaluation.best_setting(recall.reshape(-1), axes.values)
     best = dict(zip(values, map(int, np.unravel_index(flat_best, recall.shape)), strict=True))
-    own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
     plane = recall[tuple(slice(None) if name in (first, second) else best[name] for name in values)]
-    if list(values).index(first) > list(values).index(second):
-        plane = plane.T
+    plane = plane.T if list(values).index(first) > list(values).index(second) else plane
+    words = []
+    for name in (first, second):
+        stems = [Path(value).stem if value.endswith(".json") else value for value in values[name]]
+        words.append(stems if len({*stems}) == len(stems) else values[name])  # of files, if these differ
+    figure, [panel] = panels(1, 1.8 + 0.75 * len(words[1]), 1.9 + 0.5 * len(words[0]))
+    top, spread = plane.max(), max(float(plane.max() - plane.min()), 1.0)
+    image = panel.imshow(plane, cmap="viridis", aspect="auto", vmin=top - spread, vmax=top)
+    for (row, column), value in np.ndenumerate(plane):
+        color = "white" if value < top - 0.45 * spread else "black"
+        panel.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color=color)
+    panel.set_yticks(range(len(words[0])), words[0])
+    panel.set_xticks(range(len(words[1])), words[1])
+    panel.set(xlabel=second, ylabel=first)
+    if any(len(word) > _FLAT_LENGTH for word in words[1]):
+        panel.tick_params("x", rotation=30)
+    corner = best[second] - 0.5, best[first] - 0.5
+    panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))
+    own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
+    if own[first] in values[first] and own[second] in values[second]:
+        place = values[second].index(own[second]), values[first].index(own[first])
+        panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=MARK)
     fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
-    in_grid = own[first] in values[first] and own[second] in values[second]
-    defaults = (values[first].index(own[first]), values[second].index(own[second])) if in_grid else None
-    sides, title = ((name, _short(values[name])) for name in (first, second)), "; ".join([_label(outcome), *fixed])
-    return heat_map_figure(plane, *sides, best=(best[first], best[second]), defaults=defaults, title=title)
+    panel.set_title("; ".join([_label(outcome), *fixed]), fontsize=9, parse_math=False)
+    figure.colorbar(image, ax=panel, label="%")
+    return figure
 
 
 def _label(outcome: Outcome) -> str:
     return f"{outcome.protocol.label(1, outcome.protocol.thresholds[outcome.protocol.main])} in %"
-
-
-def _short(values: list[str]) -> list[str]:
-    """Shorten JSON files to their stems, if these differ."""
-    names = [Path(value).stem if value.endswith(".json") else value for value in values]
-    return names if len({*names}) == len(names) else values

@@ -1,12 +1,11 @@
-"""Tables as text for the terminal, Markdown, CSV, and LaTeX."""
+"""Tables as text for the terminal, Markdown, CSV, and LaTeX; numbers and names in them."""
 
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,15 +34,12 @@ class Table:
 
     def text(self) -> str:
         """Text for the terminal."""
-        widths = [max(map(len, column)) for column in zip(self.header, *self.rows, strict=True)]
-        lines = []
-        for row in (self.header, *self.rows):
-            cells = [
-                cell.ljust(width) if column < self.text_columns else cell.rjust(width)
-                for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ]
-            lines.append("  ".join(cells).rstrip())
-        return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]]) + "\n"
+        columns = []
+        for number, column in enumerate(zip(self.header, *self.rows, strict=True)):
+            width, is_text = max(map(len, column)), number < self.text_columns
+            columns.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in column])
+        first, *lines = ("  ".join(cells).rstrip() for cells in zip(*columns, strict=True))
+        return "\n".join([first, "-" * len(first), *lines]) + "\n"
 
     def markdown(self) -> str:
         """GitHub's Markdown."""
@@ -53,9 +49,7 @@ class Table:
 
     def csv(self) -> str:
         """Comma-separated, quoted where needed."""
-        out = io.StringIO()
-        _write_rows(out, [self.header, *self.rows])
-        return out.getvalue()
+        return _csv([self.header, *self.rows])
 
     def latex(self) -> str:
         """A `tabular` for the booktabs package."""
@@ -94,14 +88,18 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | 
 
     A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
     """
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", errors="surrogateescape") as file:
-        _write_rows(file, [header, *lines])
+    with replacing(path) as temporary:
+        temporary.write_bytes(_csv([header, *lines]).encode("utf-8", "surrogateescape"))
 
 
-def _write_rows(file: TextIO, rows: Iterable[Sequence[str | int]]) -> None:
-    """Write CSV with \\n at the end of lines; Python quotes \\r only if it is in `lineterminator` (before 3.13)."""
-    lines: Any = SimpleNamespace(write=lambda line: file.write(line.removesuffix("\r\n") + "\n"))
-    csv.writer(lines, lineterminator="\r\n").writerows(rows)
+def _csv(rows: Iterable[Sequence[str | int]]) -> str:
+    """Lines that end in \\n, where every cell with an end of a line is quoted."""
+    lines = []
+    for row in rows:
+        line = io.StringIO()
+        csv.writer(line).writerow(row)  # Python quotes \r only if it is in `lineterminator` (before 3.13)
+        lines.append(line.getvalue().removesuffix("\r\n") + "\n")
+    return "".join(lines)
 
 
 def format_number(value: Any) -> str:

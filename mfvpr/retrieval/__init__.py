@@ -1,7 +1,7 @@
 """Global descriptors -> a shortlist of candidates for every query.
 
-Read first: search (exact search), retriever (the protocol), fitting (vocabularies and whitenings of the database),
-ssm_voting, precomputed (shortlists and descriptors from files).
+Read first: search (exact search), retriever (the protocol, search by descriptors, votes, and what is learned from a
+database), precomputed (shortlists and descriptors from files).
 """
 
 import lazy_loader

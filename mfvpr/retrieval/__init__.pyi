@@ -13,8 +13,6 @@ __all__ = [
     "retrieve",
 ]
 
-from .fitting import fit_to_database
 from .precomputed import DescriptorFiles, FeatureFiles, MatchFiles, ShortlistFiles
-from .retriever import Retrieval, RetrievalResult, Retriever
+from .retriever import Retrieval, RetrievalResult, Retriever, SsmVoting, fit_to_database
 from .search import ExactSearch, WhitenedSearch, retrieve
-from .ssm_voting import SsmVoting

@@ -1,6 +1,6 @@
 """Files of other programs in place of extractors and retrievals; the cache knows them by content, not by path."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,10 +13,8 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.image_reading import Interpolation, read_size
 from mfvpr.features.extractor import Scale
-from mfvpr.io.checks import Lengths
-from mfvpr.io.containers import FileEntry
-from mfvpr.io.descriptors import read_with_entries as read_descriptors
-from mfvpr.io.features import ImportedFeatures, open_features
+from mfvpr.io.features import ImportedFeatures, Lengths, open_features
+from mfvpr.io.features import read_descriptors_with_entries as read_descriptors
 from mfvpr.io.matches import Images, ImportedMatches, content_paths, open_matches
 from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
@@ -44,43 +42,44 @@ class File:
 
 
 @dataclass(frozen=True)
-class FeatureFiles:
-    """Local features of another program, see `mfvpr.io.open_features`."""
+class _FolderFiles:
+    """Files by the root of the folder of images, and the images of their entries: none is of two images."""
 
-    files: Mapping[Path, File]  # by the root of the folder of images
-    lengths: Lengths = "unit"  # of descriptors
-    image_size: tuple[int, int] | None = None  # (width, height) px, if the files do not store it
-    interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
-    scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
+    files: Mapping[Path, File]
     _images: ImageOfEntry = field(
         default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False}
     )
 
+
+@dataclass(frozen=True)
+class FeatureFiles(_FolderFiles):
+    """Local features of another program, see `mfvpr.io.open_features`; a `Source`."""
+
+    lengths: Lengths = "unit"  # of descriptors
+    image_size: tuple[int, int] | None = None  # (width, height) px, if the files do not store it
+    interpolation: Interpolation = field(default="pil_bilinear", metadata={"recipe": False})
+    scales: tuple[Scale, ...] = field(default=(Scale(0, TYPICAL),), metadata={"recipe": False})
+
     def open(self, folder: ImageFolder, *, partial: bool) -> ImportedFeatures:
         """Open the features of a folder's images; `partial` allows missing images."""
         file = _file_of(self.files, folder)
-        features = open_features(
-            file.path, file.names(folder), image_size=self.image_size, lengths=self.lengths, partial=partial
-        )
+        options = {"image_size": self.image_size, "lengths": self.lengths, "partial": partial}
+        features = open_features(file.path, file.names(folder), **options)
         require_one_image(file.path, folder.paths, features.entries, self._images)
         return features
 
 
 @dataclass(frozen=True)
-class DescriptorFiles:
+class DescriptorFiles(_FolderFiles):
     """Candidates by global descriptors of another program, see `mfvpr.io.read_global_descriptors` for `lengths`."""
 
-    files: Mapping[Path, File]  # by the root of the folder of images
     lengths: Lengths = "unit"
     search: Search = EXACT
-    _images: ImageOfEntry = field(
-        default_factory=dict, init=False, repr=False, compare=False, metadata={"recipe": False}
-    )
 
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `mfvpr.retrieval.retriever.Retriever`."""
+        """See `Retriever`."""
         database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
         search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
@@ -104,45 +103,50 @@ class ShortlistFiles:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `mfvpr.retrieval.retriever.Retriever`; candidates that the sequence excludes are removed."""
-        file = _file_of(self.files, sequence.images)
+        """See `Retriever`; candidates that the sequence excludes are removed, and those beyond them move up."""
+        file, queries, known = _file_of(self.files, sequence.images), sequence.images, ImageOfEntry()
         names = [self.database_prefix + name for name in database.names]
-        shortlist, query_entries, database_entries = read_shortlist(file.path, file.names(sequence.images), names)
-        images: ImageOfEntry = {}
-        _require_own_folder(file.path, database, sequence.images, database_entries)
-        require_one_image(file.path, database.paths, database_entries, images)
-        require_one_image(file.path, sequence.images.paths, query_entries, images)
+        shortlist, query_entries, entries = read_shortlist(file.path, file.names(queries), names)
+        own, other = (f"/{each.root.absolute().as_posix().strip('/')}/" for each in (database, queries))
+        for name, entry in zip(database.names, entries, strict=True):
+            start = "/" if entry is None else "/" + entry.name.removesuffix(name).lstrip("/")
+            if start != "/" and other.endswith(start) and not own.endswith(start):
+                got = f"those in {queries.root}; exchange dataset.database and dataset.queries, or the file's columns"
+                raise InputError(f"{file.path}: expected names of images in {database.root}, got {got}")
+        require_one_image(file.path, database.paths, entries, known)
+        require_one_image(file.path, queries.paths, query_entries, known)
         if sequence.excluded is not None:
             shortlist = replace(shortlist, mask=shortlist.mask & ~sequence.excluded.contains(shortlist.indices))
         return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
 
 
+def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
+    """Shortlist of `num_candidates`, cut or padded; candidates beyond a masked one move up."""
+    missing = max(0, num_candidates - shortlist.mask.shape[1])
+    padded = jax.tree.map(lambda values: np.pad(values, ((0, 0), (0, missing))), shortlist)
+    order = np.argsort(~padded.mask, axis=1, kind="stable")[:, :num_candidates]
+    cut = jax.tree.map(lambda values: np.take_along_axis(values, order, axis=1), padded)
+    return Shortlist(np.where(cut.mask, cut.indices, -1), np.where(cut.mask, cut.scores, 0), cut.mask)
+
+
 @dataclass(frozen=True)
 class MatchFiles:
-    """Matches of another program in place of a matcher, see `mfvpr.io.open_matches`.
+    """Matches of another program in place of a matcher, see `mfvpr.io.open_matches` for `verified` and `confidences`.
 
         files = {data.queries.root: File("matches.h5")}
         features = {folder.root: File("feats.h5") for folder in (data.queries, data.database)}
         pipeline = mfvpr.Pipeline(extractor, retriever, MatchFiles(files, features=features))
 
     The extractor of the pipeline is used only for retrieval.
-
-    Attributes:
-        files: by the root of the folder of queries, with the prefix of the queries' names.
-        database_prefix: of the database images' names.
-        features: hloc's features, by the root of the folder of images.
-        image_size: (width, height) of the images that points are in, px, if the files do not tell.
-        verified, confidences: see `mfvpr.io.open_matches`.
-        lengths: of the features' descriptors, see `mfvpr.io.open_features`.
     """
 
-    files: Mapping[Path, File]
-    database_prefix: str = ""
-    features: Mapping[Path, File] = field(default_factory=dict)
-    image_size: tuple[int, int] | None = None
+    files: Mapping[Path, File]  # by the root of the folder of queries, with the prefix of the queries' names
+    database_prefix: str = ""  # of the database images' names
+    features: Mapping[Path, File] = field(default_factory=dict)  # hloc's, by the root of the folder of images
+    image_size: tuple[int, int] | None = None  # (width, height) of the images with the points, if no file tells, px
     verified: bool = False
     confidences: bool = True
-    lengths: Lengths = "unit"
+    lengths: Lengths = "unit"  # of the features' descriptors
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -180,27 +184,5 @@ def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
     files = {Path(root): file for root, file in files.items()}
     if folder.root not in files:
         known = ", ".join(map(str, files)) or "none"
-        expected = f"a folder that a file was given of, one of: {known}"
-        raise InputError(f"{folder.root}: expected {expected}; give one of this folder as well")
+        raise InputError(f"{folder.root}: expected a folder that has a file, one of: {known}; give one for it as well")
     return files[folder.root]
-
-
-def _require_own_folder(
-    path: Path, folder: ImageFolder, other: ImageFolder, entries: Sequence[FileEntry | None]
-) -> None:
-    """Raise an InputError if names of a file begin with the other folder's name, but not with that of their own."""
-    own_parts, other_parts = (f"/{each.root.absolute().as_posix().strip('/')}/" for each in (folder, other))
-    for name, entry in zip(folder.names, entries, strict=True):
-        start = "/" + entry.name.removesuffix(name).lstrip("/") if entry is not None else "/"
-        if start != "/" and other_parts.endswith(start) and not own_parts.endswith(start):
-            got = f"names in {other.root}; exchange dataset.database and dataset.queries, or the columns of the file"
-            raise InputError(f"{path}: expected names of images in {folder.root}, got {got}")
-
-
-def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
-    """Shortlist of `num_candidates`, cut or padded; candidates beyond a masked one move up."""
-    missing = max(0, num_candidates - shortlist.mask.shape[1])
-    padded = jax.tree.map(lambda values: np.pad(values, ((0, 0), (0, missing))), shortlist)
-    order = np.argsort(~padded.mask, axis=1, kind="stable")[:, :num_candidates]
-    cut = jax.tree.map(lambda values: np.take_along_axis(values, order, axis=1), padded)
-    return Shortlist(np.where(cut.mask, cut.indices, -1), np.where(cut.mask, cut.scores, 0), cut.mask)

@@ -1,16 +1,27 @@
-"""Retrieval (the paper's filter): candidates among the database images for each query of a sequence."""
+"""Retrieval (the paper's filter): candidates for each query; what it learns from the database, it learns once."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
-from mfvpr.features.extractor import Aggregated, Extractor
+from mfvpr.datasets.positives import Positives
+from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
+from mfvpr.features.whitening import Whitening
+from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT, Search
+from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
+
+if TYPE_CHECKING:  # Flax takes half a second
+    from mfvpr.features.ssm_features import SsmWindows
+
+QUERIES = 64  # of SSM-VPR, searched at a time
+Tool = TypeVar("Tool")
 
 
 class RetrievalResult(NamedTuple):
@@ -44,13 +55,143 @@ class Retrieval:
         """See `Retriever`."""
         database_vectors = cache.vectors(database, self.describer, database, label="database")
         query_vectors = cache.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
+        search = cache.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         # An image without features has the descriptor 0, which is equally similar to all.
         is_zero = ~query_vectors.values.any(axis=1, keepdims=True)
-        search = cache.once("search", lambda: self.search.fit(database_vectors.values), database, self)
-        candidates = search.shortlist(
-            np.where(is_zero, np.nan, query_vectors.values),
-            database_vectors.values,
-            num_candidates,
-            excluded=sequence.excluded,
-        )
+        queries = np.where(is_zero, np.nan, query_vectors.values)
+        candidates = search.shortlist(queries, database_vectors.values, num_candidates, excluded=sequence.excluded)
         return RetrievalResult(candidates, query_vectors.bad, database_vectors.bad)
+
+
+@dataclass(frozen=True)
+class SsmVoting:
+    """Candidates by votes (SSM-VPR): each query window votes for the images of its C nearest database windows.
+
+    Among images with equal votes the lowest row comes first; the public code's unstable sort leaves their order open.
+    Images without votes fill the rest of the shortlist.
+    """
+
+    describer: "SsmWindows"
+
+    def shortlist(
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
+    ) -> RetrievalResult:
+        """See `Retriever`; scores are votes."""
+        describer = fit_to_database(self.describer, database, cache)
+        database_vectors = cache.vectors(database, describer, database, label="database")
+        query_vectors = cache.vectors(sequence.images, describer, database, label=f"query {sequence.name}")
+        shape = (-1, describer.windows.count, describer.whitening.dimension)
+        queries, windows = query_vectors.values.reshape(shape), database_vectors.values.reshape(shape)
+        candidates = vote(queries, windows, num_candidates, excluded=sequence.excluded)
+        return RetrievalResult(candidates, query_vectors.bad, database_vectors.bad)
+
+
+def vote(
+    queries: Float[np.ndarray, "queries windows dimensions"],
+    database: Float[np.ndarray, "database windows dimensions"],
+    num_candidates: int,
+    *,
+    excluded: Positives | None = None,
+) -> Shortlist:
+    """Candidates by votes, NumPy: most votes first, then the lowest row.
+
+    Each query window votes for `num_candidates` windows. A query with a window that is not finite has no candidates; a
+    database image with such a window is no candidate. Windows of `excluded` images get no votes.
+    """
+    usable0, usable1 = (np.asarray(np.isfinite(side).all(axis=(1, 2))) for side in (queries, database))
+    windows = np.where(usable1[:, None, None], database, np.nan).reshape(-1, database.shape[2])
+    squares = np.einsum("nd,nd->n", windows, windows, dtype=np.float64)
+    windows = np.concatenate([windows, -squares[:, None] / 2], axis=1).astype(np.float32)
+    window, excluded_windows = np.arange(database.shape[1]), None
+    indices = np.full((len(queries), num_candidates), -1, np.int32)
+    scores = np.zeros(indices.shape, np.float32)
+    for start in range(0, len(queries), QUERIES):
+        part = slice(start, start + QUERIES)
+        unusable = ~(usable0[part, None] & usable1[None])
+        if excluded is not None:  # all windows of the excluded images, for every window of a query
+            unusable |= excluded.dense(part)
+            images = map(excluded.of, range(len(excluded))[part])
+            rows = [(each[:, None] * len(window) + window).reshape(-1) for each in images]
+            excluded_windows = Positives.from_rows((of_query for of_query in rows for _ in window), len(windows))
+        # The window b nearest to a maximizes (a, 1) . (b, -|b|^2 / 2).
+        query_windows = np.pad(queries[part], ((0, 0), (0, 0), (0, 1)), constant_values=1)
+        query_windows = query_windows.reshape(-1, windows.shape[1])
+        nearest = EXACT.shortlist(query_windows, windows, num_candidates, excluded=excluded_windows)
+        images = np.where(nearest.mask, nearest.indices // database.shape[1], len(database))
+        votes = [np.bincount(row, minlength=len(database) + 1) for row in images.reshape(len(unusable), -1)]
+        votes = np.where(unusable, -1, np.array(votes)[:, :-1])
+        order = np.argsort(-votes, axis=1, kind="stable")[:, :num_candidates]
+        counts = np.take_along_axis(votes, order, axis=1)
+        indices[part, : order.shape[1]] = np.where(counts < 0, -1, order)
+        scores[part, : order.shape[1]] = np.maximum(counts, 0)
+    return Shortlist(indices, scores, indices >= 0)
+
+
+def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> Tool:
+    """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
+
+        cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
+
+    If the cache has a root, a learned part is stored there as one `.npz` file, named by the images' content and all
+    settings; its content is part of the recipe of everything that is computed with it. Parts that are learned already
+    stay the same, even if they were learned from another database. Images that cannot be read or are too few raise an
+    `InputError`.
+    """
+    if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
+        fitting = tool.whitening
+        whitening = cache.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
+        return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
+    return with_parts(tool, lambda part: fit_to_database(part, database, cache))
+
+
+def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
+    """Apply a function to the fields of a dataclass; the same object if none changes, or if it is no dataclass."""
+    if not is_dataclass(whole) or isinstance(whole, type):
+        return whole
+    parts = {part.name: getattr(whole, part.name) for part in fields(whole) if part.init}
+    changed = {name: new for name, part in parts.items() if (new := change(part)) is not part}
+    return replace(whole, **changed) if changed else whole
+
+
+def whitening_recipe(extractor: WindowExtractor, fitting: WindowFitting, cache: FeatureCache) -> dict[str, Any]:
+    """Recipe of a whitening but for the database: network and its input, windows, and samples."""
+    parts = {"windows": cache.recipes.of(extractor.windows), "whitening": cache.recipes.of(fitting)}
+    return cache.recipes.of_features(extractor.maps) | parts
+
+
+def _whitening(
+    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
+) -> Whitening:
+    """Whitening from the cache, learned and stored there if it is missing."""
+    name, own_origin = f"{type(extractor).__name__}-whitening", origin(extractor)
+
+    def learn() -> Whitening:
+        rows, track = fitting.sample_rows(len(database)), cache.runtime.progress(name.replace("-", " "))
+
+        def maps() -> Iterator[dict[int, np.ndarray]]:
+            for batch in describe_folder(database, extractor.maps, rows, {}, skip_bad=cache.skip_bad, track=track):
+                yield {row: np.reshape(each.vector, extractor.windows.shape) for row, each in batch.items()}  # pyright: ignore
+
+        return replace(fitting.fit(maps(), extractor.windows, rows), origin=own_origin)
+
+    recipe = cache.recipe(lambda: whitening_recipe(extractor, fitting, cache))
+    if recipe is None or cache.root is None:
+        return learn()
+    key = cache.recipes.contents(database).fingerprint
+    files = CacheFiles(
+        cache.root,
+        name,
+        recipe,
+        pack=lambda whitening: {"mean": whitening.mean, "components": whitening.components},
+        unpack=lambda arrays: Whitening(arrays["mean"], arrays["components"], own_origin),
+    )
+    whitening = files.get(key)
+    if whitening is None:
+        is_damaged = key in files
+        if is_damaged:
+            cache.warn(f"{files.path(key)}: is damaged; learned again")
+        whitening = learn()
+        files.update({key: whitening}, once=not is_damaged)  # the first of several counts: bits may differ
+        cache.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
+        whitening = files.get(key) or whitening
+    return whitening

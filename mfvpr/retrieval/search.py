@@ -11,16 +11,14 @@ from jaxtyping import Bool, Float
 
 from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.positives import Positives
+from mfvpr.features.whitening import Whitening, fit_whitening
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked
-from mfvpr.utils.ragged import repeat_last
-from mfvpr.utils.whitening import Whitening, fit_whitening
+from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked, repeat_last
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
 ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it
 ROWS_SHARE = 1 / 4  # of an accelerator's free memory, for the database rows there
 BLOCK = 128  # database rows, of which an accelerator first looks at the largest similarity
-
 
 Queries = Float[np.ndarray, "queries dimensions"]
 Database = Float[np.ndarray, "database dimensions"]
@@ -28,17 +26,11 @@ Database = Float[np.ndarray, "database dimensions"]
 
 @dataclass(frozen=True)
 class ExactSearch:
-    """Search for the largest dot products in chunks, with the result of `retrieve`.
+    """Search for the largest dot products in chunks that fit into memory, with the result of `retrieve`.
 
     Above 65,536 database rows, the last bits of scores depend on the block of 65,536 rows: of equal descriptors in
-    different blocks, any may come first.
-
-    Attributes:
-        memory: GB of similarities that may exist at the same time, at least those of two queries with 65,536 rows;
-            None = a sixteenth of the free memory. On a CPU, the result does not depend on it, in any bit.
+    different blocks, any may come first. On a CPU, no bit depends on the free memory.
     """
-
-    memory: float | None = None
 
     def fit(self, database: Database) -> "ExactSearch":
         """Return itself: there is nothing to learn."""
@@ -48,17 +40,20 @@ class ExactSearch:
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
-        if queries.shape[1] != database.shape[1]:
-            got = f"{queries.shape[1]} for queries and {database.shape[1]} for the database"
-            raise InputError(f"global descriptors: expected as many numbers on both sides, got {got}")
-        if not len(queries) or not len(database):
-            got = f"{len(queries)} of queries and {len(database)} of the database"
-            raise InputError(f"global descriptors: expected at least one on both sides, got {got}")
+        if queries.shape[1] != database.shape[1] or not len(queries) or not len(database):
+            expected, got = "at least one on both sides, of as many numbers", f"{queries.shape} and {database.shape}"
+            raise InputError(f"global descriptors: expected {expected}, got shapes {got} (database)")
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
             expected = f"rows for {len(queries)} queries and {len(database)} database images"
             raise InputError(f"excluded: expected {expected}, got {len(excluded)} and {excluded.num_database}")
-        num_rows = min(len(database), _rows_at_once(database.shape[1]))
-        chunk_size = self._chunk_size(len(queries), num_rows)
+        device = device_of(())
+        num_rows = ROWS
+        if device.platform != "cpu":  # as many as fit, since every part costs a wait
+            num_rows = max(ROWS, int(ROWS_SHARE * free_bytes(device)) // (4 * database.shape[1]))
+        num_rows = min(len(database), num_rows)
+        # Queries at a time, at least 2, with similarities that fit: 8 bytes for one and its masked copy.
+        fitting = max(2, int(SHARE * free_bytes(device)) // 8 // num_rows)
+        chunk_size = -(-len(queries) // -(-len(queries) // fitting))
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
         for rows in _parts(len(database), num_rows):
             on_device = jax.device_put(as_array(database[rows]))  # once for all chunks
@@ -71,12 +66,6 @@ class ExactSearch:
                 shortlists[part.start] = jax.device_get(shortlist)  # waits: one chunk at a time
         joined = jax.tree.map(lambda *fields: np.concatenate(fields), *shortlists.values())
         return jax.tree.map(lambda field: field[: len(queries)], joined)
-
-    def _chunk_size(self, num_queries: int, num_rows: int) -> int:
-        """Queries at a time, at least 2, with similarities to `num_rows` rows that fit."""
-        available = SHARE * free_bytes(device_of(())) if self.memory is None else 1e9 * self.memory
-        fitting = max(2, int(available) // 8 // num_rows)  # 8 bytes: a similarity, and its masked copy
-        return -(-num_queries // -(-num_queries // fitting))
 
 
 EXACT = ExactSearch()
@@ -92,58 +81,41 @@ class WhitenedSearch:
     Attributes:
         dimension: D', number of components.
         max_samples: maximum number of descriptors to learn from, evenly spread over the database.
-        search: search among the whitened descriptors.
+        whitening: the learned components; None = `shortlist` learns them from the database.
     """
 
     dimension: int
     max_samples: int = 4096
-    search: ExactSearch = EXACT
+    whitening: Whitening | None = None
 
     def __post_init__(self) -> None:
         if self.dimension < 1:
             raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
-    def fit(self, database: Database) -> "Whitened":
-        """Search with the principal components of a database."""
+    def fit(self, database: Database) -> "WhitenedSearch":
+        """Search with the principal components of a database; itself if they were learned."""
+        if self.whitening is not None:
+            return self
         usable = database[np.isfinite(database).all(axis=1)]
         rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
-        sample = usable[rows].astype(np.float64)
-        fitted = fit_whitening(sample, self.dimension)
+        fitted = fit_whitening(usable[rows].astype(np.float64), self.dimension)
         single = Whitening(fitted.mean.astype(np.float32), fitted.components.astype(np.float32))
-        return Whitened(single, self.search)
-
-    def shortlist(
-        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
-    ) -> Shortlist:
-        """As `ExactSearch.shortlist`; learns from the database first."""
-        return self.fit(database).shortlist(queries, database, num_candidates, excluded=excluded)
-
-
-@dataclass(frozen=True)
-class Whitened:
-    """`WhitenedSearch` with components that were learned."""
-
-    whitening: Whitening
-    search: ExactSearch
-
-    def fit(self, database: Database) -> "Whitened":
-        """Return itself: the components are known."""
-        return self
+        return replace(self, whitening=single)
 
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """As `ExactSearch.shortlist`."""
-        queries, database = _whiten(queries, self.whitening), _whiten(database, self.whitening)
-        return self.search.shortlist(queries, database, num_candidates, excluded=excluded)
+        learned = self.whitening or self.fit(database).whitening
+        assert learned is not None
+        whiten = partial(_project, mean=learned.mean, components=learned.components)
+        queries, database = (
+            np.concatenate([whiten(side[part]) for part in _parts(len(side), ROWS)]) for side in (queries, database)
+        )
+        return EXACT.shortlist(queries, database, num_candidates, excluded=excluded)
 
 
-Search = ExactSearch | WhitenedSearch | Whitened
-
-
-def _whiten(rows: np.ndarray, whitening: Whitening) -> Float[np.ndarray, "images dimensions"]:
-    mean, components = whitening.mean, whitening.components
-    return np.concatenate([_project(rows[part], mean, components) for part in _parts(len(rows), ROWS)])
+Search = ExactSearch | WhitenedSearch
 
 
 @compiled
@@ -164,13 +136,6 @@ def _best(first: Shortlist, second: Shortlist, start: int) -> Shortlist:
     both = jax.tree.map(lambda *fields: jnp.concatenate(fields, axis=1), first, second)
     _, place = jax.lax.top_k(masked(both.scores, both.mask, -jnp.inf), first.mask.shape[1])
     return jax.tree.map(lambda field: jnp.take_along_axis(field, place, axis=1), both)
-
-
-def _rows_at_once(dimensions: int) -> int:
-    """Database rows at a time: on an accelerator as many as fit `ROWS_SHARE`, since every part costs a wait."""
-    device = device_of(())
-    fitting = 0 if device.platform == "cpu" else int(ROWS_SHARE * free_bytes(device)) // (4 * dimensions)
-    return max(ROWS, fitting)
 
 
 def _parts(total: int, size: int) -> Iterator[slice]:

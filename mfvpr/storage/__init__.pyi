@@ -4,5 +4,4 @@ __all__ = [
     "Vectors",
 ]
 
-from .feature_cache import FeatureCache, Vectors
-from .recipes import Recipes
+from .feature_cache import FeatureCache, Recipes, Vectors

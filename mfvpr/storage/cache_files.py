@@ -1,29 +1,30 @@
 """Files of a cache: `<name>-<recipe>/ab/cdef....npz`, one for each key, written once and never changed.
 
 A file gets its name when all of it is on disk, so a process may be killed at any moment, and any number of processes
-may read and write: those that need the same file make it twice, with the same content. A file knows its recipe and its
-key, and has a checksum. `recipe.json` in the folder lists everything that the content depends on.
+may read and write: those that need the same file make it twice, with the same content. Its arrays have checksums.
+`recipe.json` in the folder lists everything that the content depends on. Matches have one file for each query.
 """
 
 import errno
 import json
+import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from mfvpr.utils.arrays import read_arrays, write_arrays
+from mfvpr.core.types import Matches
+from mfvpr.matchers.match_set import QueryMatches
+from mfvpr.storage.packing import pack_arrays, pack_matches, unpack_arrays, unpack_matches
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import remove_leftovers, write_text
+from mfvpr.utils.files import replacing, write_text
 from mfvpr.utils.fingerprints import fingerprint
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.runtime import ordered_map
 
-FORMAT = "mfvpr cache 1"  # of the files and folders
-THREADS = 4  # that write
-_LEFTOVER = 24 * 3600  # seconds: temporary files that are older were left by killed processes
+THREADS = 4  # that read and write
 
 Item = TypeVar("Item")
 Arrays = Mapping[str, np.ndarray]
@@ -47,11 +48,10 @@ class CacheFiles(Generic[Item]):
         compress: bool = False,
     ) -> None:
         """Name the folder below `root` by a name and a recipe (JSON values); `pack` and `unpack` convert an item."""
-        self._recipe = {"format": FORMAT, "recipe": recipe}
-        self._fingerprint = fingerprint(self._recipe)
-        self.folder = root.absolute() / f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:100]}-{self._fingerprint}"
+        self._recipe = {"format": "mfvpr cache 2", "recipe": recipe}
+        name = re.sub(r"[^A-Za-z0-9._-]", "_", name)[:100]
+        self.folder = root.absolute() / f"{name}-{fingerprint(self._recipe)}"
         self._pack, self._unpack, self._compress = pack, unpack, compress
-        self._is_open = False  # whether something was written
 
     def path(self, key: str) -> Path:
         """The file of a key."""
@@ -64,7 +64,7 @@ class CacheFiles(Generic[Item]):
         """The item of a key; None if there is no file, or one that is damaged (`in` tells them apart)."""
         with disk_errors_as_input_errors(self.folder):
             try:
-                return self._unpack(read_arrays(self.path(key), self._about(key)))
+                return self._unpack(unpack_arrays(self.path(key).read_bytes()))
             except (FileNotFoundError, InputError):
                 return None
 
@@ -76,20 +76,65 @@ class CacheFiles(Generic[Item]):
         packed = {key: self._pack(item) for key, item in items.items()}  # raises before anything is written
 
         def write(key: str) -> None:
-            options = {"compress": self._compress, "once": once}
-            write_arrays(self.path(key), packed[key], self._about(key), **options)
+            with replacing(self.path(key), once=once) as temporary, temporary.open("wb") as file:
+                file.write(pack_arrays(packed[key], compress=self._compress))
+                file.flush()
+                os.fsync(file.fileno())
 
         with disk_errors_as_input_errors(self.folder):
-            if packed and not self._is_open:
-                if not (self.folder / "recipe.json").exists():
-                    write_text(self.folder / "recipe.json", json.dumps(self._recipe, indent=1, sort_keys=True) + "\n")
-                remove_leftovers(self.folder, seconds=_LEFTOVER)
-                self._is_open = True
+            if packed and not (self.folder / "recipe.json").exists():
+                write_text(self.folder / "recipe.json", json.dumps(self._recipe, indent=1, sort_keys=True) + "\n")
             for _ in ordered_map(write, packed, workers=THREADS):
                 pass
 
-    def _about(self, key: str) -> str:
-        return f"{self._fingerprint} {key}"
+
+class MatchStore(CacheFiles[QueryMatches]):
+    """Matches of `num_queries` queries by row, of a recipe that determines database, queries, shortlist and matcher."""
+
+    def __init__(self, root: Path, recipe: Mapping[str, Any], num_queries: int) -> None:
+        # Compressed, since every candidate repeats points of the query: a match takes about 23 bytes instead of 32.
+        super().__init__(root, "matches", recipe, pack_matches, unpack_matches, compress=True)
+        self.num_queries = num_queries
+
+    def has_all(self, rows: Iterable[int]) -> bool:
+        """Whether there are files of all rows."""
+        return all(_key(row) in self for row in rows)
+
+    def read(self, rows: Iterable[int]) -> Iterator[tuple[int, QueryMatches | None]]:
+        """(row, matches) in the order of rows; None if there is no file, or a damaged one."""
+        rows = list(rows)
+        yield from zip(rows, ordered_map(lambda row: self.get(_key(row)), rows, workers=THREADS), strict=True)
+
+    def write(self, queries: Mapping[int, QueryMatches]) -> None:
+        """Write matches by row; see `CacheFiles.update`."""
+        self.update({_key(row): query for row, query in queries.items()})
+
+
+class StoredMatches(Sequence[Matches]):
+    """Matches of queries of a store, as in QueryMatches: every access reads them."""
+
+    def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
+        self._store, self._rows = store, rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, query: Any) -> Matches:
+        """Matches of one query; slices are not supported."""
+        return next(self._read([self._rows[query]]))
+
+    def __iter__(self) -> Iterator[Matches]:
+        return self._read(self._rows)
+
+    def _read(self, rows: Sequence[int]) -> Iterator[Matches]:
+        for row, query in self._store.read(rows):
+            if query is None:
+                raise InputError(f"{self._store.folder}: matches of row {row} were removed or damaged; run again")
+            yield query.matches
+
+
+def _key(row: int) -> str:
+    return f"{row % 100:02d}{row:06d}"
 
 
 @contextmanager

@@ -14,29 +14,90 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from operator import itemgetter
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mfvpr.core.types import Features
+from mfvpr.datasets.contents import Contents, contents, files_of, state_of
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source
-from mfvpr.features.feature_extraction import describe_folder
+from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source, describe_folder
 from mfvpr.features.feature_set import FeatureSet, FeatureSource
-from mfvpr.storage.cache_files import CacheFiles
+from mfvpr.storage.cache_files import THREADS, CacheFiles
 from mfvpr.storage.packing import pack_features, unpack_features
-from mfvpr.storage.recipes import Memo, Recipes, Value, states
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.progress import Stopwatch
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.threads import ordered_map
+from mfvpr.utils.fingerprints import fingerprint, recipe_of, versions
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, Stopwatch, ordered_map
 
+DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
+# Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.image_reading` gives
+# other pixels, set it to the next version: stored features are then extracted again.
+DECODING = "0.3.0"
 AGGREGATED = 16  # images at a time
-THREADS = 4  # that read ahead
 
+Value = TypeVar("Value")
 Items = CacheFiles[Any] | MutableMapping[str, Any]  # one part of descriptions by key
+
+
+@dataclass
+class Memo:
+    """Results by their name, their images, and the recipe of the extractor or retrieval that computes them."""
+
+    _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+
+    def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder | None, by: Any) -> Value:
+        """Call `compute` once while the images (None = any) and the recipe of `by`, or else its `id`, stay the same."""
+        try:
+            recipe = fingerprint(recipe_of(by, lambda path: [str(path), *map(state_of, files_of(path).paths)]))
+        except TypeError:
+            recipe = id(by)
+        key = name, recipe, None if folder is None else (folder, hash(tuple(states(folder))))
+        if key not in self._computed:
+            self._computed[key] = compute(), by  # kept alive, so that no other object gets its id
+        return self._computed[key][0]
+
+
+def states(folder: ImageFolder, rows: Iterable[int] | None = None) -> list[str]:
+    """A text for each image, which changes with the file, or with the conversion of its pixels."""
+    how = folder.orient, folder.bits
+    names = folder.names if rows is None else [folder.names[row] for row in rows]
+    paths = (f"{folder.root}/{image}" for image in names)
+    return [f"{path} {state_of(path)} {how}" for path in paths]
+
+
+@dataclass
+class Recipes:
+    """Recipes of a cache in the folder `root`; None = hashes of files are not kept on disk."""
+
+    root: Path | None
+    _memo: Memo = field(default_factory=Memo, repr=False)
+
+    def contents(self, folder: ImageFolder) -> Contents:
+        """Hashes of the files of a folder; with a root, later runs read them from there."""
+        records = None if self.root is None else self.root / "contents"
+        return self._memo.once("contents", lambda: contents(folder, records), folder, None)
+
+    def of(self, value: Any) -> Any:
+        """See `fingerprints.recipe_of`, with the content of files and folders of files in place of their paths."""
+
+        def content_of(path: PurePath) -> Any:
+            if not Path(path).exists():
+                return str(path)
+            content = self.contents(files_of(path))
+            return content.fingerprint if Path(path).is_dir() else content.sha256
+
+        return recipe_of(value, content_of)
+
+    def of_features(self, extractor: Any) -> dict[str, Any]:
+        """Everything but the image that changes its features: extractor, versions of decoders."""
+        decoders = {"mfvpr": DECODING} | {name: versions()[name] for name in DECODERS}
+        return {"extractor": self.of(extractor), "versions": decoders}
+
+    def of_folder(self, folder: ImageFolder, extractor: Any) -> dict[str, Any]:
+        """Everything that changes the features of a folder's images."""
+        return self.of_features(extractor) | {"images": self.contents(folder).fingerprint}
 
 
 @dataclass(frozen=True)
@@ -54,10 +115,11 @@ class Vectors:
 
 @dataclass
 class Descriptions:
-    """Descriptions of a folder's images by one extractor, each part in files or in memory.
+    """Descriptions of a folder's images by one extractor, each part in files or in memory; workers of a cluster get it.
 
     Attributes:
         parts: the global descriptor, if the extractor gives one, and each scale of its local features.
+        scales: numbers of the parts that are local features.
         keys: of the images.
         states: of the files before they were hashed, see `states`.
         counts: `[parts, M]` keypoints of each image, 1 for a global descriptor; -1 = not looked at yet, or not there.
@@ -65,17 +127,12 @@ class Descriptions:
     """
 
     folder: ImageFolder
-    extractor: Extractor
     parts: list[Items]
+    scales: range
     keys: Sequence[str]
     states: Sequence[str]
     counts: np.ndarray
     bad: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def scales(self) -> range:
-        """Numbers of the parts that are local features."""
-        return range(len(self.parts) - len(self.extractor.scales), len(self.parts))
 
     def missing(self, parts: Iterable[int], rows: Iterable[int]) -> tuple[list[int], list[Path]]:
         """Rows of which a part is not here, without bad ones, and files that are damaged."""
@@ -131,18 +188,6 @@ class _LocalFeatures:
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
         rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else rows
         return self.descriptions.read(self.part, rows)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for workers of a cluster, which need no extractor."""
-        reader = replace(self.descriptions, extractor=_Scales(self.descriptions.extractor.scales))
-        return {"descriptions": reader, "part": self.part}
-
-
-@dataclass(frozen=True)
-class _Scales:
-    """What is left of an extractor in a worker that only reads."""
-
-    scales: tuple[Any, ...]
 
 
 @dataclass
@@ -216,11 +261,19 @@ class FeatureCache:
             InputError: an image cannot be read (unless `skip_bad`), or none can; or the disk cannot be used.
         """
         if isinstance(extractor, Source):
-            source = self.once("opened", lambda: self._open_source(folder, extractor, label), folder, extractor)
+
+            def open_source() -> FeatureSource:
+                opened = extractor.open(folder, partial=self.skip_bad)
+                counts = np.asarray(opened.counts)[np.asarray(opened.counts) >= 0]
+                about = f"about {np.mean(counts) if len(counts) else 0:.0f} features each"
+                self.log(f"{label} features: {len(counts)} of {len(folder)} images imported, {about}")
+                return opened
+
+            source = self.once("opened", open_source, folder, extractor)
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
         state = self._open(folder, extractor)
-        self._describe(state, state.scales, rows, f"{label} features")
+        self._describe(state, extractor, state.scales, rows, f"{label} features")
         _require_images(state)
         return tuple(FeatureSet(_LocalFeatures(state, part), dict(state.bad)) for part in state.scales)
 
@@ -258,11 +311,13 @@ class FeatureCache:
     ) -> Descriptions:
         """Run the extractor on all images, or on those in `rows`, that are missing; `label` stands in messages."""
         state = self._open(folder, extractor)
-        self._describe(state, range(len(state.parts)), rows, label)
+        self._describe(state, extractor, range(len(state.parts)), rows, label)
         return state
 
-    def _describe(self, state: Descriptions, parts: Iterable[int], rows: Iterable[int] | None, label: str) -> None:
-        folder, extractor = state.folder, state.extractor
+    def _describe(
+        self, state: Descriptions, extractor: Extractor, parts: Iterable[int], rows: Iterable[int] | None, label: str
+    ) -> None:
+        folder = state.folder
         with self.watch("features") if self.watch is not None and extractor.scales else nullcontext():
             missing, damaged = state.missing(parts, range(len(folder)) if rows is None else [*rows])
             for path in damaged:
@@ -295,18 +350,12 @@ class FeatureCache:
                 CacheFiles(root, name, recipe | {"part": part}, *(of_vectors if part == "vector" else of_scales))
                 for part in names
             ]
-        return Descriptions(folder, extractor, parts, keys, before, np.full((len(names), len(folder)), -1))
-
-    def _open_source(self, folder: ImageFolder, source: Source, label: str) -> FeatureSource:
-        opened = source.open(folder, partial=self.skip_bad)
-        counts = np.asarray(opened.counts)
-        number, typical = int((counts >= 0).sum()), np.mean(counts[counts >= 0]) if (counts >= 0).any() else 0
-        self.log(f"{label} features: {number} of {len(folder)} images imported, about {typical:.0f} features each")
-        return opened
+        scales = range(len(names) - len(extractor.scales), len(names))
+        return Descriptions(folder, parts, scales, keys, before, np.full((len(names), len(folder)), -1))
 
     def _vectors(self, folder: ImageFolder, describer: Extractor, rows: Iterable[int] | None, label: str) -> Vectors:
         state = self._open(folder, describer)
-        self._describe(state, [0], rows, f"{label} descriptors")
+        self._describe(state, describer, [0], rows, f"{label} descriptors")
         _require_images(state)
         values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
         for row, vector in state.read(0, np.flatnonzero(state.counts[0] > 0).tolist()):

@@ -20,20 +20,19 @@ from jaxtyping import Float
 
 from mfvpr.core.types import Features
 from mfvpr.storage.cache_files import disk_errors_as_input_errors, full_disk_error
-from mfvpr.storage.packing import pack_features, unpack_features
-from mfvpr.utils.arrays import pack_arrays, unpack_arrays
+from mfvpr.storage.packing import pack_arrays, pack_features, unpack_arrays, unpack_features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, lock_folder
 
 FILE = "map.sqlite"  # in the folder of the map
 _FORMAT = 3
 _WAIT = 60  # seconds for another process that writes
-_SCHEMA = """
-CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,
-                      vector BLOB NOT NULL, checksum INTEGER NOT NULL);
-CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL);
-"""
+_SCHEMA = (
+    "CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
+    "CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,"
+    " vector BLOB NOT NULL, checksum INTEGER NOT NULL)",
+    "CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL)",
+)
 
 
 class Entry(NamedTuple):
@@ -95,7 +94,7 @@ class MapFile:
             for row in rows:
                 content: tuple[bytes] | None = database and database.execute(query, [row]).fetchone()
                 try:
-                    features = unpack_features(unpack_arrays(content[0] if content else b"", str(row)))
+                    features = unpack_features(unpack_arrays(content[0] if content else b""))
                 except InputError:
                     raise self._damage(f"row {row}") from None
                 yield row, features
@@ -125,7 +124,7 @@ class MapFile:
             database.execute("BEGIN IMMEDIATE")
             try:
                 if database.execute("PRAGMA user_version").fetchone()[0] == 0:
-                    for statement in filter(str.strip, _SCHEMA.split(";")):
+                    for statement in _SCHEMA:
                         database.execute(statement)
                     database.execute(f"PRAGMA user_version = {_FORMAT}")
                 of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
@@ -136,7 +135,7 @@ class MapFile:
                     vector = np.asarray(entry.vector, np.float32).tobytes()
                     values = row, name, place, time.time(), vector, _checksum(name, place, vector)
                     database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
-                    values = row, len(arrays["scores"]), pack_arrays(arrays, str(row))
+                    values = row, len(arrays["scores"]), pack_arrays(arrays)
                     database.execute("INSERT INTO features VALUES (?, ?, ?)", values)
                 database.execute("COMMIT")
             except BaseException:

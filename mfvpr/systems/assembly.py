@@ -26,6 +26,7 @@ from mfvpr.retrieval import (
     Retrieval,
     Retriever,
     ShortlistFiles,
+    SsmVoting,
     WhitenedSearch,
 )
 from mfvpr.retrieval.precomputed import File
@@ -59,8 +60,6 @@ def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data
     if name == "pairs":
         return ShortlistFiles(_files("retrieval", {"database": None, **settings}, data), settings["database_prefix"])
     if name == "ssm":
-        from mfvpr.retrieval import SsmVoting  # here, since Flax takes half a second
-
         return SsmVoting(_network_extractor("retrieval", name, options))
     search = EXACT if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
     if name == "import":

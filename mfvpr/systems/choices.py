@@ -14,7 +14,7 @@ from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, SUFFIX
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
-from mfvpr.io.checks import Lengths
+from mfvpr.io.features import Lengths
 from mfvpr.matchers import LightGlueMatcher, NearestNeighborMatcher
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (

@@ -1,7 +1,7 @@
 """Files, hashes, errors, progress and arithmetic that several packages need.
 
-Read first: errors, files, numerics, then what you need: fingerprints (recipes of results), arrays (their
-files), progress, runtime, cluster, compiled_programs (on disk), threads, ragged (padding), whitening, versions.
+Read first: errors, fields (settings), files, numerics, then what you need: fingerprints (recipes of results), runtime
+(progress, threads, devices), cluster, compiled_programs (on disk).
 """
 
 import lazy_loader

@@ -12,5 +12,4 @@ from .cluster import Cluster
 from .compiled_programs import keep_compiled_programs
 from .errors import InputError, NoGradientError
 from .fingerprints import recipe_of
-from .progress import Stopwatch
-from .runtime import Runtime
+from .runtime import Runtime, Stopwatch

@@ -15,8 +15,8 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus, round_up
-from mfvpr.utils.versions import versions
 
 BLOCK = 32  # rows of a task at most, which a killed worker loses
 _BLOCKS = 16  # tasks at least, if there are so many rows
@@ -83,10 +83,7 @@ class Cluster:
         try:  # Dask does not count JAX's memory
             started = _distributed().LocalCluster(n_workers=workers, threads_per_worker=1, memory_limit=0, **options)
         except RuntimeError as error:
-            reason: BaseException = error
-            while reason.__cause__:
-                reason = reason.__cause__
-            line = f"{' '.join(str(reason).split())} ({type(reason).__name__})"
+            line = " ".join(str(error.__cause__ or error).split())
             hint = "in a script, put `if __name__ == '__main__':` before the cluster"
             raise InputError(f"cluster: a worker process did not start: {line}; {hint}") from None
         finally:

@@ -9,14 +9,14 @@ import warnings
 from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from mfvpr.utils.errors import require_word
+from mfvpr.utils.fields import one_of
+from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import processor_info
-from mfvpr.utils.versions import versions
 
 VARIABLE = "MFVPR_COMPILED"
 _PROCESSOR = r"^(?:vendor_id|cpu family|model|flags|CPU implementer|CPU part|Features|cpu|isa)\s*:.*$"
@@ -32,7 +32,7 @@ def keep_compiled_programs(warn: Callable[[str], object] = warnings.warn) -> Non
     that another user owns (except root) or can write to is not used, and `warn` gets a line once.
     """
     is_on, config = os.environ.get(VARIABLE) or "true", dict[str, Any](jax.config.values)
-    require_word(VARIABLE, is_on, Literal["true", "false"])
+    one_of("true", "false").check(VARIABLE, is_on)
     if is_on == "false" or config["jax_compilation_cache_dir"] or not config["jax_enable_compilation_cache"]:
         return
     folder = _folder()

@@ -43,7 +43,7 @@ class Rule:
     def check(self, name: str, value: Any) -> None:
         """Raise an InputError for a value that is not allowed."""
         if not self.holds(value):
-            text = "null" if value is None else str(value)
+            text = "null" if value is None else " ".join(str(value).split())
             text = text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN // 2]}..."
             raise InputError(f"{name}={text}: expected {self.expected}")
 

@@ -2,9 +2,7 @@
 
 import fcntl
 import os
-import re
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,8 +10,6 @@ from pathlib import Path
 from mfvpr.utils.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
-
-_TEMPORARY = re.compile(r"\..+-[a-z0-9_]{8}(\.\w+)?")  # names that `replacing` makes
 
 
 @contextmanager
@@ -70,23 +66,6 @@ def require_replaceable(path: Path, mark: bytes | None = None) -> None:
                 if mark in file.read(4096):
                     return
         raise InputError(f"{path}: expected a new file, got one that exists; remove it, or name another")
-
-
-def remove_leftovers(folder: Path, *, seconds: float = 0) -> None:
-    """Remove temporary files of killed processes below a folder that are older than so many seconds."""
-    for path in folder.rglob(".*"):
-        with suppress(FileNotFoundError):  # of a process that ended meanwhile
-            if _TEMPORARY.fullmatch(path.name) and path.is_file() and path.stat().st_mtime <= time.time() - seconds:
-                path.unlink()
-
-
-def used_bytes(folder: Path) -> int:
-    """Bytes on disk of all files below a folder, except those that another process removes meanwhile."""
-    total = 0
-    for path in folder.rglob("*"):
-        with suppress(FileNotFoundError):
-            total += path.stat().st_blocks * 512
-    return total
 
 
 def printable(text: str) -> str:

@@ -1,16 +1,18 @@
-"""Recipes: everything that determines a result, as JSON values; and their hashes, the fingerprints.
+"""Recipes: everything that determines a result, as JSON values; their hashes, the fingerprints; versions of software.
 
 Files of a cache are named by the fingerprint of their recipe. The recipe of a class of this library has its name and
 its fields; a class of your own says by a `recipe` what else its results depend on, such as a version.
 """
 
 import hashlib
-import itertools
 import json
 import math
+import platform
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.metadata import version
 from pathlib import PurePath
 from typing import Any
 
@@ -18,7 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_ABSENT = object()
+from mfvpr import __version__
+
+_PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless", "pillow")
 _LIBRARY = __name__.partition(".")[0]  # names of its classes stand for their code
 _ADDRESS = re.compile(" at 0x[0-9a-f]+")  # of a network's functions: another one in every process
 
@@ -93,22 +97,11 @@ def content_hash(*parts: Any) -> str:
     return digest.hexdigest()[:24]
 
 
-def difference(value: Any, expected: Any, name: str = "") -> str | None:
-    """The first difference of two JSON values as `name=value, expected ...`; names in `expected` come first."""
-    if isinstance(value, dict) and isinstance(expected, dict):
-        keys = {**expected, **value}
-        parts = [(f"{name}.{key}".lstrip("."), value.get(key, _ABSENT), expected.get(key, _ABSENT)) for key in keys]
-    elif isinstance(value, list) and isinstance(expected, list):
-        pairs = itertools.zip_longest(value, expected, fillvalue=_ABSENT)
-        parts = [(f"{name}[{index}]", *pair) for index, pair in enumerate(pairs)]
-    elif type(value) is type(expected) and value == expected:
-        return None
-    else:
-        return f"{name}={_short_json(value)}, expected {_short_json(expected)}"
-    differences = (difference(part, expected_part, part_name) for part_name, part, expected_part in parts)
-    return next(filter(None, differences), None)
-
-
-def _short_json(value: Any) -> str:
-    text = "nothing" if value is _ABSENT else json.dumps(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+@cache
+def versions() -> dict[str, str]:
+    """Versions of Python, of mfvpr and of the packages, by name."""
+    return {
+        "mfvpr": __version__,
+        "python": platform.python_version(),
+        **{package: version(package) for package in _PACKAGES},
+    }

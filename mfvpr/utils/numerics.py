@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Num, Shaped
 
-from mfvpr.utils.errors import InputError, NoGradientError
+from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:  # type checkers do not see that `jax.Device` is a class
     from jaxlib._jax import Device
@@ -41,13 +41,6 @@ def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLi
     """
     extra = values.ndim - mask.ndim
     return jnp.where(mask.reshape(mask.shape + (1,) * extra), values, fill)
-
-
-def or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
-    """`values` where `mask`, NaN elsewhere."""
-    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
-        return jax.device_put(np.where(mask, values, np.nan))
-    return jnp.where(mask, values, jnp.nan)
 
 
 def as_array(values: Any) -> Any:
@@ -137,40 +130,14 @@ def safe_sqrt(squared: Float[Array, "*shape"]) -> Float[jax.Array, "*shape"]:
     return jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, squared)))
 
 
-def without_gradient(why: str, values: Tree) -> Tree:
-    """The values; their derivative raises `NoGradientError` with the message `why`."""
-
-    @jax.custom_jvp
-    def same(values: Tree) -> Tree:
-        return values
-
-    @same.defjvp
-    def refuse(*_: Any) -> Any:
-        raise NoGradientError(why)
-
-    return same(values)
-
-
 def round_up(size: int, multiple: int) -> int:
     """The smallest multiple of `multiple` that is at least `size`, and at least one `multiple`."""
     return max(1, -(-size // multiple)) * multiple
 
 
-def masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
-    """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
-    values, mask = values.reshape(-1), mask.reshape(-1)
-    return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
-
-
-def over_batch(function: Callable[..., Tree]) -> Callable[..., Tree]:
-    """`jax.vmap(function)`; a batch of one goes without it, which takes a third of the time to trace."""
-
-    def call(*batch: Any) -> Tree:
-        if len(jax.tree.leaves(batch)[0]) != 1:
-            return jax.vmap(function)(*batch)
-        return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], batch)))
-
-    return call
+def repeat_last(values: Shaped[np.ndarray, " _ *rest"], total: int) -> Shaped[np.ndarray, " _ *rest"]:
+    """`values`, at least one, with the last entry repeated up to `total` entries."""
+    return np.concatenate([values, np.repeat(values[-1:], total - len(values), axis=0)])
 
 
 def compiled(function: Function, **options: Any) -> Function:

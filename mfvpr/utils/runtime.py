@@ -1,14 +1,26 @@
-"""Settings of a call that change no result: devices, memory, progress, messages and a cluster."""
+"""How work runs: devices, memory, progress, messages, a cluster; work on threads, and seconds by stage."""
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from mfvpr.utils.cluster import Cluster, Result
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device
-from mfvpr.utils.progress import Track, no_progress
+
+Item = TypeVar("Item")
+Track = Callable[[Iterable[Any], int], Iterable[Any]]  # (items, their number) -> the same items
+
+
+def no_progress(items: Iterable[Item], total: int) -> Iterable[Item]:
+    """No progress bar."""
+    return items
 
 
 @dataclass(frozen=True)
@@ -55,3 +67,41 @@ class Runtime:
 
 
 DEFAULT_RUNTIME = Runtime()
+
+
+@dataclass
+class Stopwatch:
+    """Seconds by stage. A stage excludes the stages inside it."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _inside: list[float] = field(default_factory=list, repr=False)  # seconds of other stages inside each open one
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        self._inside.append(0)
+        try:
+            yield
+        finally:
+            total, inside = time.perf_counter() - start, self._inside.pop()
+            if self._inside:
+                self._inside[-1] += total
+            self.seconds[stage] = round(self.seconds.get(stage, 0) + total - inside, 3)
+
+
+def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
+    """`map` on threads, for work that releases the interpreter lock: in order, at most 2 x `workers` ahead."""
+    remaining = iter(items)
+    with ThreadPoolExecutor(workers) as pool:
+        futures: deque[Future[Result]] = deque(
+            pool.submit(function, item) for item in itertools.islice(remaining, 2 * workers)
+        )
+        try:
+            while futures:
+                result = futures.popleft().result()
+                for item in itertools.islice(remaining, 1):
+                    futures.append(pool.submit(function, item))
+                yield result
+        finally:
+            for future in futures:
+                future.cancel()

@@ -10,7 +10,7 @@ from mfvpr.testing import check_scorer
 from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import make_matches, per_match
-from tests.core.batches import score
+from tests.scorers import score
 
 pytestmark = pytest.mark.thorough
 

@@ -104,14 +104,6 @@ def test_company_order_and_padding_change_no_bit():
         assert score_candidates(Homography(), stack([matches] * 3)).tolist() == [score] * 3
 
 
-def test_a_plane_without_noise_is_estimated_to_a_hundredth_of_a_pixel():
-    matches = pair(3, 50, 1.0, noise=0.0)
-    got = estimate(Homography(1.0, refit=True), matches)
-    assert int(got.score) == 50
-    np.testing.assert_allclose(got.matrix, PLANE / PLANE[2, 2], rtol=2e-3, atol=2e-5)
-    assert misses(got.matrix, matches).max() < 1e-2
-
-
 @pytest.mark.slow
 def test_least_squares_are_those_of_scipy():
     matches = pair(4, 200, 0.6)
@@ -212,16 +204,6 @@ def test_no_generator_of_jax_draws_otherwise_in_a_batch():
 @pytest.mark.parametrize(("limit", "numbers"), [("max_iterations", (np.nan, 0.0)), ("confidence", (np.nan, -1.0, 0.0))])
 def test_limits_without_meaning_score_nan(limit, numbers):
     assert np.isnan([score(pair(9, 40, 0.5), **{limit: np.float32(number)}) for number in numbers]).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("measure", ["inliers", "msac"])
-def test_distances_in_double_precision_change_no_score(measure):
-    matches = pair(9, 40, 0.5)
-    expected = score(matches, 8.0, measure=measure)
-    with jax.enable_x64(True):
-        got = score(replace(matches, distance=matches.distance.astype(np.float64)), 8.0, measure=measure)
-    np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
 @pytest.mark.slow

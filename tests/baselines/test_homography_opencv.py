@@ -13,8 +13,8 @@ from mfvpr.tuning import sweeps
 from mfvpr.utils import InputError
 from tests.baselines.test_homography import plane_points
 from tests.builders import make_matches, per_match
-from tests.core.batches import pair_of
 from tests.core.test_host import BATCH, CANDIDATES, MATCHES, POINTS
+from tests.scorers import pair_of
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.optimized
@@ -35,15 +35,6 @@ def test_it_says_what_opencv_says(name, estimator):
     shuffle = np.random.default_rng(0).permutation(128)
     for matches in (pair_of(BATCH, 1), per_match(pair_of(BATCH, 1), lambda rows: rows[shuffle])):
         assert float(scorer(matches)) == scores[1]
-
-
-def test_without_numbers_of_keypoints_no_order_matters():
-    points1, points0 = POINTS[1]
-    shuffle = np.random.default_rng(1).permutation(len(points1))
-    scores = {
-        float(OpenCvHomography()(make_matches(points0[order], points1[order]))) for order in (slice(None), shuffle)
-    }
-    assert len(scores) == 1
 
 
 def test_grids_data_sets_and_sweeps_score_alike():

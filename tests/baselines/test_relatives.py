@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import Features, InputError, LostScore, RapidSpatialScore, VisualPhrases, match
-from tests import relatives_oracles as oracles
+from tests import score_oracles as oracles
 from tests.builders import SIZE, make_matches, random_matches, real
-from tests.core.batches import score
 from tests.core.test_oracles import certainty, pairs
 from tests.golden import make_relatives as public
+from tests.scorers import score
 
 pytestmark = pytest.mark.thorough
 
@@ -117,12 +117,6 @@ def test_phrases_are_binomials(length):
     shifts = np.random.default_rng(2).permutation(cells + inside)
     matches = make_matches(np.full((18, 2), 100.0), 100 + shifts, capacity=32)
     assert score(VisualPhrases(length), matches) == sum(math.comb(m, length) for m in (6, 9, 3))
-
-
-def test_phrases_of_very_many_matches_are_exact_to_rounding():
-    matches = make_matches(np.full((3000, 2), 50.0), np.full((3000, 2), 60.0))
-    for length in (2, 8):
-        assert score(VisualPhrases(length), matches) == pytest.approx(math.comb(3000, length), rel=1e-5)
 
 
 @pytest.mark.parametrize(

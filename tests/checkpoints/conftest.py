@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints import networks, registry
+from mfvpr.checkpoints import networks
 from mfvpr.checkpoints.conversion import Layout, Rule, Table
 from tests.needs import skip_without
 
@@ -55,7 +55,7 @@ SHAPES = {
 PARAMETERS = 157
 
 
-def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
+def tiny_entry(name: str = "tiny", **changes: object) -> networks.Entry:
     values = {
         "name": name,
         "network": "tiny",
@@ -66,14 +66,14 @@ def tiny_entry(name: str = "tiny", **changes: object) -> registry.Entry:
         "code_license": "MIT",
         "weights_license": "none stated",
     }
-    return registry.Entry(**(values | changes))
+    return networks.Entry(**(values | changes))
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Folder of the weights; `tiny` is registered, not installed."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setitem(registry.REGISTRY, "tiny", tiny_entry())
+    monkeypatch.setitem(networks.REGISTRY, "tiny", tiny_entry())
     monkeypatch.setitem(networks.NETWORKS, "tiny", networks.Network(lambda: Tiny, TABLE))
     return tmp_path / "weights"
 

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from mfvpr.cli.command_line import override
 from mfvpr.systems import assembly
 from mfvpr.systems.choices import CONF
 from mfvpr.utils.errors import InputError
-from tests.programs import QUICK, ROOT, composed, csv_rows, folder, run, settings_of
+from tests.programs import MFVPR, QUICK, ROOT, composed, csv_rows, folder, run, settings_of
 
 pytestmark = pytest.mark.thorough
 
@@ -93,7 +92,7 @@ def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["database features", "query folder features"])
 def test_ctrl_c_leaves_nothing(small_street, tmp_path, interrupt, stage):
-    command = [sys.executable, "-m", "experiments.evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
+    command = [*MFVPR, "evaluate", *folder(small_street, "figures=10", f"out={tmp_path}/out")]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     seen = ""
     while stage not in seen:

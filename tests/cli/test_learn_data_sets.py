@@ -1,4 +1,4 @@
-"""experiments.learn with several data sets: what is learned on some is reported on the others, each as it is alone."""
+"""`mfvpr learn` with several data sets: what is learned on some is reported on the others, each as it is alone."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""experiments.learn as its users meet it: what it learns from, what it reports, its checkpoints, and mistakes."""
+"""`mfvpr learn` as its users meet it: what it learns from, what it reports, its checkpoints, and mistakes."""
 
 import csv
 import json

@@ -20,7 +20,7 @@ from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.report import runs
-from mfvpr.report.query_figures import SequenceFigures
+from mfvpr.report.figures import SequenceFigures
 from mfvpr.utils.errors import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, settings_of, small
 
@@ -286,9 +286,7 @@ def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):
-    monkeypatch.setattr(
-        "mfvpr.report.query_figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)
-    )
+    monkeypatch.setattr("mfvpr.report.figures.histogram_figure", lambda *_, **__: os.kill(os.getpid(), signal.SIGINT))
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 130
     assert "\nhistogram + retrieval " in stdout

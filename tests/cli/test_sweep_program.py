@@ -1,4 +1,4 @@
-"""experiments.sweep as its users meet it: its numbers, its files, mistakes, and interruptions."""
+"""`mfvpr sweep` as its users meet it: its numbers, its files, mistakes, and interruptions."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import evaluation, sweeping
-from tests.programs import QUERIES, ROOT, job_of, settings_of, small
+from tests.programs import MFVPR, QUERIES, ROOT, job_of, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
@@ -144,7 +144,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
     """The rows of finished settings are stored, by query here."""
     grid = ("grid.sigma=[5,10,15,20,22.5,30]", "chunk.settings=1", "chunk.queries=1")
     arguments = [*small(root), *grid, f"out={tmp_path}/out"]
-    command = [sys.executable, "-m", "experiments.sweep", *arguments]
+    command = [*MFVPR, "sweep", *arguments]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     store = root / "store"
     before = len(list(store.glob("sweep-*/*/[!.]*.npz")))

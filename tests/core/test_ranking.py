@@ -1,16 +1,13 @@
 """Combination and ranking."""
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import HistogramOfShifts, combine, rank, rerank, score_candidates
+from mfvpr import combine, rank, rerank
 from tests import oracles
-from tests.builders import random_matches, stack
 
 pytestmark = pytest.mark.thorough
 
@@ -37,16 +34,6 @@ def test_ties_may_go_by_index_instead():
     np.testing.assert_array_equal(rank(scores, tie_break=index), [[2, 1, 4, 0, 3]])
     large = np.array([[7, 9, 3, 1, 5]]) + 2**32 * np.array([[0, 0, 1, 0, 0]])
     np.testing.assert_array_equal(rank(scores, tie_break=large), [[1, 2, 4, 0, 3]])
-
-
-@pytest.mark.parametrize("other", [5.0, 1e9, np.nan])
-def test_sizes_of_pairs_without_matches_may_be_anything(other):
-    pair = random_matches(np.random.default_rng(0), 9)
-    size = np.full(2, other, np.float32)
-    empty = replace(pair, mask=np.zeros_like(pair.mask), image_size0=size, image_size1=size)
-    score = HistogramOfShifts()(pair)
-    for pairs, expected in (([pair, pair], [score, score]), ([pair, empty], [score, 0]), ([empty, empty], [0, 0])):
-        np.testing.assert_allclose(score_candidates(HistogramOfShifts(), stack(pairs)), expected, rtol=1e-6)
 
 
 def test_combined_score_spans_plain_to_retrieval_order():

@@ -17,9 +17,9 @@ from mfvpr import (
     UnitWeight,
     score_grid,
 )
-from tests import soft_oracles
+from tests import score_oracles
 from tests.builders import SIZE, double, make_matches, random_matches, real, stack
-from tests.core.batches import each_scorer, score
+from tests.scorers import each_scorer, score
 
 pytestmark = pytest.mark.thorough
 
@@ -89,7 +89,7 @@ def test_histogram_agrees_with_the_loop(matches, scorer, temperature):
     options = {name: getattr(scorer, name) for name in names}
     ends = [(points0, matches.image_size0), (points1, matches.image_size1)]
     (start, size0), (end, size1) = ends if scorer.direction == "candidate_minus_query" else ends[::-1]
-    expected = soft_oracles.histogram_score(end - start, weights, size0, size1, temperature=temperature, **options)
+    expected = score_oracles.histogram_score(end - start, weights, size0, size1, temperature=temperature, **options)
     got = score(replace(scorer, temperature=temperature), matches)
     # Of up to 900 bins: the temperature times a logarithm near 7, in single precision.
     np.testing.assert_allclose(got, expected, rtol=2e-5, atol=4e-6 * (1 + temperature))
@@ -103,7 +103,7 @@ def test_anchor_agrees_with_the_loop(matches, scorer, temperature):
     names = ("num_bins", "window", "tolerance", "window_mode", "first", "include_self", "cell_weight")
     options = {name: getattr(scorer, name) for name in names}
     sizes = matches.image_size0, matches.image_size1
-    expected = soft_oracles.anchor_points(*oracle_inputs(scorer, matches), *sizes, temperature=temperature, **options)
+    expected = score_oracles.anchor_points(*oracle_inputs(scorer, matches), *sizes, temperature=temperature, **options)
     got = score(replace(scorer, temperature=temperature), matches)
     np.testing.assert_allclose(got, expected, rtol=2e-4, atol=1e-4)
 
@@ -114,7 +114,7 @@ def test_aggregate_agrees_with_the_loop(matches, scorer, temperature):
     if confidence.sum() == 0:
         weights = confidence = np.zeros(0)
         points0 = points1 = np.zeros((0, 2))
-    expected = soft_oracles.aggregated_score(
+    expected = score_oracles.aggregated_score(
         points1 - points0,
         weights,
         confidence,

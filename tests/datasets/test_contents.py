@@ -126,11 +126,6 @@ def test_damaged_records_cost_time_only(folder, cache, damage):
     assert record(cache).read_bytes() == intact
 
 
-def test_a_cache_that_cannot_be_written_costs_time_only(folder, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert fingerprint(folder, tmp_path / "file") == fingerprint(folder)
-
-
 def test_files_that_cannot_be_read_are_left_to_whoever_reads_images(folder, cache):
     (folder / "3.png").symlink_to("nowhere")
     os.mkfifo(folder / "4.png")

@@ -163,15 +163,6 @@ def test_nordland_takes_a_few_megabytes():
     assert not difference.rows.size
 
 
-def test_a_radius_takes_no_more_than_its_neighbors():
-    """A street of 10,000 places 1 m apart: 100 MB as a matrix."""
-    xy = np.stack([np.arange(10_000.0), np.zeros(10_000)], axis=1)
-    with memory_below(10e6):
-        positives = RadiusTruth(xy, xy).positives(10)
-    assert positives.counts.sum() == 10_000 * 21 - 110
-    np.testing.assert_array_equal(positives.of(7777), np.arange(7767, 7788))
-
-
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))
 def test_a_radius_is_a_loop_over_all_pairs(seed, radius):
     rng = np.random.default_rng(seed)

@@ -7,11 +7,7 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import Positives
 from mfvpr.datasets.contents import contents, own_rows
-from mfvpr.retrieval import ExactSearch
-from mfvpr.retrieval import search as retrieval
-from tests.builders import unit
 
 
 @pytest.fixture
@@ -59,18 +55,3 @@ def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     dataset, rows = dataset_and_own_rows(sequence, tmp_path / "other")
     with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
         dataset.only.without_neighbors(6, rows, 2)
-
-
-@pytest.mark.parametrize("memory, rows", [(None, 6), (1e-9, 6), (1e-9, 4), (None, 1)])
-def test_the_shortlist_leaves_out_excluded_images(memory, rows, monkeypatch):
-    """However much is searched at a time: all, two queries, several rows of the database, one."""
-    monkeypatch.setattr(retrieval, "ROWS", rows)
-    rng, search = np.random.default_rng(0), ExactSearch(memory)
-    descriptors = unit(rng.normal(size=(6, 8)))
-    complete = search.shortlist(descriptors, descriptors, 6)
-    np.testing.assert_array_equal(complete.indices[:, 0], np.arange(6))
-    excluded = np.abs(np.arange(6)[:, None] - np.arange(6)) <= 1
-    reduced = search.shortlist(descriptors, descriptors, 6, excluded=Positives.from_matrix(excluded))
-    for query in range(6):
-        expected = [row for row in complete.indices[query] if not excluded[query, row]]
-        np.testing.assert_array_equal(reduced.indices[query], expected + [-1] * (6 - len(expected)))

@@ -19,8 +19,6 @@ from mfvpr.datasets.streets.camera import (
     plan_return,
     visible_points,
 )
-from mfvpr.datasets.streets.drawing import fall_rain
-from mfvpr.datasets.streets.sheets import WEATHERS, Sheet, texture
 
 pytestmark = pytest.mark.thorough
 
@@ -92,19 +90,6 @@ def test_files_and_ground_truth(streets, seasons):
         check_ground_truth(seasons / condition / TRUTH, SEASONS_FRAMES)
 
 
-def test_light_and_snow_of_a_weather_follow_its_row():
-    sheet = Sheet(1.0, 1.0, (100, 80, 60))
-    sheet.rect(0, 0, 1.0, 0.5, (100, 80, 60), glow=(200, 150, 90), snow=255)
-    day = replace(WEATHERS["day"], horizon=(100, 100, 100))
-    seen = texture(sheet, lamp_light=0.5, sun=1.2)
-    upper, lower = (0, 0, slice(3)), (-1, -1, slice(3))
-    np.testing.assert_array_equal(seen(day)[lower], (120, 96, 72))
-    np.testing.assert_array_equal(seen(replace(day, sun=0.5))[lower], (110, 88, 66))
-    np.testing.assert_array_equal(seen(replace(day, sun=0.0, lamp=(1, 0.5, 0)))[lower], (150, 100, 60))
-    np.testing.assert_array_equal(seen(replace(day, sun=0.0, glow=1.0))[upper], (200, 150, 90))
-    np.testing.assert_array_equal(seen(replace(day, snow=1.0))[upper], (114, 114, 114))  # 1.15 times the horizon
-
-
 def test_existing_folder_is_an_error(tmp_path):
     with pytest.raises(FileExistsError):
         draw_streets(tmp_path, num_frames=1, image_size=SIZE)
@@ -150,12 +135,6 @@ def test_heading_on_facades_follows_each_points_angle():
     assert image_shift(points, query, CAMERA)[0] == pytest.approx(np.median(moved[inside]), abs=1.0)
 
 
-def test_lane_alone_shifts_by_the_parallax():
-    wall = np.array([[x, y, 20.0] for x in (-4.0, 0.0, 4.0) for y in (-4.0, -2.0)])
-    shift = image_shift(wall, replace(CAMERA, x=1.0), CAMERA)
-    assert shift == pytest.approx((CAMERA.focal * 1.0 / 20.0, 0.0), abs=1e-6)
-
-
 def test_visible_points_lie_on_the_nearest_facade_in_view():
     hidden = Facade(12.0, 0.0, 60.0, 9.0)
     points = visible_points((*WALLS, hidden), CAMERA)
@@ -195,12 +174,3 @@ def test_frames_of_a_return_are_nearest_to_their_own_frame(seed):
         assert np.abs(z - places).max() <= 0.4 * SPACING
         assert all(0.3 <= abs(camera.x - LANE) <= 1.2 + 1e-9 for camera in drive)
     assert len({drive[10].heading for drive in drives}) == len(CONDITIONS)
-
-
-def test_rain_falls_in_lines():
-    image = np.zeros((60, 80, 3), np.float32)
-    rain = fall_rain(image, 40, np.random.default_rng(0))
-    assert rain.max() > 5
-    down, across = (np.abs(np.diff(rain[..., 0], axis=axis)).sum() for axis in (0, 1))
-    assert across > 1.5 * down
-    assert (fall_rain(image, 0, np.random.default_rng(0)) == 0).all()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mfvpr.deployment.check_arrays import largest_difference
+from mfvpr.deployment.folders import largest_difference
 from tests.golden.make_exported import export_scorer
 from tests.needs import skip_without
 from tests.programs import ROOT

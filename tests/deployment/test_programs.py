@@ -10,8 +10,8 @@ import pytest
 import mfvpr
 from mfvpr import ExportShapes, Features, InputError, Matches
 from mfvpr.baselines import SCORERS
-from mfvpr.deployment import stablehlo
-from mfvpr.deployment.check_arrays import check_inputs, largest_difference
+from mfvpr.deployment.folders import check_inputs, largest_difference
+from mfvpr.deployment.program_formats import deserialize, export_program, without_unused_inputs
 from mfvpr.deployment.programs import make_program
 from mfvpr.evaluation import Fusion
 from mfvpr.features import Aggregated, Scale, Sift, VladFitting
@@ -34,7 +34,7 @@ def outputs_of(method, *, with_shift=False):
     """Inputs of a program, and what its serialized form returns for them, by name."""
     program = make_program(method, SHAPES, with_shift=with_shift)
     inputs = check_inputs(program)
-    exported = stablehlo.deserialize(stablehlo.serialize(program), "program")
+    exported = deserialize(bytes(export_program(program).serialize()), "program")
     outputs = exported.call(*inputs.values())
     assert exported.platforms == ("cpu", "cuda")
     return inputs, dict(zip((each.name for each in program.outputs), map(np.asarray, outputs), strict=True))
@@ -63,18 +63,6 @@ def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     assert largest_difference(outputs, expected) <= 1e-5
     assert outputs["scores"][0] > 0
     assert outputs["scores"][-1] == 0  # without matches
-
-
-@pytest.mark.slow
-@pytest.mark.optimized
-def test_a_program_has_the_bits_of_the_jitted_function():
-    for method in (HISTOGRAM, make_system({"count": mfvpr.MatchCount(), "histogram": HISTOGRAM}, final="histogram")):
-        program = make_program(method, SHAPES, with_shift=True)
-        inputs, outputs = outputs_of(method, with_shift=True)
-        jax.clear_caches()
-        expected = jax.jit(lambda *arrays: program.call(*arrays))(*inputs.values())  # noqa: B023
-        for values, each in zip(outputs.values(), expected, strict=True):
-            np.testing.assert_array_equal(values, np.asarray(each))
 
 
 def test_a_system_matches_and_scores_by_all_scorers_the_deciding_one_first():
@@ -126,7 +114,7 @@ def test_images_above_the_capacity_score_nan_and_smaller_ones_a_number():
     ],
 )
 def test_inputs_without_effect_are_left_out(scorer, names):
-    program = stablehlo.without_unused_inputs(make_program(scorer, SHAPES, with_shift=False))
+    program = without_unused_inputs(make_program(scorer, SHAPES, with_shift=False))
     assert [each.name for each in program.inputs] == names
     assert program.call(*check_inputs(program).values())[0][0] > 0
 
@@ -161,7 +149,7 @@ def branch_in_python(matches):
 )
 def test_scorers_that_cannot_be_exported_are_refused_by_the_operation(scorer, message):
     with pytest.raises(InputError, match=message) as error:
-        stablehlo.serialize(make_program(scorer, SHAPES, with_shift=False))
+        export_program(make_program(scorer, SHAPES, with_shift=False))
     assert "\n" not in str(error.value)
 
 

@@ -97,13 +97,6 @@ def test_scores_of_scales_are_fused_over_the_candidates_of_a_query(two_scales):
             np.testing.assert_allclose(fused[name][query], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_one_scale_as_it_is_scores_as_without(data):
-    match_set, candidates = data
-    scores = stages.score(SCORERS, Scales([match_set], normalize="none"), candidates)
-    for name, expected in stages.score(SCORERS, match_set, candidates).items():
-        np.testing.assert_array_equal(scores[name], expected)
-
-
 @pytest.mark.parametrize("normalize", ["zscore", "none"])
 def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tmp_path):
     scales, candidates = two_scales
@@ -123,20 +116,6 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tm
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
 
 
-def test_blocks_of_other_weights_or_scales_are_not_read(two_scales, tmp_path):
-    scales, candidates = two_scales
-    first, second = scales.match_sets
-    cases = [
-        scales, replace(scales, weights=(0.0, 1.0)), replace(scales, weights=None), replace(scales, normalize="none"),
-        Scales([first, first], WEIGHTS), Scales([second, first], WEIGHTS), first, second,
-    ]  # fmt: skip
-    for number, case in enumerate(cases, start=1):
-        expected = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates)
-        stored = rank(SCORERS["sum"], [{"c": 0.1}], case, candidates, folder=tmp_path)
-        np.testing.assert_array_equal(stored, expected)
-        assert len(list(tmp_path.rglob("*.npz"))) == number
-
-
 def test_scales_of_other_queries_or_weights_raise(data):
     match_set, _ = data
     for words, *arguments in (
@@ -146,18 +125,3 @@ def test_scales_of_other_queries_or_weights_raise(data):
     ):
         with pytest.raises(mfvpr.InputError, match=words):
             Scales(*arguments)
-
-
-def test_progress_is_of_the_batches_of_all_scales(two_scales):
-    scales, candidates = two_scales
-    seen = []
-    runtime = mfvpr.Runtime(progress=lambda label: lambda items, total: seen.append(total) or items)
-    stages.score(SCORERS, scales, candidates, runtime=runtime)
-    assert seen == [2]
-
-
-def test_nothing_matches_anywhere(data):
-    match_set, candidates = data
-    empty = MatchSet([select(matches, slice(0)) for matches in match_set.matches], 0 * match_set.counts, 64)
-    for scores in stages.score(SCORERS, empty, candidates).values():
-        np.testing.assert_array_equal(scores, np.where(candidates.mask, 0.0, np.nan))

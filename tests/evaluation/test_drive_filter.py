@@ -185,13 +185,6 @@ def test_excluded_rows_are_not_ranked(method):
     assert np.isnan(empty.scores).all()
 
 
-@pytest.mark.parametrize("method", ["causal", "lagged", "smoothed"])
-def test_a_drive_that_excludes_its_images_gives_numbers(method):
-    drive = Drive(advance=8, spread=0.1, kidnapped=0.0, leaves=0.0, correct=1.0)
-    result = DriveFilter(method, drive)(drive_of(np.arange(30), 40, True), 40)
-    assert np.isfinite(result.scores).all()
-
-
 def test_wrong_arguments_are_one_line():
     with pytest.raises(InputError, match="method"):
         DriveFilter("best")

@@ -4,11 +4,9 @@ import itertools
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import mfvpr
 from mfvpr import datasets
@@ -17,15 +15,14 @@ from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, 
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.features.feature_extraction import describe_folder
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
-from mfvpr.report.run_files import differences, write_gains, write_rankings
+from mfvpr.report.run_files import write_gains
+from mfvpr.report.tables import read_table
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
-from mfvpr.storage import feature_cache as cache_module
-from mfvpr.utils import InputError, progress
+from mfvpr.utils import InputError, runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
 from tests.programs import typed
@@ -74,7 +71,7 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     np.testing.assert_allclose(recall.pooled, result.recall([0, 1], [1])["count"].pooled)
     np.testing.assert_allclose(recall.mean, recall.by_sequence.mean(axis=0))
     evaluation = EvaluationReport(parts, [0, 1], [1])
-    table = recall_table(evaluation)
+    table = recall_table(evaluation.rows())
     assert [line[:2] for line in table.rows[:4]] == [
         ["retrieval", name] for name in ("first", "second", "mean", "pooled")
     ]
@@ -86,9 +83,9 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     hits = {
         name: np.concatenate([evaluation.is_correct(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems
     }
-    for first, second, counts, path in differences(evaluation):
-        assert counts.only_first == (hits[first] > hits[second]).sum()
-        assert path == path_test(hits[first], hits[second])
+    for first, second, only_first, _, _, *path in read_table(tmp_path / "differences.csv").rows:
+        assert int(only_first) == (hits[first] > hits[second]).sum()
+        assert [float(value) for value in path] == pytest.approx(path_test(hits[first], hits[second]), rel=1e-6)
     with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
         several.queries  # noqa: B018
     with pytest.raises(InputError, match=r"queries: expected folders of different names.* got first, first"):
@@ -128,7 +125,7 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
 
     def only_scores(label):
         assert label == "scores"
-        return progress.no_progress
+        return runtime.no_progress
 
     again = evaluate_parts(
         replace(dataset, name="again"), SIFT, VLAD, SCORERS, candidates=5,
@@ -254,22 +251,6 @@ def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several,
     assert sum("images to do" in line for line in lines) == 3
 
 
-def test_bad_images_of_the_database_are_told_once(split, small_street, tmp_path):
-    shutil.copytree(small_street / "database", tmp_path / "database")
-    (tmp_path / "database" / "0004.png").write_bytes(b"")
-    Image.new("RGB", (160, 120)).save(tmp_path / "database" / "0005.png")
-    several, lines = datasets.folder(tmp_path / "database", split, ground_truth="none"), []
-    for root in (None, tmp_path / "s", tmp_path / "s"):  # the last reads matches alone
-        lines.clear()
-        feature_cache = FeatureCache(root, skip_bad=True, runtime=mfvpr.Runtime(log=lines.append))
-        result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates="all", cache=feature_cache)
-        assert all(list(matched.bad_database) == [4] for matched in result.matched)
-        warned = [line for line in lines if line.startswith("warning: ")]
-        assert len(warned) == 2
-        assert "0004.png" in warned[0]
-        assert "0005.png: no keypoints, so no matches (1 such images of 10)" in warned[1]
-
-
 @pytest.fixture
 def imported(small_street, files):
     """Settings of programs that read the features of other programs."""
@@ -291,62 +272,3 @@ def test_programs_take_sequences_and_files(split, imported, tmp_path, monkeypatc
     assert {"sequences/first/predictions.csv", "sequences/second/predictions/count_retrieval.csv", "table.csv"} <= names
     table = (tmp_path / "out" / "table.csv").read_text().splitlines()
     assert [line.split(",")[1] for line in table[1:5]] == ["first", "second", "mean", "pooled"]
-
-
-def test_a_sweep_takes_features_whose_files_tell_the_image_size(
-    small_street, files, imported, tmp_path, monkeypatch, capsys
-):
-    settings = ("dataset=folder", f"dataset.queries={small_street}/queries", "dataset.ground_truth=order", "scorer=sum",
-                "grid.clamp=[true]", "retrieval=pairs", f"retrieval.queries={files}/pairs.npz")  # fmt: skip
-    code, stdout, stderr = typed(monkeypatch, capsys, "sweep", *imported, *settings, f"out={tmp_path}/out")
-    assert code == 0, stderr
-    assert "score, import features; recall in %" in stdout
-
-
-def test_extraction_counts_as_features_whoever_asks_for_them(dataset, monkeypatch):
-    """VLAD asks first; a clock that only extraction moves."""
-    clock = [0.0]
-    monkeypatch.setattr(progress, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
-
-    def slow(*arguments, **options):
-        clock[0] += 10
-        yield from describe_folder(*arguments, **options)
-
-    monkeypatch.setattr(cache_module, "describe_folder", slow)
-    seconds = evaluate_parts(dataset, SIFT, VLAD, {}, candidates=2).seconds
-    assert seconds.pop("features") >= 20
-    assert {*seconds.values()} == {0}
-
-
-def test_predictions_of_systems_of_any_names_are_all_there(result, tmp_path):
-    names = ["count_retrieval", "count + retrieval", "../../up", "count"]
-    systems = dict(zip(names, [*result.systems.values()] * 2, strict=False))
-    write_rankings(tmp_path / "out", EvaluationReport(replace(result, systems=systems), [0], [1]))
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    for kind in ("predictions", "failures"):
-        assert len([*(tmp_path / "out" / kind).iterdir()]) == len(names)
-
-
-@pytest.mark.parametrize("taken", ["mean", "pooled"])
-def test_no_sequence_is_called_as_a_row_of_the_table(small_street, tmp_path, taken):
-    with pytest.raises(InputError, match=f"queries: .*none called mean or pooled, got a, {taken}"):
-        datasets.folder(small_street / "database", [tmp_path / "a", tmp_path / taken], ground_truth="none")
-
-
-def test_sequences_of_any_name_leave_all_of_their_files(split, small_street, tmp_path, monkeypatch):
-    """Called as files of the run folder, by a path that ends with no name, or by a link."""
-    names = ["predictions", "results.json", "table.csv", "figures"]
-    for name in names:
-        (tmp_path / name).symlink_to(split[0])
-    shutil.copytree(split[0], tmp_path / "real")
-    (tmp_path / "real" / "deeper").mkdir()
-    monkeypatch.chdir(split[1])
-    folders = [*(tmp_path / name for name in names), tmp_path / "real" / "deeper" / "..", Path()]
-    several = datasets.folder(small_street / "database", folders, ground_truth="none")
-    assert [sequence.name for sequence in several.sequences] == [*names, "real", "second"]
-    result = evaluate_parts(several, SIFT, VLAD, {"count": mfvpr.MatchCount()}, candidates=2)
-    write_rankings(tmp_path / "out", EvaluationReport(result, [], [1]))
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["sequences"]
-    for name in (*names, "real", "second"):
-        folder = tmp_path / "out" / "sequences" / name
-        assert {path.name for path in folder.rglob("*.csv")} >= {"predictions.csv", "retrieval.csv", "count.csv"}

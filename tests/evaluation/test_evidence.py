@@ -45,12 +45,6 @@ def test_a_fence_is_no_noise():
     assert reason_against_image(image) is None
 
 
-def test_plain_images_are_left_to_the_other_tests():
-    assert reason_against_image(np.full((48, 64, 3), 128, np.uint8)) is None
-    assert reason_against_image(np.full((48, 64, 3), 255, np.uint8)) == "overexposed"
-    assert reason_against_image(np.zeros((2, 2, 3), np.uint8)) is None
-
-
 def test_negative_detection_scores_have_no_strength():
     scores = np.array([0.5, -3.0, 0.25], np.float32)
     features = Features(np.zeros((3, 2)), np.zeros((3, 4)), scores, np.ones(3, bool), np.ones(2))

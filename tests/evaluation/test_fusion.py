@@ -1,16 +1,20 @@
-"""Several scores of a query's candidates, retrieval's among them, as one."""
+"""Final scores: fused with retrieval, over scales and scorers, correlated with frames before, and ranked."""
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import mfvpr
-from mfvpr import datasets
+from mfvpr import balancing_c, combine, datasets
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import FrameCorrelation, Fusion, match_sequence, stages
 from mfvpr.evaluation.fusion import final_scores, rank_by_scores
-from mfvpr.evaluation.rankings import rank_shortlist
+from mfvpr.evaluation.rankings import fuse, fuse_scales, fuse_shortlist, rank_shortlist
 from tests import oracles
 from tests.builders import evaluate_parts
 from tests.evaluation.conftest import SCORERS, SIFT, VLAD
@@ -80,11 +84,6 @@ def test_equal_scores_say_nothing_and_equal_sums_keep_their_order():
     assert rank_shortlist(candidates, equal, ties="index").tolist() == [[1, 2, 0]]
 
 
-def test_a_system_is_called_by_what_takes_part():
-    for names, system in ((["retrieval", "b"], "a + b + retrieval"), (["c", "a", "b"], "a + c + b + retrieval")):
-        assert Fusion("zscore", weights=dict.fromkeys(names, 2.0)).system("a") == system
-
-
 @pytest.fixture(scope="module")
 def sequence_matches(dataset):
     return match_sequence(dataset, dataset.only, mfvpr.Pipeline(SIFT, VLAD, candidates=5))
@@ -122,15 +121,6 @@ def test_systems_of_several_scores_are_ranked_beside_the_others(sequence_matches
     assert_fused(by_row["histogram + count + retrieval"], sequence_matches.candidates, parts, [0.5, 1.0, 2.0])
 
 
-def test_scores_of_several_scales_are_fused_again_with_retrieval(sequence_matches):
-    """They are standardized sums themselves."""
-    twice = replace(sequence_matches, matches=sequence_matches.matches * 2, weights=(1.0, 1.0))
-    systems, once = (rank_by(matched, {"histogram": Fusion("zscore")}, {}) for matched in (twice, sequence_matches))
-    name = "histogram + retrieval"
-    np.testing.assert_allclose(systems[name].scores, once[name].scores, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(systems["histogram"].scores.mean(axis=1), 0, atol=1e-5)
-
-
 def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
     folders = [tmp_path / name for name in ("first", "second")]
     for folder in folders:
@@ -142,3 +132,96 @@ def test_every_sequence_is_fused_by_itself(dataset, small_street, tmp_path):
     for ranking in rankings:
         np.testing.assert_array_equal(ranking.rows, alone.rows)
         np.testing.assert_array_equal(ranking.scores, alone.scores)
+
+
+ROUGH = st.one_of(
+    st.sampled_from([0.0, 0.1, 3.0, np.nan, np.inf, -np.inf]), st.floats(-1e3, 1e3, width=16, allow_subnormal=False)
+)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int32, np.float16, jnp.bfloat16])
+@pytest.mark.parametrize("array", [np.array, jnp.array])
+def test_scores_of_few_bits_are_combined_in_single_precision(array, kind):
+    """Also whole numbers, whose products and squares would overflow."""
+    retrieval_scores, scores = array([[100, 200, 96]], kind), array([[250, 10, 240]], kind)
+    wide = [jnp.asarray(values, jnp.float32) for values in (retrieval_scores, scores)]
+    np.testing.assert_array_equal(combine(retrieval_scores, scores, c=1000), combine(*wide, c=1000.0))
+    mask = np.ones((1, 3), bool)
+    c = balancing_c(retrieval_scores[0], scores[0], mask[0])
+    np.testing.assert_allclose(c, np.std(wide[1]) / np.std(wide[0]), rtol=1e-5)
+    if not jnp.issubdtype(kind, jnp.floating):
+        return  # no scores of a shortlist
+    candidates = Shortlist(np.arange(3)[None], np.asarray(retrieval_scores), mask)
+    for fusion in (Fusion(1000.0), Fusion(), Fusion("zscore")):
+        expected = fusion("it", replace(candidates, scores=np.asarray(wide[0])), {"it": np.asarray(wide[1])})
+        np.testing.assert_allclose(fusion("it", candidates, {"it": np.asarray(scores)}), expected, rtol=1e-5)
+
+
+def test_balancing_c_equalizes_the_spread_of_real_candidates():
+    retrieval_scores = jnp.array([0.5, 0.7, 0.9, 77.0])
+    scores = jnp.array([10.0, 50.0, 30.0, np.nan])
+    mask = jnp.array([True, True, True, False])
+    c = balancing_c(retrieval_scores, scores, mask)
+    np.testing.assert_allclose(c * np.std(retrieval_scores[:3]), np.std(scores[:3]), rtol=1e-6)
+    assert balancing_c(jnp.ones(4), scores, mask) == 0.0
+
+
+def test_a_score_that_is_no_number_takes_no_part_in_the_balance():
+    retrieval_scores, mask = jnp.array([0.5, 0.7, 0.9, 0.1]), jnp.ones(4, bool)
+    expected = np.std([10.0, 50.0, 30.0]) / np.std(retrieval_scores[:3])  # without its candidate
+    for broken in (np.nan, np.inf):
+        c = balancing_c(retrieval_scores, jnp.array([10.0, 50.0, 30.0, broken]), mask)
+        np.testing.assert_allclose(c, expected, rtol=1e-6)
+        c = balancing_c(retrieval_scores.at[3].set(broken), jnp.array([10.0, 50.0, 30.0, 20.0]), mask)
+        np.testing.assert_allclose(c, expected, rtol=1e-6)
+    assert balancing_c(retrieval_scores, jnp.full(4, jnp.nan), mask) == 0.0
+
+
+def test_balanced_fusion_has_a_gradient_where_all_scores_are_equal():
+    retrieval_scores, mask = jnp.array([[0.5, 0.7], [0.3, 0.3]]), jnp.ones((2, 2), bool)
+    total = lambda scores: jnp.sum(fuse(retrieval_scores, scores, mask, None) ** 2)  # noqa: E731
+    for scores in (jnp.full((2, 2), 3.0), jnp.array([[1.0, 2.0], [4.0, 4.0]])):
+        assert np.isfinite(jax.grad(total)(scores)).all()
+
+
+@pytest.mark.parametrize("normalize", ["zscore", "none"])
+@given(data=st.data())
+def test_scales_are_fused_as_in_patch_netvlad(normalize, data):
+    scores = np.array(data.draw(st.lists(ROUGH, min_size=12, max_size=12)), np.float32).reshape(4, 3)
+    mask = np.array(data.draw(st.lists(st.booleans(), min_size=4, max_size=4)))
+    weights = (0.45, 0.15, 0.4)
+    with np.errstate(invalid="ignore"):
+        expected = oracles.fuse_scales(scores, mask, weights, normalize)
+    got = fuse_scales(scores, mask, np.array(weights, np.float32), normalize=normalize)
+    np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
+
+
+def test_no_score_is_no_fault_of_a_program():
+    scores, mask = np.ones((3, 2), np.float32), np.array([True, True, False])
+    with jax.debug_nans(True):
+        np.testing.assert_array_equal(fuse_scales(scores, mask), [0, 0, np.nan])
+        candidates = Shortlist(np.array([[0, -1]]), np.array([[0.5, np.nan]], np.float32), np.array([[True, False]]))
+        fused = fuse_shortlist(candidates, np.array([[2, np.nan]], np.float32), 4.0)
+        np.testing.assert_array_equal(fused, [[4, np.nan]])
+
+
+def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
+    scores, mask = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32), np.array([True, True, False])
+    for weight in (1, -2):
+        fused = fuse_scales(scores, mask, np.array([0, weight], np.float32), normalize="none")
+        np.testing.assert_array_equal(fused, [weight, 2 * weight, np.nan])
+    assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
+
+
+def test_fused_scales_have_a_gradient_where_scores_are_equal_or_missing():
+    mask = np.array([True, True, True, True, False])
+    equal, unequal = np.full(5, 2.0), np.array([1.0, np.nan, 4.0, 2.0, np.nan])
+
+    def total(scores):
+        fused = fuse_scales(scores, mask)
+        return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 3)  # the sum of squares is their number
+
+    for scores in (np.stack([equal, equal], 1), np.stack([equal, unequal], 1)):
+        slope = jax.grad(total)(jnp.asarray(scores, jnp.float32))
+        assert np.isfinite(slope).all()
+    assert np.abs(slope[[0, 2, 3], 1]).min() > 0.05

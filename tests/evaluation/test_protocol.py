@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from mfvpr import InputError, Shortlist
-from mfvpr.datasets import FrameTruth, RadiusTruth
+from mfvpr import InputError, Shortlist, frame_positives
+from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import middle
-from mfvpr.evaluation import evaluation_protocol
+from mfvpr.evaluation import best_setting, evaluation_protocol, halves, neighboring_settings
+from mfvpr.evaluation.protocol import halves_of_map, places_along_path
+from mfvpr.evaluation.statistics import path_test
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
@@ -113,3 +115,113 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     changes = np.flatnonzero(np.diff(hits.astype(int)))
     assert hits.sum() == 25
     assert len(changes) == 1  # neighbors of the street are neighbors
+
+
+PLACES = 60
+DRIVES = [*range(PLACES), *reversed(range(0, PLACES, 2))]  # there and back
+
+
+def shown(seed, tolerance=2):
+    """Images within the tolerance of each query's place, whose rows are in any order."""
+    row = np.random.default_rng(seed).permutation(PLACES)
+    return Positives.from_rows(
+        [row[max(place - tolerance, 0) : place + tolerance + 1] for place in DRIVES], PLACES
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_neighbors_follow_whatever_the_rows_of_the_map_are(seed):
+    places = places_along_path(shown(seed), "m")
+    places = places if places[0] < places[PLACES - 1] else places.max() - places  # in the direction of the first drive
+    assert np.abs(places - DRIVES).max() <= 2  # at the ends images are shown by few queries
+    assert (np.diff(places[2 : PLACES - 2]) == 1).all()
+    np.testing.assert_array_equal(places[PLACES:][::-1], places[:PLACES:2])
+
+
+def test_frames_are_in_order_and_exact_images_in_that_of_the_first_queries():
+    frames = Positives.from_rows([[place] for place in DRIVES], PLACES)
+    np.testing.assert_array_equal(places_along_path(frames, "frames"), DRIVES)
+    np.testing.assert_array_equal(places_along_path(shown(3, tolerance=0), "exact"), DRIVES)
+
+
+@pytest.mark.parametrize("unit", ["frames", "m", "exact"])
+def test_places_that_the_map_does_not_show_are_none(unit):
+    places = places_along_path(Positives.from_rows([[], [3], [3], [], [1], [0], []], 5), unit)
+    assert (places == -1).tolist() == [True, False, False, True, False, False, True]
+    assert places[1] == places[2]
+    assert len({*places[[1, 4, 5]].tolist()}) == 3
+    for queries in (0, 2):
+        assert places_along_path(Positives.from_rows([[]] * queries, 4), unit).tolist() == [-1] * queries
+
+
+def test_p_along_the_path_is_rarely_low_without_a_difference_however_the_names_are_sorted():
+    """Two systems that are equally good, each with its own weak stretches of the street, which drives share."""
+    rng, draws, low = np.random.default_rng(0), 200, {"sorted by chance": 0, "along the path": 0}
+    names = rng.permutation(len(DRIVES))  # queries in the order of files
+    path = np.argsort(places_along_path(shown(0).take(names), "m"), kind="stable")
+    for _ in range(draws):
+        hits = []
+        for _ in range(2):
+            latent = np.convolve(rng.normal(size=PLACES + 14), np.ones(15), "valid") / np.sqrt(15)
+            hits.append((latent[DRIVES] > -0.5)[names])
+        low["sorted by chance"] += path_test(*hits).p_value <= 0.05
+        low["along the path"] += path_test(*np.array(hits)[:, path]).p_value <= 0.05
+    assert low["along the path"] <= 0.1 * draws
+    assert low["sorted by chance"] >= 0.3 * draws
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 3])
+def test_halves_never_share_a_place(tolerance):
+    places = np.arange(20)
+    matrix = frame_positives(places, places, tolerance=tolerance)
+    positives = Positives.from_matrix(matrix)
+    for half in halves(positives):
+        near = {place for query in half.report for place in range(query - tolerance, query + tolerance + 1)}
+        assert set(np.flatnonzero(~half.allowed)) == near & set(range(20))
+        assert all(set(np.flatnonzero(matrix[query])) & near == set() for query in half.tune)
+        assert list(half.report) == list(range(half.report[0], half.report[-1] + 1))
+    reported = np.concatenate([half.report for half in halves(positives)])
+    assert sorted(reported) == list(range(20))
+    first, second = halves(positives)
+    assert len(first.tune) == len(second.tune) == 10 - 2 * tolerance
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_queries_without_a_place_are_in_both_halves_of_a_map(share):
+    """One drive there, one back, and one elsewhere: neither half has all that is nowhere, or all that is somewhere."""
+    rng, drive = np.random.default_rng(0), np.arange(100)
+    there = np.where(rng.random(100) < share, -1, drive)
+    parts = [Positives.from_matrix(frame_positives(places, drive, tolerance=2))
+             for places in (there, there[::-1], np.full(50, -1))]  # fmt: skip
+    nowhere = np.concatenate([there, there[::-1], np.full(50, -1)]) < 0
+    both = halves_of_map(parts, "frames")
+    assert sorted(np.concatenate([half.report for half in both])) == list(range(250))
+    for half in both:
+        for side in (half.tune, half.report):
+            assert abs(nowhere[side].sum() - nowhere.sum() / 2) <= 2
+            assert abs((~nowhere[side]).sum() - (~nowhere).sum() / 2) <= 0.1 * (~nowhere).sum() + 8
+
+
+def test_neighbors_are_one_step_along_one_axis():
+    axes = {"sigma": [1, 2, 3], "weight": ["fs", "dmf"]}  # numbers: 0 1 / 2 3 / 4 5
+    assert neighboring_settings(axes, 2) == [0, 4, 3]
+    assert neighboring_settings(axes, 5) == [3, 4]
+    assert neighboring_settings({"sigma": [1]}, 0) == []
+
+
+def test_equals_are_told_apart_by_their_neighbors():
+    axes = {"sigma": [1, 2, 3, 4, 5]}
+    assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8]), axes) == 3
+    assert best_setting(np.array([0.9, 0.1, 0.8, 0.9, 0.8])) == 0
+    assert best_setting(np.array([0.2, 0.1, 0.8, 0.4, 0.7]), axes) == 2
+    assert best_setting(np.array([0.8, 0.9, 0.0, 0.7, 0.9, 0.7]), {"sigma": range(6)}) == 4  # on average
+
+
+def test_a_query_that_is_a_database_image_is_seen_where_it_is_reported():
+    """A place that is passed twice, in one sequence: what may not prediction a query still shows its place."""
+    labels = np.r_[np.arange(50), np.arange(50)]
+    itself = FrameTruth(tuple((row,) for row in range(100)), 100)
+    truth = AllowedTruth(LabelTruth(labels, labels), itself.positives(3))
+    assert (truth.positives(0).counts == 1).all()
+    for half in halves(truth.shows_place(0)):
+        assert len(half.tune) == 0

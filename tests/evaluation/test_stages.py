@@ -12,12 +12,11 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import rankings, stages
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.matchers import match_set as match_sets
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.match_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore, StoredMatches
 from mfvpr.tuning.sweeps import rank_settings
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -43,14 +42,6 @@ def candidates(dataset):
 @pytest.fixture(scope="module")
 def matches(features, candidates):
     return stages.match(features[1], features[0], candidates)
-
-
-def test_capacity_of_matches_is_the_largest_pair(features, candidates, matches):
-    assert matches.capacity % 64 == 0
-    assert matches.counts.max() <= matches.capacity < matches.counts.max() + 64
-    few = stages.match(features[1], features[0], candidates, NearestNeighborMatcher(max_matches=10, max_distance=0.9))
-    assert few.counts.max() <= 10
-    assert few.capacity == 64
 
 
 def open_store(folder, num_queries=10):

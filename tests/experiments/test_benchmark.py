@@ -2,17 +2,15 @@
 
 import json
 from functools import partial
-from importlib import import_module
 
 import numpy as np
 import pytest
 
-from experiments.benchmark import search
-from experiments.benchmark.__main__ import BENCHMARKS
+from experiments.benchmark import scores
 from experiments.benchmark.__main__ import run as run_benchmark
 from mfvpr import InputError
+from mfvpr.checkpoints.conversion import SELAVPR
 from mfvpr.checkpoints.networks import NETWORKS, Network
-from mfvpr.checkpoints.tables import SELAVPR
 from mfvpr.networks import SelaVpr
 from tests.needs import skip_without
 
@@ -105,16 +103,11 @@ def test_report_has_everyone(contest):
 
 
 def test_all_searches_give_the_same_rows(monkeypatch):
-    monkeypatch.setattr(search, "QUERIES", (1, 3))
-    results = {(step, name): call() for step, name, call in search.search_entries(200, 24)}
+    monkeypatch.setattr(scores, "QUERIES", (1, 3))
+    results = {(step, name): call() for step, name, call in scores.search_entries(200, 24)}
     for (step, _), rows in results.items():
-        assert rows.shape == (int(step.split()[0]), search.CANDIDATES)
+        assert rows.shape == (int(step.split()[0]), scores.CANDIDATES)
         np.testing.assert_array_equal(rows, results[step, "NumPy"])
-
-
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_every_benchmark_is_a_module(name):
-    assert callable(import_module(f"experiments.benchmark.{name}").run)
 
 
 def test_the_file_of_others_stays(tmp_path):

@@ -6,12 +6,10 @@ from dataclasses import fields, replace
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mfvpr import Features, InputError
 from mfvpr.features import FeatureSet
-from mfvpr.features.feature_set import KEPT, WRITTEN, Recent, Slots, memory_budget, stack_features
+from mfvpr.features.feature_set import KEPT, WRITTEN, Slots, memory_budget, stack_features
 from tests.builders import make_features
 
 DEVICE = jax.devices()[0]
@@ -126,23 +124,6 @@ def test_processors_share_what_is_given_and_accelerators_have_their_own():
 # Rows on a device
 
 
-@given(st.lists(st.lists(st.integers(0, 9), max_size=4, unique=True), max_size=12))
-def test_what_was_used_longest_ago_makes_room(requests):
-    recent, last_use, places = Recent(4), {}, {}
-    for time, rows in enumerate(requests):
-        slots, new = recent.take(rows)
-        assert new == [row for row in rows if row not in places]
-        for row in new:
-            if len(places) == 4:
-                oldest = min(places.keys() - rows, key=last_use.__getitem__)
-                del places[oldest]
-            places[row] = slots[rows.index(row)]
-        last_use |= {row: (time, row in new, number) for number, row in enumerate(rows)}
-        assert [places[row] for row in rows] == slots
-        assert len(set(places.values())) == len(places)
-        assert set(places.values()) <= set(range(4))
-
-
 COUNTS = [30, 25, 0, 200, 31, 1, 180, 29, 200, 32]
 
 
@@ -205,16 +186,6 @@ def test_slots_and_what_is_on_its_way_stay_within_the_budget():
         assert taken + 6 * largest < budget + 6 * WRITTEN * (224 + 32) * KEYPOINT  # of each capacity, `WRITTEN` rows
         again = [slots.stage(part) for part in slots.parts(rows)]
         assert any(part.new for part in again) == (share < 1 / KEPT)
-
-
-def test_parts_are_what_can_be_asked_for_at_the_same_time():
-    features, _ = counted([200] * 50)
-    slots = Slots(features, np.arange(50), 0, DEVICE)
-    rows = np.arange(50)[::-1]
-    parts = list(slots.parts(rows))
-    np.testing.assert_array_equal(np.concatenate(parts), rows)
-    assert {len(part) for part in parts[:-1]} == {WRITTEN}
-    assert list(slots.parts(rows[:0])) == []
 
 
 def test_rows_are_written_by_one_program_for_each_capacity(compilations):

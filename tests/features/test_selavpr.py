@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints import networks
-from mfvpr.checkpoints.tables import DINOV2, SELAVPR
+from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
 from mfvpr.networks import SelaVpr, VisionTransformer
 from tests.features.conftest import read_rows
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes, write_zip
@@ -17,13 +17,7 @@ def training(tensors):
     moments = [{"step": 7, "exp_avg": np.zeros(3, np.float32), "exp_avg_sq": np.ones(3, np.float32)}]
     groups = [{"lr": 1e-5, "betas": (0.9, 0.999), "weight_decay": 0, "amsgrad": False, "params": [0, 1]}]
     optimizer = {"state": dict(enumerate(moments)), "param_groups": groups}
-    return {
-        "epoch_num": 3,
-        "model_state_dict": tensors,
-        "optimizer_state_dict": optimizer,
-        "best_r5": 97.2,
-        "not_improved_num": 0,
-    }
+    return {"epoch_num": 3, "model_state_dict": tensors, "optimizer_state_dict": optimizer, "best_r5": 97.2}
 
 
 @pytest.fixture
@@ -50,13 +44,7 @@ def checkpoint(folder, name="SelaVPR_msls", registers=0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("system", "file"),
-    [
-        ("selavpr_msls", "SelaVPR_msls"),
-        ("selavpr_pitts", "SelaVPR_pitts30k"),
-    ],
-)
+@pytest.mark.parametrize(("system", "file"), [("selavpr_msls", "SelaVPR_msls"), ("selavpr_pitts", "SelaVPR_pitts30k")])
 def test_it_runs_by_name_once_its_weights_are_converted(program, tmp_path, system, file):
     stderr = program("evaluate", f"system={system}", code=2)
     assert f"not installed in {tmp_path}/weights; get {file}.pth from https://drive.google.com/" in stderr
@@ -78,25 +66,23 @@ def test_the_variant_with_registers_takes_its_own_weights_alone(program, tmp_pat
     program("evaluate", "system=selavpr_msls", "features.weights=selavpr_msls_registers", *small)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("pooling", ["cls", "gem"])
-def test_dinov2_is_a_retriever(program, tmp_path, pooling):
-    tensors = random_checkpoint(dinov2_shapes(64, 1))
-    program("weights", "add", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
-    options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
-    small = "features.max_keypoints=50", "candidates=5", "figures=0"
-    program("evaluate", *options, f"retrieval.pooling={pooling}", *small)
-    assert {row["retrieval"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
-    stderr = program("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2", code=2)
-    assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
-
-
 @pytest.fixture
 def dinov2(program, tmp_path):
     """A command line, with a small DINOv2 installed."""
     tensors = random_checkpoint(dinov2_shapes(64, 1))
     program("weights", "add", write_zip(tmp_path / "dinov2_vits14_pretrain.pth", tensors))
     return program
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pooling", ["cls", "gem"])
+def test_dinov2_is_a_retriever(dinov2, tmp_path, pooling):
+    options = "retrieval=dinov2", "retrieval.weights=dinov2_vits14", "retrieval.image_size=[56,42]"
+    small = "features.max_keypoints=50", "candidates=5", "figures=0"
+    dinov2("evaluate", *options, f"retrieval.pooling={pooling}", *small)
+    assert {row["retrieval"]["pooling"] for row in read_rows(tmp_path / "out")} == {pooling}
+    stderr = dinov2("evaluate", *options, "retrieval.image_size=[56,40]", *small, f"out={tmp_path}/2", code=2)
+    assert "image_size=[56, 40]: expected multiples of 14, the side of a patch in px" in stderr
 
 
 @pytest.mark.slow

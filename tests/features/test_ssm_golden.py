@@ -12,12 +12,12 @@ from mfvpr.features import WindowFitting
 from mfvpr.features.extractor import local_features
 from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
-from mfvpr.retrieval.ssm_voting import vote
+from mfvpr.retrieval.retriever import vote
 from tests.baselines.test_grid_anchors import cells
-from tests.core.batches import score
 from tests.golden import make_ssm
 from tests.golden.make_ssm import CANDIDATES, DIMENSIONS, IMAGES, MAPS, made_up_map, picture
 from tests.networks.test_ssm_maps import published
+from tests.scorers import score
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
 
@@ -50,7 +50,7 @@ def of_images(case, stage):
     """Whitened windows of the pictures by a network with random weights."""
     seed, pixels, *counts = IMAGES[case]
     size = (224, 224) if stage == 1 else (pixels, pixels)
-    maps = SsmMaps(published(seed), stage, size)
+    maps = SsmMaps(published(seed), size, stage=stage)
     computed = maps(np.stack([resize(picture(*row), size) for row in rows_of(*counts)]))
     return described(np.stack([result.vector.reshape(maps.shape) for result in computed]), stage, counts[0])
 

@@ -5,13 +5,12 @@
 
 import sys
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from tests.golden.make_netvlad import name, normalized, samples
-from tests.golden.torch_networks import fill
+from tests.golden.torch_networks import fill, vision_transformer
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint
 
 WIDTH, HEADS = 64, 4
@@ -64,15 +63,4 @@ def _transformer(depth: int, registers: int) -> Any:
     from dinov2.layers import NestedTensorBlock as Block  # pyright: ignore
     from dinov2.models.vision_transformer import DinoVisionTransformer  # pyright: ignore
 
-    return DinoVisionTransformer(
-        img_size=518,
-        patch_size=14,
-        embed_dim=WIDTH,
-        depth=depth,
-        num_heads=HEADS,
-        mlp_ratio=4,
-        init_values=1,
-        block_chunks=0,
-        num_register_tokens=registers,
-        block_fn=partial(Block, attn_class=MemEffAttention),
-    )
+    return vision_transformer(DinoVisionTransformer, Block, MemEffAttention, WIDTH, depth, HEADS, registers)

@@ -125,20 +125,8 @@ def write_vismatch(work: Path, images: str, expected: dict) -> None:
 
     pairs, folder = work / "pairs.txt", work / "vismatch"
     pairs.write_text("\n".join(" ".join(f"{images}/{name}" for name in pair) for pair in PAIRS) + "\n")
-    sys.argv = [
-        "vismatch-match",
-        "--matcher",
-        "sift-nn",
-        "--device",
-        "cpu",
-        "--no-viz",
-        "--n-kpts",
-        str(KEYPOINTS),
-        "--input",
-        str(pairs),
-        "--out-dir",
-        str(folder),
-    ]
+    options = f"--matcher sift-nn --device cpu --no-viz --n-kpts {KEYPOINTS} --input {pairs} --out-dir {folder}"
+    sys.argv = ["vismatch-match", *options.split()]
     vismatch_match.main()
     pairs.unlink()
     for number, pair in enumerate(PAIRS):

@@ -73,7 +73,7 @@ def normalized(size: tuple[int, int]) -> Any:
     """As ToTensor and Normalize do, in float64."""
     import torch
 
-    from mfvpr.networks.imagenet import DEVIATION, MEAN
+    from mfvpr.networks.layers import DEVIATION, MEAN
 
     pixels = torch.from_numpy(image(size)).permute(0, 3, 1, 2).double() / 255
     mean, deviation = (torch.tensor(values, dtype=torch.float64)[None, :, None, None] for values in (MEAN, DEVIATION))

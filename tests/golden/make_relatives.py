@@ -120,16 +120,8 @@ def _lost(clone: str) -> dict[str, np.ndarray]:
             np.savez(f"{path}0000000.npz", maps.T.reshape(-1, *LAYOUT))
         for mirrored in (False, True):
             for form, files in (("weighted", paths), ("unweighted", {})):
-                matrix = match_lost_kc.getSpatialCheckMat(
-                    labels,
-                    labels,
-                    reference[None],
-                    query[None],
-                    1,
-                    np.ones((1, 1)),
-                    flipFlag=mirrored,
-                    preLoadDenseDescRef=False,
-                    **files,
-                )
+                options = {"flipFlag": mirrored, "preLoadDenseDescRef": False, **files}
+                inputs = labels, labels, reference[None], query[None], 1, np.ones((1, 1))
+                matrix = match_lost_kc.getSpatialCheckMat(*inputs, **options)
                 golden[f"lost/{form}/{mirrored}"] = matrix[0, 1]
     return golden

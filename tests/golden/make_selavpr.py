@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tests.golden.make_netvlad import name, normalized, samples
-from tests.golden.torch_networks import fill
+from tests.golden.torch_networks import fill, vision_transformer
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes
 
 SIZE = (224, 224)
@@ -51,24 +51,11 @@ def main(clone: str) -> dict[str, np.ndarray]:
 
 
 def _transformer(width: int, depth: int, heads: int, registers: int) -> Any:
-    from functools import partial
-
     from backbone.dinov2 import MemEffAttention  # pyright: ignore
     from backbone.dinov2 import NestedTensorBlock as Block  # pyright: ignore
     from backbone.vision_transformer import DinoVisionTransformer  # pyright: ignore
 
-    return DinoVisionTransformer(
-        img_size=518,
-        patch_size=14,
-        embed_dim=width,
-        depth=depth,
-        num_heads=heads,
-        mlp_ratio=4,
-        init_values=1,
-        block_chunks=0,
-        num_register_tokens=registers,
-        block_fn=partial(Block, attn_class=MemEffAttention),
-    )
+    return vision_transformer(DinoVisionTransformer, Block, MemEffAttention, width, depth, heads, registers)
 
 
 def _networks() -> Iterator[tuple[str, np.ndarray]]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mfvpr.networks.imagenet import DEVIATION, MEAN
+from mfvpr.networks.layers import DEVIATION, MEAN
 from tests.golden.make_d2net import samples, texture
 from tests.random_checkpoints import layered, places365_shapes, random_checkpoint
 

@@ -1,6 +1,7 @@
 """Networks of torch, and modules in place of those that public code imports, for the programs of this folder."""
 
 import sys
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -20,3 +21,10 @@ def replace_module(name: str, **members: Any) -> ModuleType:
     sys.modules[name] = module = ModuleType(name)
     vars(module).update(members)
     return module
+
+
+def vision_transformer(network: Any, block: Any, attention: Any, width: int, depth: int, heads: int, registers: int):
+    """DINOv2's transformer for 518 px, of the classes of public code."""
+    options = {"img_size": 518, "patch_size": 14, "mlp_ratio": 4, "init_values": 1, "block_chunks": 0}
+    options |= {"embed_dim": width, "depth": depth, "num_heads": heads, "num_register_tokens": registers}
+    return network(**options, block_fn=partial(block, attn_class=attention))

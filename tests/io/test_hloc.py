@@ -1,7 +1,8 @@
-"""hloc's h5 as hloc writes it, and files that do not fit."""
+"""hloc's h5 as hloc writes it; files that do not fit, are damaged, or lead to other files."""
 
 import sys
 
+import h5py
 import numpy as np
 import pytest
 
@@ -191,3 +192,66 @@ def test_without_h5py(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r"h5py; pip install 'mfvpr\[hloc\]'"):
         open_features(path, NAMES)
+
+
+def check_refused(path, message, name="a.jpg"):
+    with one_line_error(message, str(path)):
+        list(open_features(path, [name]).read())
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A file beside it that nobody named."""
+    return write_hloc(tmp_path / "secret.h5", ["a.jpg"])
+
+
+def external_link(group, values, secret):
+    group["scores"] = h5py.ExternalLink(str(secret), "/a.jpg/scores")
+
+
+def external_storage(group, values, secret):
+    external = [(str(secret), 0, values.nbytes)]
+    group.create_dataset("scores", shape=values.shape, dtype=values.dtype, external=external)
+
+
+@pytest.mark.parametrize(
+    "put",
+    [
+        external_link,
+        external_storage,
+        lambda group, *_: group.create_group("scores"),
+        lambda group, *_: group.create_dataset("scores", data=h5py.Empty("f")),
+    ],
+)
+def test_other_data_sets_are_refused(path, secret, put):
+    parts = hloc_parts(feature(0))
+    scores = parts.pop("scores")
+    append_hloc(path, "a.jpg", parts)
+    with h5py.File(path, "a", libver="latest") as file:
+        put(file["a.jpg"], scores, secret)
+    check_refused(path, r"a\.jpg/scores: expected data in this file")
+
+
+def test_what_leads_to_another_file_is_no_image(path, secret):
+    append_hloc(path, "b.jpg", hloc_parts(feature(0)))
+    with h5py.File(path, "a") as file:
+        file["a.jpg"] = h5py.ExternalLink(str(secret), "/a.jpg")
+        file["b.jpg/a"] = file["b.jpg"]  # a circle
+    check_refused(path, r"got 0; the first without is a\.jpg")
+
+
+def test_values_that_were_not_written(path):
+    """HDF5 would make them up."""
+    parts = hloc_parts(feature(0))
+    scores = parts.pop("scores")
+    append_hloc(path, "a.jpg", parts)
+    with h5py.File(path, "a") as file:
+        file["a.jpg"].create_dataset("scores", shape=scores.shape, dtype="f2", chunks=(10,))
+    check_refused(path, r"a\.jpg/scores: .*not written")
+
+
+def test_truncated_at_any_place(tmp_path, path):
+    content = write_hloc(tmp_path / "whole.h5", ["a.jpg", "b.jpg"]).read_bytes()
+    for length in (0, 10, 100, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        check_refused(path, "cannot be read")

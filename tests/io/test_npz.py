@@ -1,12 +1,10 @@
 """Features in npz: D2-Net's files, one for each image, one for all."""
 
-import os
-
 import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.io import open_features, read_global_descriptors
+from mfvpr.io import open_features
 from tests.io.checks import one_line_error
 from tests.io.other_programs import SIZE, assert_equal, feature
 
@@ -60,23 +58,6 @@ def test_one_for_all(tmp_path):
     assert source.counts.tolist() == [5, 6, 7]
     for row, features in source.read([2, 0, 1]):
         assert_equal(features, written[row])
-
-
-def test_pipes_are_not_waited_for(tmp_path):
-    names, pipe = ["1.jpg", "2.jpg"], tmp_path / "2.jpg.npz"
-    for name in names:
-        np.savez(tmp_path / f"{name}.npz", **parts_of(feature(0)))
-    source = open_features(tmp_path, names)
-    pipe.unlink()
-    for path in (pipe, tmp_path / "a.h5", tmp_path / "a.npy"):
-        os.mkfifo(path)
-        with pytest.raises(InputError, match=f"{path.name}: .*a pipe"):
-            read_global_descriptors(path, names)
-    for use in (lambda: open_features(tmp_path, names), lambda: list(source.read([1]))):
-        with pytest.raises(InputError, match=r"2\.jpg\.npz: .*a pipe"):
-            use()
-    [(_, features)] = open_features(tmp_path, names[:1]).read()
-    assert_equal(features, feature(0))
 
 
 def test_pickles_are_never_loaded(tmp_path):

@@ -1,7 +1,5 @@
 """Shortlists: pairs of hloc and kapture, predictions in npz."""
 
-import os
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -147,15 +145,6 @@ def test_predictions_that_cannot_be_used(tmp_path, arrays, message):
     np.savez(tmp_path / "p.npz", **arrays)
     with one_line_error(message, "p.npz"):
         read_shortlist(tmp_path / "p.npz", QUERIES[:2], DATABASE)
-
-
-def test_not_a_file(tmp_path):
-    os.mkfifo(tmp_path / "pipe.txt")
-    os.mkfifo(tmp_path / "pipe.npz")
-    pipes = dict.fromkeys(("pipe.txt", "pipe.npz"), "a pipe or device")
-    for name, got in ({"p.txt": "nothing", "p.npz": "nothing"} | pipes).items():
-        with pytest.raises(InputError, match=f"expected a file, got {got}"):
-            read_shortlist(tmp_path / name, QUERIES, DATABASE)
 
 
 def shortlists():

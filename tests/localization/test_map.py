@@ -1,13 +1,7 @@
 """A map: the predictions of an evaluation, whole rows only, and no place without evidence."""
 
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import dataclass, replace
-from functools import reduce
 from pathlib import Path
 
 import jax
@@ -21,7 +15,7 @@ from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map
-from mfvpr.localization import matching as map_matching
+from mfvpr.localization import map as map_module
 from mfvpr.retrieval import FeatureFiles, Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile, check_entry
@@ -29,8 +23,7 @@ from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
 from tests.core.test_types import Tensor as TensorWithGradient
-from tests.programs import ROOT, snapshot
-from tests.shapes import unchecked_shapes
+from tests.programs import snapshot
 
 pytestmark = pytest.mark.thorough
 
@@ -68,9 +61,9 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
     predictions = []
-    monkeypatch.setattr(map_matching, "_AT_ONCE", 2)  # of five candidates
+    monkeypatch.setattr(map_module, "_PAIRS_AT_ONCE", 2)  # of five candidates
     for cores in (1, 2, 3, 7):
-        monkeypatch.setattr(map_matching, "available_cpus", lambda cores=cores: cores)
+        monkeypatch.setattr(map_module, "available_cpus", lambda cores=cores: cores)
         predictions.append([opened(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
     assert predictions[1:] == predictions[:1] * 3
 
@@ -229,17 +222,14 @@ def test_a_map_goes_on_where_it_was(dataset, tmp_path):
         again.build(dataset.database, [1])
 
 
-@pytest.mark.parametrize(("extractor", "describer", "difference"), [
-    (replace(SIFT, image_size=(120, 120)), VLAD, "recipe.extractor.image_size[0]=160, expected 120"),
-    (replace(SIFT, max_keypoints=50), VLAD, "recipe.extractor.max_keypoints=60, expected 50"),
-    (SIFT, VladFitting(num_words=4), "recipe.describer.num_words=8, expected 4"),
-    (SIFT, "constant", "recipe.describer.class="),
-])  # fmt: skip
-def test_a_map_of_other_settings_is_refused(folder, extractor, describer, difference):
-    with pytest.raises(InputError) as error:
-        Map(folder, map_system(extractor, Constant() if describer == "constant" else describer))
-    assert difference in str(error.value)
-    assert "delete" not in str(error.value)
+def test_a_map_of_other_settings_is_refused(folder):
+    for extractor, describer, words in (
+        (replace(SIFT, max_keypoints=50), VLAD, "another extractor"),
+        (SIFT, VladFitting(num_words=4), "another describer"),
+        (SIFT, Constant(), "another describer"),
+    ):
+        with pytest.raises(InputError, match=f"made with {words}. Use the settings"):
+            Map(folder, map_system(extractor, describer))
 
 
 def test_the_least_recently_used_features_make_room(folder, monkeypatch):
@@ -254,35 +244,6 @@ def test_the_least_recently_used_features_make_room(folder, monkeypatch):
     assert read == [0, 1, 2, 3, 1, 2]
 
 
-def test_rows_that_cannot_be_read_do_not_change_other_rows(dataset, folder, monkeypatch):
-    known, features = opened(folder), MapFile.features
-
-    def fail_at_2(self, rows):
-        for row in rows:
-            if row == 2:
-                raise InputError("row 2")
-            yield from features(self, [row])
-
-    monkeypatch.setattr(MapFile, "features", fail_at_2)
-    with pytest.raises(InputError, match="row 2"):
-        known._read_features([3, 2])
-    monkeypatch.undo()
-    for rows in ([3, 1], [0, 3], [0, 1, 2, 3]):
-        for row, read in zip(rows, known._read_features(rows), strict=True):
-            np.testing.assert_array_equal(read.scores, next(MapFile(folder).features([row]))[1].scores)
-
-
-@pytest.mark.parametrize(
-    "place", ["here", 3, 1.5, True, np.float64(0.1), [1, [2.5, "b"]], {"x": {"y": [None]}}, "\udcff"]
-)
-def test_places_are_what_json_gives_back(place):
-    check_entry("a.jpg", place)
-
-
-def nested(levels):
-    return reduce(lambda place, _: [place], range(levels - 1), [])
-
-
 JSON = "expected a place that JSON can say"
 
 
@@ -291,10 +252,10 @@ JSON = "expected a place that JSON can say"
     ("a.jpg", (1.0, 2.0), "(1.0, 2.0), which JSON gives back as [1.0, 2.0]"),
     ("a.jpg", {"at": [(1, 2)]}, "which JSON gives back as"),
     ("a.jpg", {3: "room"}, "which JSON gives back as"),
-    ("a.jpg", nested(100_000), JSON),
     *((name, 0, "name: expected text, got ") for name in (("drive1", 9), ["l"], 5, b"b", Path("x"), float("nan"))),
 ], ids=lambda value: type(value).__name__)  # fmt: skip
 def test_other_places_and_names_are_refused(name, place, words):
+    check_entry("a.jpg", [1, {"x": {"y": [None, "\udcff"]}}])
     with pytest.raises(InputError, match=re.escape(words)) as error:
         check_entry(name, place)
     assert "\n" not in str(error.value)
@@ -317,22 +278,6 @@ def test_scores_that_are_never_finite_are_refused(dataset, folder, scorer):
         opened(folder, scorer=scorer).localize(dataset.queries.paths[0])
 
 
-def test_scores_are_floats_whatever_the_scorer_returns(dataset, folder):
-    with unchecked_shapes():
-        prediction = opened(folder, scorer=lambda matches: matches.mask.sum()).localize(dataset.queries.paths[0])
-    assert type(prediction.score) is float
-
-
-def test_two_do_not_add_at_the_same_time(dataset, tmp_path):
-    first, second = opened(tmp_path / "map"), opened(tmp_path / "map")
-    first.learn(dataset.database)
-    second.refresh()
-    with MapFile(first.folder).lock(), pytest.raises(InputError, match="another process adds images"):
-        second.add(dataset.database.paths[0], 0)
-    second.add(dataset.database.paths[0], 0)
-    assert first.localize(dataset.database.paths[0]).place == 0
-
-
 @pytest.mark.parametrize("number", [-1, 1.5, "2", np.arange(4).reshape(2, 2), np.int64(-3)], ids=repr)
 def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
     known, image = opened(folder), dataset.database.paths[7]
@@ -341,7 +286,7 @@ def test_numbers_of_rows_are_whole_and_not_negative(dataset, folder, number):
                 lambda: known.localize(image, recent=number), lambda: opened(folder, candidates=number)):  # fmt: skip
         with pytest.raises(InputError, match=r"^(recent|before|candidates).*: expected a whole number [^\n]+$"):
             ask()
-    with pytest.raises(InputError, match=r"^recent: .*got None"):
+    with pytest.raises(InputError, match=r"^recent=null: expected a whole number"):
         known.localize(image, recent=None)
 
 
@@ -399,31 +344,3 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
         known.add(dataset.queries.paths[0], "a query", name="q")
         for image in (*dataset.database.paths, dataset.queries.paths[0]):
             assert len(known.localize(image).alternatives) == 3
-
-
-@pytest.mark.slow
-def test_killed_while_adding_it_has_whole_rows(dataset, small_street, tmp_path):
-    program = (
-        "import sys; from pathlib import Path; from mfvpr import datasets\n"
-        "from tests.localization.test_map import opened\n"
-        "root = Path(sys.argv[1]); data = datasets.folder(root / 'database', root / 'queries', ground_truth='order')\n"
-        "known = opened(sys.argv[2]); known.learn(data.database); print('ready', flush=True)\n"
-        "for turn in range(int(sys.argv[3]), 10**6):\n"
-        "    known.add(data.database.paths[turn % 10], turn, name=str(turn)); print('added', flush=True)\n"
-    )
-    seen, known, start = 0, None, 0
-    for turn in range(5):
-        command = [sys.executable, "-c", program, str(small_street), str(tmp_path / "map"), str(start)]
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        running = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, start_new_session=True)
-        assert [running.stdout.readline() for _ in range(2)] == [b"ready\n", b"added\n"]
-        time.sleep(0.1 * turn)
-        os.killpg(running.pid, signal.SIGKILL)
-        running.communicate()
-        known = opened(tmp_path / "map") if known is None else known
-        known.refresh()
-        assert known.names == [str(number) for number in range(len(known))]
-        assert len(known) > seen
-        seen = start = len(known)
-        assert opened(tmp_path / "map").names == known.names
-    assert known.localize(dataset.database.paths[4]).place % 10 == 4

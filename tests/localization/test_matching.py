@@ -3,7 +3,7 @@
 import numpy as np
 
 import mfvpr
-from mfvpr.localization.matching import match_and_score
+from mfvpr.localization.map import match_and_score
 from tests.builders import make_features
 
 

@@ -4,10 +4,8 @@ import json
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,16 +14,15 @@ from PIL import Image
 
 from mfvpr.cli import localization
 from mfvpr.cli.schema import Localize
-from mfvpr.datasets import image_folder, read_image
+from mfvpr.datasets import read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
-from mfvpr.localization.declaration import read_declaration
-from mfvpr.storage.maps import MapFile
+from mfvpr.localization.map_settings import read_settings
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE
-from tests.programs import ROOT, output_of, settings_of
+from tests.programs import MFVPR, ROOT, output_of
 
 pytestmark = pytest.mark.thorough
 
@@ -111,7 +108,7 @@ def test_lines_have_angles_of_the_shift(folder, small_street, localize):
 def test_a_map_is_built_in_the_shape_of_its_images(tmp_path, small_street, build_map):
     stdout, _ = build_map(tmp_path / "map", small_street, "features.image_size=19200")
     assert stdout == f"{tmp_path}/map: 10 images, 10 of them new\n"
-    assert read_declaration(tmp_path / "map")["features"]["image_size"] == [160, 120]
+    assert read_settings(tmp_path / "map")["features"]["image_size"] == [160, 120]
 
 
 def test_images_of_the_map_are_not_added_again(folder, small_street, call_program, build_map):
@@ -196,18 +193,6 @@ def test_other_settings_are_refused(folder, small_street, build_map, more, words
     changes = [setting.replace("STREET", str(small_street)) for setting in more]
     _, stderr = build_map(folder, small_street, *changes, code=2)
     assert words in stderr
-
-
-def test_settings_that_another_build_wrote_meanwhile_stay(tmp_path, small_street):
-    common = (f"map={tmp_path}/map", *QUICK[:-1])
-    settings = [settings_of(*common, f"candidates={number}", config="map") for number in (5, 6)]
-    systems = map(assembly.system, settings)
-    first, second = (Map(tmp_path / "map", system) for system in systems)
-    images = image_folder(small_street / "database")
-    second.build(images)
-    with pytest.raises(InputError, match="was made with other candidates"):
-        first.build(replace(images, root=small_street, names=("queries/0000.png",)))
-    assert read_declaration(tmp_path / "map")["candidates"] == 6
 
 
 @pytest.mark.slow
@@ -349,16 +334,6 @@ def test_names_do_not_depend_on_the_spelling_of_a_path(small_street, video, tmp_
     assert name == f"{video}:0"
 
 
-def test_a_file_that_vanishes_while_its_folder_is_listed_does_not_end_the_watch(tmp_path, monkeypatch):
-    (tmp_path / "a.png").symlink_to("gone")
-    (tmp_path / "b.png").write_bytes(b"image")
-    (tmp_path / "c.png").mkdir()
-    monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was when it was listed
-    monkeypatch.setattr(localization, "POLL", 0)
-    name, path = next(localization.images_of(Localize(map="map", images=str(tmp_path), watch=True)))
-    assert (name, path) == (str(tmp_path / "b.png"), tmp_path / "b.png")
-
-
 def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
     image, writes = tmp_path / "a.png", [b"image", b"im"]
     image.write_bytes(b"i")
@@ -367,16 +342,8 @@ def test_an_image_is_taken_when_its_file_stops_changing(tmp_path, monkeypatch):
     assert path.read_bytes() == b"image"
 
 
-def test_two_do_not_add_their_drives_at_the_same_time(twice, folder, localize):
-    with MapFile(folder).lock():
-        lines, stderr = localize(twice, "add=true", code=2)
-    assert [(line["image"], "added" in line) for line in lines] == [(f"{twice}/00.png", False)]
-    assert "another process adds images" in stderr
-    assert stderr.count("\n") == 1
-
-
 def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path, localize):
-    settings = read_declaration(folder)
+    settings = read_settings(folder)
     for candidates, absent in ((settings["candidates"], 0), (settings["candidates"] + 1, 7)):
         same = {name: settings[name] for name in ("features", "retrieval", "matching")}
         origin = {
@@ -402,7 +369,7 @@ def test_a_map_is_calibrated(folder, small_street, call_program, localize):
 
 @pytest.mark.slow
 def test_new_images_of_a_folder_are_localized(folder, small_street, queries):
-    command = [sys.executable, "-m", "experiments.localize", f"map={folder}", f"images={queries}", "watch=true"]
+    command = [*MFVPR, "localize", f"map={folder}", f"images={queries}", "watch=true"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         assert running.stderr.readline() == f"watching {queries}; end with Ctrl-C\n"
         for row in (3, 5):

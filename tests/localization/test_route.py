@@ -74,16 +74,6 @@ def test_a_speed_that_was_right_for_long_and_is_wrong_now_is_a_warning():
     assert len(lines) == 1
 
 
-@pytest.mark.parametrize("advance", [3, -2, 0])
-def test_a_sure_robot_moves_as_its_drive_says(advance):
-    there, drive_route = np.ones(60, bool), Route(Drive(advance, 0.05, 0.0))
-    for turn in range(6):
-        located = drive_route(sharp(30) if turn == 0 else None, there)
-        assert located.row == 30 + turn * advance
-        assert located.p > 0.98 * (1 - located.off)
-        assert located.advance == pytest.approx(advance, abs=1e-5)
-
-
 def test_it_finds_a_robot_that_was_carried_away():
     there, drive_route = np.ones(200, bool), Route(Drive())
     for turn in range(20):

@@ -50,16 +50,6 @@ def test_threads_get_the_answers_of_one_thread(images, tmp_path):
     assert [shared.localize(path) for path in images.paths] == expected
 
 
-def test_threads_add_to_one_map(images, tmp_path):
-    shared = opened(tmp_path / "map")
-    with ThreadPoolExecutor(4) as threads:
-        [*threads.map(lambda row: shared.add(images.paths[row], row, name=str(row)), range(len(images)))]
-    assert sorted(shared.names) == sorted(map(str, range(len(images))))
-    again = opened(tmp_path / "map")
-    assert again.names == shared.names
-    assert [again.localize(path).place for path in images.paths] == [*range(len(images))]
-
-
 def test_builders_share_one_vocabulary(images, tmp_path):
     learning, other = (opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2))
 
@@ -136,17 +126,6 @@ def test_a_map_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
                 use()
     assert opened(folder).localize(images.paths[0]).place == images.names[0]
     assert len(opened(folder)) == 6
-
-
-def test_a_vocabulary_that_replaced_the_one_that_is_open_is_refused(images, tmp_path):
-    maps = [opened(tmp_path / "map", describer=VladFitting(num_words=2)) for _ in range(2)]
-    for known in maps:
-        known.learn(first(images, 4))
-    shutil.rmtree(tmp_path / "map")
-    opened(tmp_path / "map", describer=VladFitting(num_words=2)).build(images)
-    for use in (lambda known: known.localize(images.paths[0]), lambda known: known.add(images.paths[0], 0, name="0")):
-        with pytest.raises(InputError, match=r"replaced.* Open the map again"):
-            use(maps.pop())
 
 
 def test_a_map_stays_where_it_is_when_the_working_directory_changes(images, folder, monkeypatch):

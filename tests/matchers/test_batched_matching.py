@@ -24,9 +24,8 @@ from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matchers import MatchSet, NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers.batched_matching import QUERIES
-from mfvpr.matchers.match_set import batches, shapes, slots, split_pairs
+from mfvpr.matchers.match_set import batches, shapes, slots, split_pairs, split_rows
 from mfvpr.storage.packing import round_as_stored
-from mfvpr.utils import ragged
 from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
 
@@ -88,7 +87,7 @@ def assert_as_alone(match_set, queries, database, candidates, expected):
     assert len(match_set) == len(queries)
     assert match_set.counts.shape == candidates.indices.shape
     for query, flat in enumerate(match_set.matches):
-        rows = ragged.split(per_match(flat), match_set.counts[query])
+        rows = split_rows(per_match(flat), match_set.counts[query])
         for place, index in enumerate(candidates.indices[query]):
             row = expected.get((query, place))
             if row is None:

@@ -12,10 +12,11 @@ from mfvpr import InputError, LightGlueMatcher, NearestNeighborMatcher
 from mfvpr.core.types import per_keypoint, per_match
 from mfvpr.evaluation import Pipeline, stages
 from mfvpr.features import FeatureSet, Scale, Sift
+from mfvpr.matchers.match_set import split_rows
 from mfvpr.networks.lightglue_assignment import assignment
 from mfvpr.retrieval import ShortlistFiles
-from mfvpr.storage.match_files import MatchStore
-from mfvpr.utils import ragged, recipe_of
+from mfvpr.storage.cache_files import MatchStore
+from mfvpr.utils import recipe_of
 from tests.builders import make_shortlist, stack
 from tests.golden.make_lightglue import SIZES, SMALL, pair
 from tests.networks.test_lightglue import match_one, padded, small_network
@@ -128,7 +129,7 @@ def test_stores_keep_the_confidence_for_the_scorers(tmp_path):
         for query, place in np.ndindex(2, 2):
             row = SHORTLIST.indices[query, place]
             alone = rows(match_one(matcher(), padded(queries[query], 32), padded(database[row], 32)))
-            in_set = ragged.split(per_match(match_set.matches[query]), match_set.counts[query])[place]
+            in_set = split_rows(per_match(match_set.matches[query]), match_set.counts[query])[place]
             assert_same_rows(in_set, alone)
         sure = replace(match_set, matches=[replace(matches, confidence=None) for matches in match_set.matches])
         scorers = {"histogram": mfvpr.HistogramOfShifts()}
@@ -150,9 +151,7 @@ class Extractor:
 
 
 def test_features_of_another_kind_are_one_line():
-    expected = (
-        "^LightGlue: expected ALIKED's features, of 16 dimensions, got {}; extract these, or match nearest neighbors$"
-    )
+    expected = "^LightGlue: expected ALIKED's features, of 16 dimensions, got {}; "
     retriever = ShortlistFiles({})
     for extractor, got in ((Sift(), "Sift of 128"), (Extractor(16, 64), "Extractor of 16, 64")):
         with pytest.raises(InputError, match=expected.format(got)):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mfvpr import match, soft_match
 from mfvpr.core.types import per_keypoint
-from tests import soft_oracles
+from tests import score_oracles
 from tests.builders import double, make_features, stack
 
 pytestmark = pytest.mark.thorough
@@ -55,7 +55,7 @@ def test_smooth_agree_with_the_loop(pair, temperature):
     np.testing.assert_array_equal(got.mask, rows0 & rows1.any())
     assert ((got.confidence >= 0) & (got.confidence <= 1)).all()
     if rows1.any():
-        expected = soft_oracles.soft_matches(
+        expected = score_oracles.soft_matches(
             features0.descriptors[rows0],
             features1.descriptors[rows1],
             features1.keypoints[rows1],
@@ -148,7 +148,7 @@ def test_ratios_agree_with_the_loop(pair, mode):
     rows0 = usable(features0)
     got = with_ratio(features0, features1, cross_check=mode)
     assert np.isfinite(got.ratio).all()
-    expected = soft_oracles.ratios(features0.descriptors[rows0], features1.descriptors[usable(features1)])
+    expected = score_oracles.ratios(features0.descriptors[rows0], features1.descriptors[usable(features1)])
     np.testing.assert_allclose(got.ratio[rows0], expected, atol=1e-5)
     assert ((got.ratio >= 0) & (got.ratio <= 1)).all()
 

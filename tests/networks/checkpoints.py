@@ -2,9 +2,8 @@
 
 from functools import partial
 
-from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.conversion import NETVLAD, convert
 from mfvpr.checkpoints.networks import NETWORKS, plan_network
-from mfvpr.checkpoints.tables import NETVLAD
 from mfvpr.networks import VggNetVlad
 from tests.random_checkpoints import netvlad_shapes, random_checkpoint
 

@@ -11,10 +11,8 @@ from flax import nnx
 from mfvpr import InputError
 from mfvpr.features import AlikedFeatures
 from mfvpr.networks import Aliked
-from mfvpr.networks.aliked import DeformableConv
-from mfvpr.networks.aliked_description import DescriptorHead, field
-from mfvpr.networks.aliked_detection import detect
-from mfvpr.networks.sampling import sample, upsample
+from mfvpr.networks.aliked import DeformableConv, DescriptorHead, detect, field
+from mfvpr.networks.sampling import sample, stretch
 from tests.builders import local
 from tests.golden.make_aliked import DRAWN, REAL, checkpoint, picture, projections, samples, texture
 from tests.needs import ALIKED, PHOTOGRAPHS, needs
@@ -109,7 +107,7 @@ def test_the_extractor_does_as_the_public_code_and_compiles_once(drawn, golden, 
 
 
 def test_a_deformable_convolution_agrees_with_the_oracle():
-    conv = randomized(partial(DeformableConv, 3, 4, precision="highest"), 1.5)
+    conv = randomized(partial(DeformableConv, 3, 4), 1.5)
     images = seeded((2, 6, 5, 3))
     results = jax.jit(lambda images: conv(images))(images)
     for image, ours in zip(images, results, strict=True):
@@ -131,7 +129,7 @@ def test_a_field_is_the_dense_map_where_it_is_asked_for():
     @jax.jit
     def both(levels):
         features = field(levels, *window)
-        maps = [upsample(level, len(levels[0]) // len(level)) for level in levels]
+        maps = [stretch(level, *levels[0].shape[:2]) for level in levels]
         plain = jnp.concatenate(maps, axis=-1)[window]
         plain /= jnp.linalg.norm(plain, axis=-1, keepdims=True)
         return (features.dense(), features.sample(points), features.at(y, x)), (plain, sample(plain, points))
@@ -145,7 +143,7 @@ def test_a_field_is_the_dense_map_where_it_is_asked_for():
 
 
 def test_descriptors_agree_with_the_oracle_also_at_the_border():
-    head = randomized(partial(DescriptorHead, 8, 4, precision="highest"), 0.7)
+    head = randomized(partial(DescriptorHead, 8, 4), 0.7)
     weights = dict(nnx.to_flat_state(nnx.state(head)))
     weights = {".".join(path): np.asarray(value[...]) for path, value in weights.items()}
     points = np.random.default_rng(0).uniform(0, [31, 25], (40, 2)).astype(np.float32)

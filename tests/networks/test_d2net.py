@@ -7,12 +7,11 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
-from mfvpr.features import D2NetFeatures
-from mfvpr.features import d2net_features as features_d2net
+from mfvpr.features import D2NetFeatures, keypoint_networks
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 from tests.builders import local
 from tests.golden.make_d2net import CASES, PLAIN, projections, samples, texture
 from tests.networks import d2net_oracle as oracle
@@ -207,7 +206,7 @@ def test_what_does_not_fit_is_counted_and_the_strongest_stay():
 
 
 def test_crowded_images_are_extracted_again(small, images, monkeypatch):
-    monkeypatch.setattr(features_d2net, "_SHARE", 0.01)
+    monkeypatch.setattr(keypoint_networks, "_SHARE", 0.01)
     crowded = D2NetFeatures(small.model, small.image_size)
     for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
         assert len(expected.scores) > 2
@@ -272,12 +271,3 @@ def test_the_smallest_images_are_taken(model, size, multiscale, slots):
         jax.ShapeDtypeStruct((1, *size, 3), jnp.uint8),
     )
     assert levels[0].keypoints.shape == (1, slots, 2)
-
-
-def test_relu_is_an_option(model, images):
-    open_ended = nnx.merge(*nnx.split(model))
-    open_ended.relu = False
-    both = compile_network(nnx.List([model, open_ended]), lambda models, images: [model(images) for model in models])
-    usual, dense = both(preprocess(images[:1, :24, :24], "caffe"))
-    assert dense.min() < 0
-    np.testing.assert_array_equal(usual, np.maximum(dense, 0))

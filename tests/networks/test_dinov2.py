@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints.tables import DINOV2
+from mfvpr.checkpoints.conversion import DINOV2
 from mfvpr.features import Dinov2Features, GlobalDescriptor
 from mfvpr.networks import VisionTransformer
 from mfvpr.networks.vit import TokenDescriptor
@@ -122,7 +122,7 @@ def test_wrong_settings_are_one_line(settings, words):
 
 
 def test_another_network_and_images_of_another_size_are_one_line():
-    with pytest.raises(InputError, match="DINOv2: expected a VisionTransformer as model, got TokenDescriptor"):
+    with pytest.raises(InputError, match="Dinov2Features: expected a VisionTransformer as model, got TokenDescriptor"):
         Dinov2Features(TokenDescriptor(network()))
     with pytest.raises(InputError, match=r"Dinov2Features: .*56 x 28 px, got 28 x 56"):
         Dinov2Features(network(), (56, 28))(np.zeros((1, 56, 28, 3), np.uint8))

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import convert
+from mfvpr.checkpoints.conversion import LIGHTGLUE, convert
 from mfvpr.checkpoints.networks import plan_network
-from mfvpr.checkpoints.tables import LIGHTGLUE
 from mfvpr.core.types import per_keypoint
 from mfvpr.matchers import LightGlueMatcher
 from mfvpr.networks import LightGlue

@@ -9,7 +9,7 @@ import pytest
 
 from mfvpr.features import MixVprDescriptor
 from mfvpr.networks import MixVPR
-from mfvpr.networks.imagenet import preprocess
+from mfvpr.networks.layers import preprocess
 from mfvpr.utils import InputError
 from tests.golden.make_mixvpr import SIZES, faint_maps, images
 from tests.golden.make_netvlad import samples

@@ -8,10 +8,10 @@ import pytest
 from flax import nnx
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.tables import NETVLAD_MATLAB
+from mfvpr.checkpoints.conversion import NETVLAD_MATLAB
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
-from mfvpr.networks.gem import GeneralizedMean
+from mfvpr.networks.layers import GeneralizedMean
 from mfvpr.networks.netvlad import CHANNELS
 from mfvpr.utils import InputError
 from tests.golden.make_netvlad import CASES, GEM, MATLAB, PATCHES, image, name, samples
@@ -84,7 +84,7 @@ def test_layer_and_patches_are_those_of_loops(order):
     rng = np.random.default_rng(0)
     maps = rng.normal(size=(2, 4, 5, CHANNELS))
     with jax.numpy_dtype_promotion("standard"):
-        layer = NetVlad(3, order, precision="highest", rngs=nnx.Rngs(0))
+        layer = NetVlad(3, order, rngs=nnx.Rngs(0))
     layer.centers[...] = jax.numpy.asarray(rng.normal(size=(3, CHANNELS)) / 20, np.float32)
     kernel, centers = (np.asarray(parameter[...], np.float64) for parameter in (layer.assignment.kernel, layer.centers))
 
@@ -114,7 +114,7 @@ def test_layer_and_patches_are_those_of_loops(order):
 
 def test_where_a_map_is_zero_there_is_no_nan():
     with jax.numpy_dtype_promotion("standard"):
-        layer = NetVlad(2, precision="highest", rngs=nnx.Rngs(0))
+        layer = NetVlad(2, rngs=nnx.Rngs(0))
     zero = np.zeros((1, 3, 3, CHANNELS), np.float32)
     assert not np.asarray(layer(zero)).any()
     assert not np.asarray(layer.patches(zero, 2)).any()

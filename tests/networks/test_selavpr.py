@@ -10,11 +10,10 @@ import pytest
 from flax import nnx
 
 import mfvpr
-from mfvpr.checkpoints.tables import DINOV2, SELAVPR
+from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
 from mfvpr.features import GlobalDescriptor, SelaVprFeatures
 from mfvpr.networks import SelaVpr, VisionTransformer
-from mfvpr.networks.selavpr import AdaptedBlock, Upsampling
-from mfvpr.networks.vit import Block, TokenDescriptor
+from mfvpr.networks.vit import AdaptedBlock, Block, TokenDescriptor, Upsampling
 from mfvpr.utils import InputError, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import make_matches
@@ -109,7 +108,7 @@ def as_features(values):
 def test_upsampling_is_the_sum_of_what_positions_add():
     rng = np.random.default_rng(0)
     with jax.numpy_dtype_promotion("standard"):
-        layer = Upsampling(5, 3, precision="highest", rngs=nnx.Rngs(0))
+        layer = Upsampling(5, 3, rngs=nnx.Rngs(0))
     layer.bias[...] = jnp.asarray(rng.normal(size=3), jnp.float32)
     x = rng.normal(size=(2, 3, 4, 5)).astype(np.float32)
     expected = np.zeros((2, 7, 9, 3))  # with a border, which is dropped
@@ -122,13 +121,13 @@ def test_upsampling_is_the_sum_of_what_positions_add():
 @pytest.mark.slow
 def test_without_adapters_an_adapted_block_is_a_plain_one():
     with jax.numpy_dtype_promotion("standard"):
-        plain, adapted = (kind(64, 2, precision="highest", rngs=nnx.Rngs(0)) for kind in (Block, AdaptedBlock))
+        plain, adapted = (kind(64, 2, rngs=nnx.Rngs(0)) for kind in (Block, AdaptedBlock))
     x = jax.random.normal(jax.random.key(1), (2, 5, 64))
     for part in ("attention", "perceptron"):
         nnx.update(getattr(adapted, part), nnx.state(getattr(plain, part)))
     assert np.abs(adapted(x) - plain(x)).max() > 1e-3
     for adapter in (adapted.serial, adapted.parallel):
-        adapter.up.kernel[...] = jnp.zeros_like(adapter.up.kernel[...])
+        adapter.output.kernel[...] = jnp.zeros_like(adapter.output.kernel[...])
     np.testing.assert_array_equal(adapted(x), plain(x))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.networks.ssm import STAGE1_STRIDE, STAGE2_STRIDE
+from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, checkpoint
 from tests.networks.checkpoints import fill_published

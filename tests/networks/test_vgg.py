@@ -1,4 +1,4 @@
-"""VGG16 and its convolutions, against float64 sums by definition."""
+"""Layers that networks share, and VGG16: against float64 sums by definition."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,9 @@ import pytest
 from flax import nnx
 
 from mfvpr.networks import Vgg16
-from mfvpr.networks.convolution import Conv3x3, winograd
+from mfvpr.networks.layers import Conv3x3, preprocess, winograd
+from mfvpr.networks.sampling import sample, stretch
+from tests.networks import aliked_oracle as oracle
 
 pytestmark = pytest.mark.thorough
 
@@ -27,9 +29,9 @@ def convolved(x, kernel, dilation):
 def test_convolutions_agree_with_their_definition(height, width, dilation, channels):
     rng = np.random.default_rng(height)
     x = rng.normal(size=(2, height, width, channels)).astype(np.float32)
-    layer = Conv3x3(channels, 3, dilation=dilation, precision="highest", rngs=nnx.Rngs(0))
+    layer = Conv3x3(channels, 3, dilation=dilation, rngs=nnx.Rngs(0))
     layer.bias[...] = jnp.arange(3, dtype=jnp.float32)
-    fast = jax.jit(lambda x, kernel: winograd(x, kernel, dilation, "highest"))(x, layer.kernel[...])
+    fast = jax.jit(lambda x, kernel: winograd(x, kernel, dilation))(x, layer.kernel[...])
     expected = convolved(x, np.asarray(layer.kernel[...]), dilation)
     tolerance = 1e-5 * np.abs(expected).max()
     np.testing.assert_allclose(layer(x), expected + np.arange(3), atol=tolerance)
@@ -89,3 +91,41 @@ def test_layers_behind_the_last_map_do_not_run():
     image = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     run = jax.make_jaxpr(lambda state, image: nnx.merge(graph, state)(image, "conv1_2"))(state, image)
     assert str(run).count("conv_general_dilated[") == 2
+
+
+@pytest.mark.optimized
+def test_bytes_are_preprocessed_to_the_last_bit():
+    byte = np.arange(256, dtype=np.uint8)
+    image = np.stack([byte, byte[::-1], np.roll(byte, 7)], axis=-1)[None, None]
+    mean = np.array([103.939, 116.779, 123.68])  # blue comes first
+    expected = (image[..., ::-1].astype(np.float32) - mean).astype(np.float32)
+    np.testing.assert_array_equal(preprocess(image, "caffe"), expected)
+    np.testing.assert_allclose(preprocess(image.astype(np.float32), "caffe"), expected, atol=1e-5)
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    expected = ((image.astype(np.float32) / np.float32(255) - mean) / deviation).astype(np.float32)
+    np.testing.assert_array_equal(preprocess(image, "torch"), expected)
+    np.testing.assert_allclose(preprocess(image.astype(np.float32), "torch"), expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def dense() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+
+
+def test_values_between_pixels_and_outside_agree_with_the_oracle(dense):
+    points = np.random.default_rng(1).uniform(-3, 9, (40, 5, 2)).astype(np.float32)
+    points[0] = [[6, 4], [7, 4], [-1, 0], [1e6, 0], [0, -1e6]]  # on pixels, and far from the map
+    expected = [oracle.sampled(dense, x, y) for x, y in points.reshape(-1, 2)]
+    sampled = jax.jit(sample)(dense, points)
+    assert sampled.shape == (40, 5, 3)
+    np.testing.assert_allclose(sampled.reshape(-1, 3), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("height, width, factor", [(5, 7, 1), (5, 7, 2), (5, 7, 8), (1, 1, 32)])
+def test_the_finer_grid_has_the_same_corners(dense, height, width, factor):
+    finer = jax.jit(stretch, static_argnums=(1, 2))(dense[:height, :width], factor * height, factor * width)
+    assert finer.shape == (height * factor, width * factor, 3)
+    y = np.linspace(0, height - 1, height * factor)
+    x = np.linspace(0, width - 1, width * factor)
+    expected = [[oracle.sampled(dense, column, row) for column in x] for row in y]
+    np.testing.assert_allclose(finer, expected, atol=1e-5)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mfvpr.report.pages.one_run import write_report
-from mfvpr.report.pages.several_runs import write_comparison
+from mfvpr.report.pages import write_comparison, write_report
 from tests.needs import needs
 from tests.run_folders import HEADLINE, RANKS, SYSTEMS, write_run
 

@@ -79,7 +79,7 @@ def test_trajectory_leaves_out_images_without_a_place(write, tmp_path):
         write_poses(tmp_path / "kitti.txt", images[:1], tmp_path / "poses.txt", DATABASE, None)
     with one_line_error("expected a place of all images, .* of 4 images"):
         write_poses(tmp_path / "kitti.txt", images, tmp_path / "poses.txt", DATABASE, None)
-    with one_line_error("expected a database image with a pose, got 1.png; name the folder"):
+    with one_line_error("expected a database image with a pose, got 1.png; localize with"):
         write_poses(tmp_path / "tum2.txt", images, tmp_path / "poses.txt", ["a", "b", "c"], STAMPS)
     assert not [*tmp_path.glob("kitti*"), *tmp_path.glob("tum2*")]
 
@@ -87,26 +87,16 @@ def test_trajectory_leaves_out_images_without_a_place(write, tmp_path):
 @pytest.mark.parametrize(
     "line",
     [
-        "{", "[]", "3", '"text"', "{}", "[" * 100_000,
+        "{",
+        "[]",
         {"image": "a.png"},
         {**LINES[0], "shift": [1.0]},
-        {**LINES[0], "shift_interval": [1, 2]},
         {**LINES[0], "alternatives": [{"row": 3}]},
-        {name: value for name, value in LINES[2].items() if name != "reason"},
     ],
-)  # fmt: skip
+)
 def test_other_lines_are_one_line(write, line):
     with one_line_error("line 2: expected a line of mfvpr localize", "lines.jsonl"):
         read_lines(write([LINES[0], line]))
-
-
-def test_a_place_without_alternatives_has_shifts_but_no_pose(write, tmp_path):
-    place = next(line for line in LINES if line.get("place") is not None)
-    [image] = read_lines(write([{**place, "alternatives": []}]))
-    write_shift_table(tmp_path / "shifts.csv", [image], [0])
-    (tmp_path / "poses.txt").write_text("".join(f"{row}.5 1 2 3 0 0 0 1\n" for row in range(len(DATABASE))))
-    with one_line_error("alternatives=1"):
-        write_poses(tmp_path / "out.txt", [image], tmp_path / "poses.txt", DATABASE, [0])
 
 
 def test_files_of_a_run(tmp_path):

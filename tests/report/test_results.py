@@ -14,7 +14,7 @@ from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
 from mfvpr.evaluation import DriveFilter, Fusion
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.report.pages.files import read_run
+from mfvpr.report.pages import read_run
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils import InputError
 from tests.programs import composed, csv_rows

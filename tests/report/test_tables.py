@@ -1,11 +1,15 @@
-"""Names of any characters in CSV and LaTeX."""
+"""Names of any characters in CSV, LaTeX, and as names of files."""
 
 import csv
 import io
 import string
 
+import pytest
+
 from mfvpr.report import Table
+from mfvpr.report.runs import file_names
 from mfvpr.report.tables import read_csv, write_csv
+from mfvpr.utils import InputError
 
 NAMES = ["a\rb", "a\r\nb\r\n", "a\nb", "\r", 'a,"b"', "=a", "\udcff.png"]
 
@@ -23,3 +27,35 @@ def test_no_character_is_a_command_of_latex():
     row = Table(["name"], [[string.punctuation]]).latex().splitlines()[4]
     escaped = r"!\"\#\$\%\&'()*+,-./:;<=>?@[\textbackslash{}]\textasciicircum{}\_`\{|\}\textasciitilde{}"
     assert row == escaped.replace(r"\"", '"') + r" \\"
+
+
+HOSTILE = (
+    "a/b", "a_b", "../up", "..", ".", "", "nul\0", "two\nlines", "a\\b", "c:d", "e*?", "not utf-8 \udcff", "\ud800",
+    ".hidden", "ends in dot.", " ", "x" * 300, "x" * 301, "ü" * 150, "a + b", "A + B", "count", "Count", "c_d", "c + d",
+)  # fmt: skip
+
+
+def test_plain_names_are_files_of_their_own_name():
+    files = {
+        "histogram": "histogram",
+        "histogram + anchor + retrieval": "histogram_anchor_retrieval",
+        "homography_24 + retrieval": "homography_24_retrieval",
+        "my score (v2), straße=1": "my score (v2), straße=1",
+    }
+    assert file_names([*files]) == files
+
+
+def test_names_have_different_files_that_every_folder_takes(tmp_path):
+    names = list(HOSTILE)
+    files = file_names(names)
+    assert len({file.casefold() for file in files.values()}) == len(names)
+    for name, file in files.items():
+        (tmp_path / f"{file}.csv").write_text(repr(name))
+    assert len([*tmp_path.iterdir()]) == len(names)  # none in a folder, or above
+    for name, file in files.items():
+        assert (tmp_path / f"{file}.csv").read_text() == repr(name)
+
+
+def test_a_repeated_name_is_refused():
+    with pytest.raises(InputError, match="got one twice"):
+        file_names(["one", "two", "one"])

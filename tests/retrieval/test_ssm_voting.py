@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets import Positives
-from mfvpr.retrieval import ExactSearch
-from mfvpr.retrieval.ssm_voting import vote
+from mfvpr.retrieval import retriever
+from mfvpr.retrieval.retriever import vote
 
 
 def by_loops(queries, database, num_candidates, excluded=()):
@@ -39,27 +39,21 @@ def windows(seed, images, per_image=4, dimension=5):
     return np.random.default_rng([seed, images]).normal(size=(images, per_image, dimension)).astype(np.float32)
 
 
-@pytest.mark.parametrize("memory", [None, 2e-6], ids=["at once", "few at a time"])
 @pytest.mark.parametrize("num_candidates", [1, 3, 9, 12])
-def test_agrees_with_the_loop(num_candidates, memory):
+def test_agrees_with_the_loop(num_candidates):
     queries, database = windows(0, 7), windows(0, 9)
     database[4, 1, 0], queries[2, 1, 0] = np.nan, np.inf
-    got = vote(queries, database, num_candidates, search=ExactSearch(memory))
+    got = vote(queries, database, num_candidates)
     assert_lists(got, by_loops(queries, database, num_candidates), num_candidates)
 
 
-def test_excluded_images_neither_get_votes_nor_fill_up():
+def test_excluded_images_neither_get_votes_nor_fill_up(monkeypatch):
+    monkeypatch.setattr(retriever, "QUERIES", 2)
     queries, database = windows(1, 5), windows(1, 8)
     excluded = [[0, 1, 2], [], [7], [*range(8)], [3]]
     got = vote(queries, database, 8, excluded=Positives.from_rows(excluded, 8))
     assert_lists(got, by_loops(queries, database, 8, excluded), 8)
     assert not got.mask[3].any()
-
-
-def test_more_queries_than_go_together():
-    queries, database, excluded = windows(2, 70), windows(2, 6), [[row % 6] for row in range(70)]
-    got = vote(queries, database, 2, excluded=Positives.from_rows(excluded, 6))
-    assert_lists(got, by_loops(queries, database, 2, excluded), 2)
 
 
 def test_equal_votes_go_by_row_and_equal_windows_by_image():

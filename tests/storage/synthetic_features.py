@@ -80,7 +80,6 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "empty": lambda path: path.write_bytes(b""),
     "short": lambda path: path.write_bytes(path.read_bytes()[:-3]),
     "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-    "long": lambda path: path.write_bytes(path.read_bytes() + b"abc"),
     "flipped": lambda path: flip(path, path.stat().st_size // 2),
     "gone": lambda path: path.unlink(),
 }

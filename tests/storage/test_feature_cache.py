@@ -12,8 +12,8 @@ from mfvpr import Runtime
 from mfvpr.datasets import image_folder
 from mfvpr.datasets.image_reading import resize
 from mfvpr.features import Aggregated, Description, VladFitting
-from mfvpr.storage import FeatureCache, feature_cache, recipes
-from mfvpr.storage.recipes import Recipes
+from mfvpr.storage import FeatureCache, feature_cache
+from mfvpr.storage.feature_cache import Recipes
 from mfvpr.utils import InputError
 from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_features
 from tests.storage.synthetic_features import DAMAGE, assert_same
@@ -116,13 +116,13 @@ def test_other_conversions_give_other_images(tmp_path, change):
 
 
 def test_what_another_version_decodes_are_other_images(monkeypatch):
-    known, recipe = recipes.versions(), Recipes(None).of_features(SIFT)
+    known, recipe = feature_cache.versions(), Recipes(None).of_features(SIFT)
     for name in ("opencv-python-headless", "pillow"):
-        monkeypatch.setattr(recipes, "versions", lambda name=name: {**known, name: "0"})
+        monkeypatch.setattr(feature_cache, "versions", lambda name=name: {**known, name: "0"})
         assert Recipes(None).of_features(SIFT) != recipe
-    monkeypatch.setattr(recipes, "versions", lambda: {**known, "mfvpr": "0"})  # a release decodes as the last one
+    monkeypatch.setattr(feature_cache, "versions", lambda: {**known, "mfvpr": "0"})  # a release decodes as the last one
     assert Recipes(None).of_features(SIFT) == recipe
-    monkeypatch.setattr(recipes, "DECODING", "0")
+    monkeypatch.setattr(feature_cache, "DECODING", "0")
     assert Recipes(None).of_features(SIFT) != recipe
 
 
@@ -235,17 +235,6 @@ def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, on_disk
     assert sorted(descriptors.bad) == [1, 2]
     assert "b.png: features are not finite" in descriptors.bad[1]
     assert np.isnan(descriptors.values).any(axis=1).tolist() == [False, True, True, False]
-
-
-def test_stores_are_found_by_content_whatever_folders_are_called(folder, tmp_path, small_street):
-    copy = tmp_path / "copy"
-    shutil.copytree(small_street / "database", copy)
-    lines, extractor = [], Counted()
-    for images, label in ((folder, "summer"), (image_folder(copy), "winter")):
-        FeatureCache(tmp_path / "s", runtime=Runtime(log=lines.append)).local(images, extractor, label=label)
-    assert extractor.seen == len(folder)
-    [path] = [path for path in (tmp_path / "s").iterdir() if path.name != "contents"]
-    assert lines == [f"summer features: 10 of 10 images to do in {path}"]
 
 
 def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path):

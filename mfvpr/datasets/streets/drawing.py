@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import pairwise
@@ -35,7 +35,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Drive:
-    """The images of one folder: a camera and the name of a weather per frame, and the seed of the images.
+    """The images of one folder, with a camera and the name of a weather per frame.
 
     `ground_truth` is the file with the shifts to the database's frames; None = this is the database.
     """
@@ -143,7 +143,7 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Pro
 
 
 def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
-    """Draw one image of a drive and write it."""
+    """Draw one image of a drive and write it: panels from far to near, then lens, air and sensor."""
     rng, camera, weather = np.random.default_rng((*drive.seed, row)), drive.cameras[row], WEATHERS[drive.weathers[row]]
     cars = scene.cars[1::2] if drive.ground_truth is None else scene.cars[::2]  # no query meets a car of the database
     # Objects on the street are never behind a house, hence houses are painted first.
@@ -151,24 +151,19 @@ def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
     near = ([prop for prop in layer if prop.z < camera.z + SIGHT] for layer in layers)
     z = camera.z + 4.0  # the sky is so far away that it moves along with the camera
     sky = Panel(scene.sky, (camera.x - 8, -CAMERA_HEIGHT - 3.9, z), (16, 0, 0), (0, 4.0, 0))
-    image = expose(paint(([Prop(z, (sky,))], *near), camera, weather), weather, rng)
-    path = drive.folder / f"{row:04d}.png"
-    if not cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"cannot write {path}")
-
-
-def paint(layers: Iterable[Iterable[Prop]], camera: Camera, weather: Weather) -> Image:
-    """The image (RGB) that the camera sees, before lens, air and sensor; later layers hide earlier ones."""
     width, height = camera.image_size
     size = (round(width * OVERSAMPLING), round(height * OVERSAMPLING))
     canvas = np.empty((size[1], size[0], 4), np.uint8)
     canvas[:] = (*weather.horizon, 255)
     projection = np.diag([size[0] / width, size[1] / height, 1.0]) @ camera.projection()
-    for layer in layers:
+    for layer in ([Prop(z, (sky,))], *near):
         for prop in sorted(layer, key=lambda prop: -prop.z):
             for panel in prop.panels:
                 paint_panel(canvas, projection, panel, weather)
-    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)[..., :3]
+    image = expose(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)[..., :3], weather, rng)
+    path = drive.folder / f"{row:04d}.png"
+    if not cv2.imwrite(str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(f"cannot write {path}")
 
 
 def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weather) -> None:
@@ -178,9 +173,16 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
     """
     frame = np.column_stack([panel.right, panel.down, panel.corner])
     homography = projection @ np.vstack([frame, (0, 0, 1)])
-    outline = clip_outline(homography)
-    if outline is None:
+    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]) @ homography.T
+    clipped = []  # the part in front of the camera
+    for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if corner[2] > NEAR:
+            clipped.append(corner)
+        if (corner[2] > NEAR) != (following[2] > NEAR):
+            clipped.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
+    if not clipped:
         return
+    outline = np.array([point[:2] / point[2] for point in clipped])
     double_area = 0.0
     for (x0, y0), (x1, y1) in pairwise([*outline.tolist(), outline[0].tolist()]):
         double_area = double_area + x0 * y1 - y0 * x1
@@ -209,20 +211,6 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
     cv2.fillConvexPoly(mask, np.rint((outline - low) * 16).astype(np.int32), 255, shift=4)
     mask[patch[..., 3] < 128] = 0
     cv2.copyTo(patch, mask, canvas[low[1] : high[1], low[0] : high[0]])
-
-
-def clip_outline(homography: Floats) -> Floats | None:
-    """Corners `[n, 2]` px of the unit square's image, clipped in front of the camera; None if all of it is behind."""
-    corners = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]) @ homography.T
-    if np.all(corners[:, 2] > NEAR):
-        return corners[:, :2] / corners[:, 2:]
-    outline = []
-    for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if corner[2] > NEAR:
-            outline.append(corner)
-        if (corner[2] > NEAR) != (following[2] > NEAR):
-            outline.append(corner + (following - corner) * (NEAR - corner[2]) / (following[2] - corner[2]))
-    return np.array([point[:2] / point[2] for point in outline]) if outline else None
 
 
 def expose(image: Image, weather: Weather, rng: Rng) -> Image:

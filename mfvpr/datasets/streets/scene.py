@@ -12,14 +12,7 @@ import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera, Facade
 from mfvpr.datasets.streets.sheets import (
-    ACCENTS,
-    CARS,
     DARK,
-    GLASS,
-    ROOFS,
-    TRIMS,
-    WALLS,
-    WARM,
     WEATHERS,
     Color,
     Image,
@@ -33,11 +26,28 @@ from mfvpr.datasets.streets.sheets import (
     blotches,
     draw_glyphs,
     move,
-    pick,
     texture,
     tone,
     upright,
 )
+
+WALLS = (
+    (226, 205, 160),
+    (214, 170, 130),
+    (196, 120, 96),
+    (170, 184, 160),
+    (176, 188, 200),
+    (232, 224, 208),
+    (205, 150, 140),
+    (186, 160, 120),
+    (150, 92, 78),
+    (216, 190, 190),
+)
+TRIMS = ((245, 240, 230), (230, 222, 205), (120, 110, 104))
+ACCENTS = ((150, 48, 44), (38, 84, 124), (40, 96, 74), (196, 148, 48), (92, 60, 110), (48, 52, 60), (208, 96, 48))
+ROOFS = ((158, 82, 62), (132, 74, 62), (92, 92, 102), (112, 84, 76))
+CARS = ((186, 44, 40), (40, 72, 130), (228, 228, 226), (60, 64, 70), (150, 156, 160), (64, 104, 84), (214, 178, 70))
+GLASS, WARM = (62, 76, 92), (255, 196, 110)
 
 LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
@@ -116,6 +126,10 @@ def build_scene(seed: int, length: float) -> Scene:
         cars=tuple(build_car(seed, index) for index in range(NUM_CARS)),
         sky=cache(lambda weather: draw_sky(np.random.default_rng([seed, 5, CLOUDS[weather]]), weather)),
     )
+
+
+def pick(rng: Rng, colors: tuple[Color, ...]) -> Color:
+    return colors[int(rng.integers(len(colors)))]
 
 
 def lamp_light(z: np.ndarray) -> np.ndarray:

@@ -63,15 +63,14 @@ def compare(
     """Compare a scorer as it is, weighted by the ratio, the best of a grid, and learned: each alone and fused.
 
     Everything is chosen or learned on one half of the path and reported on the other, or chosen on some data sets and
-    reported on others, see `mfvpr.tuning.learning.splits`. "gradient" learns the scorer's parameters through the
-    ranking, and "match weights" the weights as well. "match labels" learns weights from labels of matches: a match is
-    correct if it is one of a correct pair and agrees with the dominant shift.
+    reported on others. "gradient" learns the scorer's parameters through the ranking, and "match weights" the weights
+    as well. "match labels" learns weights from labels of matches: a match is correct if it is one of a correct pair and
+    agrees with the dominant shift.
 
     Args:
         axes: the scorer, and the grid to search; an axis `c` is in units of the c that balances retrieval and score.
         protocol: the ground truth, with halves.
         match_set: matches of all queries, with their ratio.
-        checkpoints: where an interrupted training is continued; None = nowhere.
 
     Raises:
         InputError: the scorer has nothing to learn or no match weight, a setting cannot be scored, a half has too few

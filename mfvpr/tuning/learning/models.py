@@ -1,4 +1,10 @@
-"""Models of learning: what they start from, a differentiable score of the candidates of a query, and their training."""
+"""Losses of a query's ranking, the models that learn from them, and their training.
+
+A loss takes scores, positives and mask of the candidates of one query, and gives a number, smaller = better. Positives
+are the correct candidates. Scores of padding may be anything. A query without a positive has the loss 0 and the
+gradient 0. For `mean_loss`, set a temperature with `functools.partial`. A temperature is in units of the scores; a
+temperature not above 0 makes the loss NaN.
+"""
 
 import math
 from collections.abc import Callable
@@ -136,14 +142,15 @@ class Model:
 
     def objective(self, loss: Loss) -> Objective:
         """A function of parameters and a batch: the mean loss of its queries, or of its matches with a teacher."""
-        return partial(self._ranking_loss, loss) if self.teacher is None else partial(_match_loss, self.teacher)
 
-    def _ranking_loss(self, loss: Loss, parameters: Parameters, batch: Batch) -> Array:
-        scorer, c = self.scorer_of(parameters), self.c_of(parameters)
-        scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
-        scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
-        logits = scores / self.unit * jnp.exp(parameters["sharpness"])
-        return mean_loss(loss, logits, batch.positives, batch.mask)
+        def ranking_loss(parameters: Parameters, batch: Batch) -> Array:
+            scorer, c = self.scorer_of(parameters), self.c_of(parameters)
+            scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
+            scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
+            logits = scores / self.unit * jnp.exp(parameters["sharpness"])
+            return mean_loss(loss, logits, batch.positives, batch.mask)
+
+        return ranking_loss if self.teacher is None else partial(_match_loss, self.teacher)
 
 
 def first_numbers(scorer: Any, spread: float) -> dict[str, Array]:

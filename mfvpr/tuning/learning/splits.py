@@ -1,4 +1,4 @@
-"""The half of a path to learn on: queries to train on, queries to validate on, and their visible candidates."""
+"""What to learn on: queries to train on and to validate on, of one half of a path or of several joined data sets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +16,8 @@ from mfvpr.evaluation.protocol import EvaluationProtocol, Half, separate
 from mfvpr.evaluation.rankings import RetrievalScore, retrieval_scores
 from mfvpr.evaluation.stages import score
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.utils import ragged
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.numerics import round_up
-from mfvpr.utils.ragged import repeat_last
+from mfvpr.utils.numerics import repeat_last, round_up
 
 VALIDATION = 0.25  # of the queries to learn on, the end of each path
 
@@ -72,7 +70,7 @@ class TrainingSplit:
 
     def batch(self, queries: Int[np.ndarray, " batch"], size: int) -> Batch:
         """A batch of queries, padded to `size` with queries without candidates."""
-        padded = ragged.repeat_last(queries, size)
+        padded = repeat_last(queries, size)
         places = np.argsort(~self.usable[padded], axis=1, kind="stable")[:, : self.width]
         take = partial(np.take_along_axis, indices=places, axis=1)
         mask = take(self.usable[padded]) & (np.arange(size) < len(queries))[:, None]
@@ -107,32 +105,24 @@ def training_splits(
         InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.
     """
     if not protocol.halves:
-        raise InputError(
-            "split=None: expected first_half, second_half or both, since what is learned is never "
-            "reported on the same queries"
-        )
+        reason = "since what is learned is never reported on the same queries"
+        raise InputError(f"split=None: expected first_half, second_half or both, {reason}")
     candidates = replace(candidates, scores=retrieval_scores(candidates, retrieval_score))
-    split = partial(_split, match_set, candidates, protocol)
-    return [split(half, name) for half, name in zip(protocol.halves, protocol.names, strict=True)]
-
-
-def _split(
-    match_set: MatchSet, candidates: Shortlist, protocol: EvaluationProtocol, half: Half, name: str
-) -> TrainingSplit:
-    paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
-    pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
-    split_half = separate(protocol.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
-    seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
-    split = TrainingSplit(match_set, candidates, protocol, half, split_half.tune, split_half.report, seen, name)
-    correct, incorrect = split.correct & split.usable, ~split.correct & split.usable
-    has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
-    train, validation = (rows[has_both[rows]] for rows in (split_half.tune, split_half.report))
-    if not len(train) or not len(validation):
-        raise InputError(
-            f"split={name}: expected queries to learn on and to validate with, got {len(train)} and "
-            f"{len(validation)}; use more queries or candidates"
-        )
-    return replace(split, train=train, validation=validation)
+    splits = []
+    for half, name in zip(protocol.halves, protocol.names, strict=True):
+        paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
+        pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
+        apart = separate(protocol.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+        seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
+        split = TrainingSplit(match_set, candidates, protocol, half, apart.tune, apart.report, seen, name)
+        correct, incorrect = split.correct & split.usable, ~split.correct & split.usable
+        has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
+        train, validation = (rows[has_both[rows]] for rows in (apart.tune, apart.report))
+        if not len(train) or not len(validation):
+            got = f"{len(train)} and {len(validation)}; use more queries or candidates"
+            raise InputError(f"split={name}: expected queries to learn on and to validate with, got {got}")
+        splits.append(replace(split, train=train, validation=validation))
+    return splits
 
 
 @dataclass(frozen=True)
@@ -148,10 +138,6 @@ class Part:
 def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
     """Join data sets to one, whose protocol learns on the first sets and reports on the others.
 
-    Args:
-        teach: sets to learn on, each from its first query to its last.
-        report: sets to report on, of which learning sees nothing.
-
     Raises:
         InputError: `teach` or `report` is empty, two sets have the same name, or units or thresholds differ.
     """
@@ -165,10 +151,8 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         for what in ("unit", "thresholds"):
             expected, got = getattr(parts[0].protocol, what), getattr(part.protocol, what)
             if expected != got:
-                raise InputError(
-                    f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; compare sets "
-                    "whose ground truth is of one kind"
-                )
+                fix = "compare sets whose ground truth is of one kind"
+                raise InputError(f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; {fix}")
     sizes, databases = ([len(part.match_set) for part in parts], [part.protocol.places.num_database for part in parts])
     split = sum(sizes[: len(teach)])
     half = Half(

@@ -20,11 +20,11 @@ import orbax.checkpoint as ocp
 from mfvpr.core.types import Array
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import lock_folder
-from mfvpr.utils.progress import Track, no_progress
+from mfvpr.utils.runtime import Track, no_progress
 
 
 @contextmanager
-def lock_checkpoints(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     """Lock a folder of checkpoints, which is made if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -96,10 +96,7 @@ def _manager(folder: Path, read_only: bool = False) -> Iterator[ocp.CheckpointMa
 
 
 def _checksum(leaves: Sequence[np.ndarray], progress: Any) -> int:
-    checksum = zlib.crc32(json.dumps(progress).encode())
-    for leaf in leaves:
-        checksum = zlib.crc32(leaf.tobytes(), checksum)
-    return checksum
+    return zlib.crc32(b"".join([json.dumps(progress).encode(), *(leaf.tobytes() for leaf in leaves)]))
 
 
 def _reason(error: Exception) -> str:
@@ -166,9 +163,7 @@ def fit(
         parameters: pytree of floating-point arrays to start from.
         objective: parameters and a batch -> loss `[]`; compiled once per shape of the batches.
         batches: a step, counted from 0, -> its batch; the same batch in every call.
-        schedule: optimizer, steps and validations.
         validate: parameters -> a number, smaller = better.
-        checkpoints: folder and recipe; None = no checkpoints.
         track: progress over the steps.
 
     Raises:
@@ -189,32 +184,29 @@ def fit(
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient, parameters))]
         return parameters, _strong(memory), loss, jnp.all(jnp.stack(finite))
 
-    def validation(parameters: Any, step: int) -> float | None:
-        value = None if validate is None else float(validate(parameters))
-        if value is not None and not math.isfinite(value):
-            raise _not_finite("the validation", step)
-        return value
-
     def add_record(state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
         """Validate; return the state with the best parameters so far, and the history."""
-        step = history[-1].step + len(losses)
-        history = [*history, Record(step, float(np.mean(losses)), validation(state.parameters, step))]
+        step, loss = (history[-1].step + len(losses), float(np.mean(losses))) if history else (0, None)
+        value = None if validate is None else float(validate(state.parameters))
+        if value is not None and not math.isfinite(value):
+            raise _not_finite("the validation", step)
+        history = [*history, Record(step, loss, value)]
         return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history
 
     parameters = _strong(parameters)
     state = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
-    with lock_checkpoints(checkpoints.folder) if checkpoints else nullcontext():
+    with _lock(checkpoints.folder) if checkpoints else nullcontext():
         stored = restore(*checkpoints, state) if checkpoints else None
         if stored:
             state, (rows, losses) = _strong(stored[0]), stored[1]
             history = [Record(*row) for row in rows]
         else:
-            history, losses = [Record(0, None, validation(parameters, 0))], []
+            (state, history), losses = add_record(state, [], []), []
         done = history[-1].step + len(losses)
         if checkpoints and done > steps:
+            fix = "ask for more steps, or choose another folder"
             raise InputError(
-                f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; ask for more "
-                "steps, or choose another folder"
+                f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; {fix}"
             )
         remaining = 0 if _out_of_patience(history, patience) else steps - done
         for step in track(range(done, done + remaining), remaining):

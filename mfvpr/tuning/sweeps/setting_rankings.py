@@ -9,7 +9,6 @@ import itertools
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
@@ -23,7 +22,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from mfvpr.core import ranking
 from mfvpr.core.batch import WEIGHTINGS, by_capacity, score_settings
 from mfvpr.core.scorer import check_host, static_names, whole_numbers, with_parameters, with_static_functions
-from mfvpr.core.types import Array, Matches, Shortlist
+from mfvpr.core.types import Array, Shortlist
 from mfvpr.core.weights import ChosenWeight
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
@@ -34,10 +33,9 @@ from mfvpr.evaluation.stages import PaddedBatch, all_batches, fuse_all, require_
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of
+from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of, versions
 from mfvpr.utils.numerics import Device, compiled
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
-from mfvpr.utils.versions import versions
 
 Setting = Mapping[str, Any]
 
@@ -86,23 +84,19 @@ def group_by_program(
         if weights:
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = with_static_functions(chosen)
-        for rows in _products(settings, members):
+        # Split the members into products `[G, W]` of settings and weightings.
+        columns = _group_by(settings, members, lambda name, _: name in WEIGHTINGS)
+        column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
+        products: dict[tuple[int, ...], list[list[int]]] = {}
+        for _, line in _group_by(settings, members, lambda name, _: name not in WEIGHTINGS):
+            line = sorted(line, key=column.__getitem__)
+            products.setdefault(tuple(column[row] for row in line), []).append(line)
+        for rows in map(np.array, products.values()):
             values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
             parameter_names = set(settings[0]) - set(WEIGHTINGS)
             weightings = _arrays([settings[row] for row in rows[0]], weights, integers, without=parameter_names)
             for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
-
-
-def _products(settings: Sequence[Setting], members: Sequence[int]) -> list[np.ndarray]:
-    """Split the members into products `[G, W]` of settings and weightings."""
-    columns = _group_by(settings, members, lambda name, _: name in WEIGHTINGS)
-    column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
-    products: dict[tuple[int, ...], list[list[int]]] = {}
-    for _, line in _group_by(settings, members, lambda name, _: name not in WEIGHTINGS):
-        line = sorted(line, key=column.__getitem__)
-        products.setdefault(tuple(column[row] for row in line), []).append(line)
-    return [np.array(lines) for lines in products.values()]
 
 
 def _group_by(
@@ -175,31 +169,21 @@ class DriveRanking:
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """Options of a sweep. Only `ks`, `ties`, `retrieval_score` and `sequence` change its results.
+    """Options of a sweep. Only the first four change its results.
 
-    Attributes:
-        ks: depths of the recall; the largest is the number of rows of a ranking.
-        ties: see `mfvpr.evaluation.rankings.rank_shortlist`.
-        retrieval_score: see `mfvpr.evaluation.rankings.retrieval_scores`.
-        sequence: ranks the queries of a drive together, from their rankings by a setting; then blocks have all queries.
-            None = each query alone.
-        settings_per_block: None = 64.
-        queries_per_block: None = as many as fit into 256 MB.
-        folder: where the rows of each setting are kept, and read by later sweeps; None = nowhere. It may hold those of
-            other data and scorers. Rows of a scorer without a recipe (`mfvpr.utils.recipe_of`) are not kept.
-        runtime: devices that share the batches of pairs, progress and messages.
-        label: of the progress.
+    The `folder` may hold rows of other data and scorers; rows of a scorer without a recipe (`mfvpr.utils.recipe_of`)
+    are not kept.
     """
 
-    ks: Sequence[int] = (1, 5, 10)
-    ties: Ties = "retrieval"
-    retrieval_score: RetrievalScore = "cosine"
-    sequence: DriveRanking | None = None
-    settings_per_block: int | None = None
-    queries_per_block: int | None = None
-    folder: Path | None = None
-    runtime: Runtime = DEFAULT_RUNTIME
-    label: str = "sweep"
+    ks: Sequence[int] = (1, 5, 10)  # depths of the recall; the largest is the number of rows of a ranking
+    ties: Ties = "retrieval"  # see `mfvpr.evaluation.rankings.rank_shortlist`
+    retrieval_score: RetrievalScore = "cosine"  # see `mfvpr.evaluation.rankings.retrieval_scores`
+    sequence: DriveRanking | None = None  # ranks the queries of a drive together, in one block; None = each alone
+    settings_per_block: int | None = None  # None = 64
+    queries_per_block: int | None = None  # None = as many as fit into 256 MB
+    folder: Path | None = None  # where the rows of each setting are kept, and read by later sweeps; None = nowhere
+    runtime: Runtime = DEFAULT_RUNTIME  # devices that share the batches of pairs, progress and messages
+    label: str = "sweep"  # of the progress
 
 
 DEFAULT_OPTIONS = SweepOptions()
@@ -235,7 +219,7 @@ def rank_settings(
     num_queries, at_once = len(candidates.mask), min(options.settings_per_block or SETTINGS_PER_BLOCK, len(settings))
     size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)
     rows = np.full((len(views), len(settings), num_queries, max(options.ks)), -1, np.int32)
-    files, recipes = _files(scorer, settings, options)
+    files, recipes = _files(scorer, options, settings)
     parts, total = list[_Part](), 0  # total: batches of pairs for all blocks
     for start in range(0, num_queries, max(1, size)):
         queries = range(num_queries)[start : start + size]
@@ -244,7 +228,9 @@ def rank_settings(
         seen = [view[part] & shortlist.mask for view in views]
         keys, missing = list[str](), range(len(settings))
         if files is not None:
-            digest = _digest(match_set, queries, shortlist, seen)
+            fusion = (match_set.weights, match_set.normalize) if isinstance(match_set, Scales) else ()
+            of_scales = [scale.take(queries) for scale in scales(match_set)]
+            digest = content_hash(fusion, [(each.counts, each.matches) for each in of_scales], shortlist, seen)
             keys, missing = [fingerprint([recipe, digest]) for recipe in recipes], list[int]()
             for number, key in enumerate(keys):
                 if (found := files.get(key)) is None:
@@ -294,44 +280,36 @@ class _Part(NamedTuple):
 
 
 def _files(
-    scorer: Any, settings: Sequence[Setting], options: SweepOptions
+    scorer: Any, options: SweepOptions, settings: Sequence[Setting] = ()
 ) -> tuple[CacheFiles[np.ndarray] | None, list[Any]]:
     """Files of rows, by what determines them but for setting and data, and recipes of the settings; None without."""
     if options.folder is None:
         return None, []
+    of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
     try:
+        recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
         recipes = [recipe_of(setting) for setting in settings]
-        return _open_files(scorer, options.folder, options), recipes
     except (TypeError, InputError) as error:
         options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
         return None, []
-
-
-def _open_files(scorer: Any, folder: Path, options: SweepOptions) -> CacheFiles[np.ndarray]:
-    of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
-    recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(folder, "sweep", recipe, pack, unpack, compress=True)
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), recipes
 
 
 def forget_rankings(scorer: Any, options: SweepOptions) -> None:
     """Remove the rankings that a sweep kept in its folder: when it is finished, changed code may rank otherwise."""
-    if options.folder is not None:
-        with suppress(TypeError, InputError):  # without a recipe, nothing was kept
-            shutil.rmtree(_open_files(scorer, options.folder, options).folder, ignore_errors=True)
-
-
-def _digest(match_set: MatchSet | Scales, queries: range, candidates: Shortlist, views: Sequence[np.ndarray]) -> str:
-    """Hash of the matches of queries, the fusion of their scales, their shortlist and views."""
-    fusion = (match_set.weights, match_set.normalize) if isinstance(match_set, Scales) else ()
-    parts = [scale.take(queries) for scale in scales(match_set)]
-    return content_hash(fusion, [(part.counts, part.matches) for part in parts], candidates, views)
+    if (files := _files(scorer, options)[0]) is not None:
+        shutil.rmtree(files.folder, ignore_errors=True)
 
 
 def _first_rows(
-    scores: Float[np.ndarray, "settings queries candidates"], cs: Sequence[Any], candidates: Shortlist,
-    view: Bool[np.ndarray, "queries candidates"], number: int, options: SweepOptions,
-) -> Int[np.ndarray, "settings queries depth"]:  # fmt: skip
+    scores: Float[np.ndarray, "settings queries candidates"],
+    cs: Sequence[Any],
+    candidates: Shortlist,
+    view: Bool[np.ndarray, "queries candidates"],
+    number: int,
+    options: SweepOptions,
+) -> Int[np.ndarray, "settings queries depth"]:
     """Database rows by the scores of settings, each fused with its own c, in the view of a number."""
     by_retrieval = retrieval_scores(candidates, options.retrieval_score)
     tie_break = candidates.indices if breaks_ties_by_row(options.ties) else None
@@ -362,16 +340,13 @@ def block_scores(
     """Scores of every scale, settings by weightings; a pair without matches scores 0. Each batch takes a tick."""
     scores = np.zeros((block.rows.size, math.prod(shape)), np.float32)
     inputs = block.scorer, block.settings, block.weightings
-    for places, values in run_batches(_score_settings, inputs, batches, devices=devices):
+    program = lambda matches, scorer, *values: score_settings(scorer, matches, *values)  # noqa: E731
+    for places, values in run_batches(program, inputs, batches, devices=devices):
         next(ticks, None)
         scores[:, places] = values.reshape(-1, len(places))
     for of_setting in scores:
         require_finite("a setting of the sweep", of_setting)
     return np.moveaxis(scores.reshape(-1, *shape), 1, 0)
-
-
-def _score_settings(matches: Matches, scorer: Any, *values: Mapping[str, Array]) -> Array:
-    return score_settings(scorer, matches, *values)
 
 
 @partial(compiled, static_argnames="fused")

@@ -1,4 +1,4 @@
-"""Search for the best setting: all of a grid, or those that Optuna proposes, batch by batch; and its result."""
+"""Search for the best setting on axes of plain values: all of a grid, or what Optuna proposes; and its result."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -109,7 +109,7 @@ class Axes:
         }
         declared = {name: parameter.value for name, parameter in self.parameters.items()}
         converters = declared | special
-        return {name: converters[name](value) if name in converters else value for name, value in plain.items()}
+        return {name: converters.get(name, lambda value: value)(value) for name, value in plain.items()}
 
     def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
         """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
@@ -125,8 +125,7 @@ class Axes:
             words = [word for word, weight in WEIGHTS.items() if weight == value]
             words += [word for word, weight in NAMED_WEIGHTS.items() if weight is value]
             return words[0] if words else value
-        is_none = name in self.parameters and value == self.parameters[name].none
-        return None if is_none else _plain(value)
+        return None if name in self.parameters and value == self.parameters[name].none else _plain(value)
 
 
 def can_learn(scorer: Any) -> bool:
@@ -158,22 +157,14 @@ class Verdict(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcome:
-    """All rankings of a sweep, and their evaluation.
-
-    Attributes:
-        protocol: the ground truth, with the views of the shortlist.
-        settings: in plain values; those of a complete grid come first, in its order.
-        rows: of the database, best first.
-        ks: depths of the recall, ascending, up to the depth of `rows`.
-        is_grid: whether `settings` has all settings of the grid.
-    """
+    """All rankings of a sweep, and their evaluation."""
 
     axes: Axes
-    protocol: EvaluationProtocol
-    settings: Sequence[Mapping[str, Any]]
-    rows: Int[np.ndarray, "views settings queries depth"]
-    ks: Sequence[int]
-    is_grid: bool
+    protocol: EvaluationProtocol  # the ground truth, with the views of the shortlist
+    settings: Sequence[Mapping[str, Any]]  # in plain values; those of a complete grid come first, in its order
+    rows: Int[np.ndarray, "views settings queries depth"]  # of the database, best first
+    ks: Sequence[int]  # depths of the recall, ascending, up to the depth of `rows`
+    is_grid: bool  # whether `settings` has all settings of the grid
 
     @cached_property
     def recall(self) -> Float[np.ndarray, "settings tolerances"]:
@@ -193,18 +184,19 @@ class Outcome:
             return recall[:, : self.axes.size]
         return np.where(np.arange(len(self.settings)) == self.own, -1.0, recall)
 
-    def _choose(self, recall: Float[np.ndarray, " settings"]) -> int:
-        return best_setting(recall, self.axes.values if self.is_grid else None)
-
     @cached_property
     def chosen(self) -> list[int]:
         """Number of the best setting, for each half."""
-        return list(map(self._choose, self._tuning))
+        return [best_setting(recall, self._grid) for recall in self._tuning]
 
     @cached_property
     def best(self) -> int:
         """Number of the best setting by the mean recall of the halves."""
-        return self._choose(self._tuning.mean(axis=0))
+        return best_setting(self._tuning.mean(axis=0), self._grid)
+
+    @property
+    def _grid(self) -> Mapping[str, Sequence[Any]] | None:
+        return self.axes.values if self.is_grid else None
 
     @cached_property
     def report(self) -> list[Verdict]:
@@ -271,19 +263,23 @@ def search_optuna(
     return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
 
 
-def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
-    pairs, queries = int(candidates.mask.sum()), len(candidates.mask)
-    options.runtime.log(
-        f"sweep: {number:,} settings on {pairs:,} pairs of {queries:,} queries with their candidates, "
-        f"{number * pairs:,} scores"
-    )
-
-
-def _rank(axes: Axes, settings: Sequence[Mapping[str, Any]], protocol: EvaluationProtocol, *data: Any) -> np.ndarray:
-    """Rows `[V, S, Q, depth]` of the rankings by plain settings; `data` are matches, candidates and options."""
-    match_set, candidates, options = data
+def _rank(
+    axes: Axes,
+    settings: Sequence[Mapping[str, Any]],
+    protocol: EvaluationProtocol,
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    options: SweepOptions,
+) -> Int[np.ndarray, "views settings queries depth"]:
+    """Rows of the rankings by plain settings."""
     of_scorer = [axes.setting(plain) for plain in settings]
     return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
+
+
+def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
+    pairs, queries = int(candidates.mask.sum()), len(candidates.mask)
+    words = f"{number:,} settings on {pairs:,} pairs of {queries:,} queries with their candidates"
+    options.runtime.log(f"sweep: {words}, {number * pairs:,} scores")
 
 
 def require_optuna() -> None:

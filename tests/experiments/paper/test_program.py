@@ -66,7 +66,7 @@ def files(out):
     """Contents that do not depend on the time: every file but seconds and their figures, and results without them."""
     contents = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
-        if path.parent.name == "seconds" or path.stem in ("speed", "growth", "run", "seconds", "report"):
+        if path.parent.name == "seconds" or path.stem in ("speed", "run", "seconds", "report"):
             continue
         content = path.read_bytes()
         if path.name == "results.json":
@@ -105,7 +105,7 @@ def test_runs_of_a_data_set_stand_side_by_side(copy, paper):
     assert not (copy / "tables/sequences_other.md").exists()
     assert '<a href="comparisons/grief_season.html">' in (copy / "report.html").read_text()
     assert (copy / RUN / "report.html").is_file()
-    assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "growth.png", "histogram.png"}
+    assert {path.name for path in (copy / "figures").iterdir()} >= {"failures.png", "histogram.png"}
 
 
 def test_seconds_of_something_else_are_measured_again(copy, paper):
@@ -162,15 +162,6 @@ def test_finished_runs_are_not_repeated(finished, paper):
     assert "sift_10 on grief_season" not in stderr
     assert path.stat().st_mtime_ns == time_of_change
     assert files(out) == before
-
-
-def test_sizes_count_what_an_earlier_process_extracted(copy, paper):
-    path = copy / RUN / "sizes.json"
-    before = path.read_text()
-    for _ in range(2):  # the first fills the cache, the second reads matches alone
-        shutil.rmtree(copy / RUN)
-        paper(copy, "systems=[sift_hist_10]")
-    assert path.read_text() == before
 
 
 def test_runs_of_other_inputs_in_the_same_folder_are_errors(copy, data, tmp_path, paper):

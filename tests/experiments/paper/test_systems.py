@@ -9,7 +9,7 @@ import pytest
 from experiments.paper import systems
 from experiments.paper.pages import mean_recalls
 from experiments.paper.runs import input_fingerprints, lock_output, settings_of
-from experiments.paper.systems import DRAWN, ROWS, Place, chosen_rows, missing_weights, places
+from experiments.paper.systems import DRAWN, ROWS, Place, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
 from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
@@ -87,11 +87,6 @@ def test_folders_with_positions_in_image_names_are_data_sets(tmp_path):
         places(str(tmp_path), ["no positions"])
 
 
-def test_rows_are_chosen_by_name():
-    assert chosen_rows(None) == ROWS
-    assert [row.name for row in chosen_rows(["sift_hist_50", "mixvpr"])] == ["mixvpr", "sift_hist_50"]
-
-
 def test_weights_that_are_missing_are_named(monkeypatch):
     monkeypatch.setattr(systems, "is_installed", lambda entry: False)
     assert [entry.name for entry in missing_weights(compose("mix_hist_50"))] == ["d2_tf", "mixvpr_4096"]
@@ -100,23 +95,24 @@ def test_weights_that_are_missing_are_named(monkeypatch):
 
 
 def test_a_run_is_known_by_what_decides_its_numbers(tmp_path):
-    def inputs(run="sift_50", root="a", queries="b", **changes):
-        settings = replace(compose(run, "corridor", tmp_path / root), **changes)
-        return input_fingerprints(settings, {"database": "a", "queries": queries}, None)
-
-    assert inputs(root="b", out="elsewhere") == inputs()
-    assert inputs("sift_10")["settings"] != inputs()["settings"]
-    assert inputs(queries="c")["images"] != inputs()["images"]
-
-
-def test_another_ground_truth_of_the_same_images_is_another_run(tmp_path):
-    folder, settings = ImageFolder(Path(), ("0", "1", "2")), compose("sift_50", "corridor", tmp_path)
-    inputs = []
-    for rows in (((0,), (1,), (2,)), ((0,), (2,), (1,))):
+    def inputs(run="sift_50", root="a", queries="b", rows=((0,), (1,), (2,)), **changes):
+        folder, settings = (
+            ImageFolder(Path(), ("0", "1", "2")),
+            replace(compose(run, "corridor", tmp_path / root), **changes),
+        )
         dataset = Dataset("corridor", folder, (QuerySequence("one", folder, FrameTruth(rows, 3)),))
-        inputs.append(input_fingerprints(settings, {}, dataset.positives_fingerprint([1])))
-    assert {name for name in inputs[0] if inputs[0][name] != inputs[1][name]} == {"ground truth"}
-    assert Dataset("corridor", folder, (QuerySequence("one", folder, None),)).positives_fingerprint([]) is None
+        images = {"database": "a", "queries": queries}
+        return input_fingerprints(settings, images, dataset.positives_fingerprint([1]))
+
+    before = inputs()
+    assert inputs(root="b", out="elsewhere") == before
+    for name, changes in {
+        "settings": {"run": "sift_10"},
+        "images": {"queries": "c"},
+        "ground truth": {"rows": ((0,), (2,), (1,))},
+    }.items():
+        after = inputs(**changes)
+        assert {each for each in before if after[each] != before[each]} == {name}
 
 
 @pytest.mark.parametrize(

@@ -96,19 +96,6 @@ def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated
     assert same(train(tmp_path, **options), train(**options))
 
 
-def test_the_best_between_two_validations_is_of_the_shorter_training_alone(tmp_path):
-    """Step 7 has the best validation; whoever goes on to step 20 never saw it."""
-
-    def at_seven(parameters):
-        return abs(float(parameters["slope"]) - float(seven["slope"]))
-
-    seven = train(steps=7, every=7, validate=None).parameters
-    assert train(tmp_path, steps=7, validate=at_seven).step == 7
-    longer = train(tmp_path, validate=at_seven)
-    assert longer.step != 7
-    assert same(longer, train(validate=at_seven))
-
-
 def test_a_second_training_in_one_folder_is_refused(tmp_path):
     def second(step):
         if step == 8:
@@ -117,13 +104,6 @@ def test_a_second_training_in_one_folder_is_refused(tmp_path):
         return batches(step)
 
     assert same(train(tmp_path, batches=second), train(tmp_path))
-
-
-def test_an_ended_training_stays_ended(tmp_path):
-    falling = iter(range(100))
-    ended = train(tmp_path, steps=100, patience=3, validate=lambda parameters: -min(next(falling), 2))
-    assert (ended.step, ended.history[-1].step) == (10, 25)
-    assert same(train(tmp_path, steps=100, patience=3, batches=None), ended)
 
 
 @pytest.mark.parametrize(("spike", "broken"), [
@@ -146,15 +126,3 @@ def test_a_step_to_infinity_and_a_validation_of_nan_are_told():
         train(objective=lambda parameters, batch: 10 * objective(parameters, batch), optimizer=optax.sgd(1e38))
     with pytest.raises(TrainingError, match=r"step 5: the validation is not finite"):
         train(validate=lambda parameters: np.nan if parameters["slope"] != 1 else 0.0)
-
-
-@pytest.mark.parametrize("incorrect", [{"every": 0}, {"steps": -1}, {"patience": 0}, {"patience": 1, "validate": None}])
-def test_impossible_settings_are_refused(incorrect):
-    with pytest.raises(ValueError, match=r"patience .*validate"):
-        train(**incorrect)
-
-
-def test_progress_is_told():
-    tracked = []
-    train(steps=7, track=lambda steps, total: (tracked.append((step, total)) or step for step in steps))
-    assert tracked == [(step, 7) for step in range(7)]

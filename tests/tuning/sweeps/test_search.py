@@ -53,12 +53,6 @@ def test_words_become_values():
     assert Axes(Wrapped(), {}, {}).setting({"inner.sigma": 9.0}) == {"inner.sigma": 9.0}  # declared nowhere
 
 
-def test_one_axis_less():
-    axes = Axes(SUM, WEIGHTS, {"weight": "dmf", "c": 2}).without("c")
-    assert axes == Axes(SUM, {"weight": ["fs", "unit"]}, {"weight": "dmf"})
-    assert axes.without("c") == axes
-
-
 def test_bins_that_do_not_fit_are_refused_before_any_work(data):
     axes = Axes(mfvpr.HistogramOfShifts(), {"bin_size": [15.0, 0.01]})
     options = sweeping.SweepOptions(runtime=mfvpr.Runtime(log=lambda _: pytest.fail("begun")))

@@ -13,7 +13,7 @@ from mfvpr.core.scorer import with_parameters
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import rankings
 from mfvpr.matchers import MatchSet, Scales
-from mfvpr.matchers.match_set import PROGRAM_SLOTS, block_bytes, shapes, slots
+from mfvpr.matchers.match_set import PROGRAM_SLOTS, shapes, slots
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.setting_rankings import group_by_program
@@ -205,14 +205,6 @@ def test_the_largest_size_is_that_of_the_set_whatever_part_is_scored():
     match_set = MatchSet([], np.array([[300, 9], [9, 0]]), 320)
     assert max(shapes(match_set)) == max(shapes(replace(match_set, counts=match_set.counts[1:]))) == 320
     assert (slots(MatchSet([], np.zeros((3, 2), int), 0)) == 32).all()
-
-
-def test_memory_is_told_beforehand(data):
-    match_set, _ = data
-    assert block_bytes(match_set, 10, 1) < block_bytes(match_set, 20, 1) < block_bytes(match_set, 20, 7)
-    uneven, largest = (MatchSet([], np.array(counts), 320) for counts in ([[0, 9], [300, 300], [9, 9]], [[300, 300]]))
-    many = 10**7  # settings, for which padding to one size would not pay
-    assert block_bytes(uneven, many, 1) == block_bytes(largest, many, 1)
 
 
 def with_points(match_set, points):

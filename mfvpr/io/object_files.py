@@ -1,0 +1,143 @@
+"""Read files that may hold more than data, as data: pickles of NumPy and PyTorch, and MATLAB's files.
+
+Nothing in a file is executed: a pickle may ask only for the names of an unpickler, each of which has a stand-in.
+"""
+
+import io
+import pickle
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import PurePath, PurePosixPath, PureWindowsPath
+from typing import Any, BinaryIO, ClassVar, NamedTuple
+
+import numpy as np
+import scipy  # its subpackages are imported at their first use
+
+from mfvpr.io.containers import read_npy_header, shorten
+from mfvpr.utils.errors import InputError
+
+NUMPY_MAGIC = b"\x93NUMPY"
+
+
+class Function:
+    """Stand-in of a function or class that a pickle may call; a pickle cannot change it."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise InputError("a function has no state")
+
+
+class DataUnpickler(pickle.Unpickler):
+    """Unpickler of plain data and of `names`: `module.name` -> what stands for it.
+
+    Strings of Python 2, which may be text or bytes, become text in which each character is a byte.
+    """
+
+    names: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__(file, encoding="latin-1")
+
+    def find_class(self, module: str, name: str) -> Any:
+        full_name = f"{module}.{name}"
+        if full_name not in self.names:
+            raise InputError(f"its pickle asks for {shorten(full_name)}; nothing was executed, use the official file")
+        return self.names[full_name]
+
+
+def _path_text(kind: type[PurePath], *parts: str) -> str:
+    return kind(*parts).as_posix()
+
+
+class ArrayUnpickler(DataUnpickler):
+    """Unpickler of NumPy's arrays among plain data; paths become text."""
+
+    names: ClassVar = {
+        **dict.fromkeys(
+            ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"),
+            Function(lambda *_: np.ndarray(0, np.int8)),  # which the pickle fills
+        ),
+        "numpy.ndarray": Function(np.ndarray),
+        "numpy.dtype": Function(lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
+        "_codecs.encode": Function(lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
+        "__builtin__.bytes": Function(bytes),  # of an array without values
+        "builtins.bytes": Function(bytes),
+        **{
+            f"{module}.{prefix}{kind.__name__.removeprefix('Pure')}": Function(partial(_path_text, kind))
+            for module in ("pathlib", "pathlib._local")
+            for prefix in ("", "Pure")
+            for kind in (PurePosixPath, PureWindowsPath)
+        },
+    }
+
+
+def read_objects(file: BinaryIO, expected: str) -> list[Any]:
+    """Objects of a `.npy` file, NumPy's arrays among them; `expected` is for messages.
+
+    Raises:
+        InputError: the file holds other content; any error if it is damaged.
+    """
+    shape, _, dtype = read_npy_header(file)
+    content = ArrayUnpickler(file).load() if dtype.hasobject else None
+    if not isinstance(content, np.ndarray) or content.dtype != object or content.shape != shape:
+        raise InputError(f"expected {expected}, got another object of {dtype} {[*shape]}; use the official file")
+    return content.ravel().tolist()
+
+
+class TorchArchive(NamedTuple):
+    """An open zip file of `torch.save`: a pickle, and an entry for the values of each storage."""
+
+    archive: zipfile.ZipFile
+    folder: str  # of its entries, with a slash
+    pickle: BinaryIO
+
+
+@contextmanager
+def open_torch_archive(file: BinaryIO) -> Iterator[TorchArchive]:
+    """Check an uncompressed file and its checksums; an InputError if entries are compressed or damaged."""
+    with zipfile.ZipFile(file) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            raise InputError("expected uncompressed entries of the zip file; use the official file")
+        if broken := archive.testzip():
+            raise InputError(f"the file is damaged, by the checksum of {shorten(broken)}; get it again")
+        pickles = [name for name in archive.namelist() if name.split("/")[1:] == ["data.pkl"]]
+        if len(pickles) != 1:
+            raise InputError("expected a file of torch.save, got another zip file")
+        yield TorchArchive(archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0])))
+
+
+def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
+    """Read arrays by path: `variable.field.0.field`, with 0, 1, ... for elements of a cell or an array of structures.
+
+    Reads versions 4 to 7.2. If `text`, lines of text are read as well, as arrays of one string. SciPy's errors are
+    raised if the file is damaged.
+    """
+    arrays = {}
+
+    def collect(path: str, value: Any) -> None:
+        if value.dtype.names:  # structures
+            for place, structure in enumerate(value.ravel(order="F")):
+                owner = path if value.size == 1 else f"{path}.{place}"
+                for field in value.dtype.names:
+                    collect(f"{owner}.{field}", structure[field])
+        elif value.dtype == object:  # a cell
+            for place, part in enumerate(value.ravel(order="F")):
+                collect(f"{path}.{place}", part)
+        elif value.dtype.kind == "U" and value.size == 1 and text:
+            arrays[path] = np.array(value.item())
+        elif value.dtype.kind in "fiu" and value.size:
+            arrays[path] = value
+
+    for name, value in scipy.io.loadmat(file, mat_dtype=True).items():
+        if not name.startswith("__"):
+            collect(name, value)
+    return arrays

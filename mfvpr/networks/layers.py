@@ -1,0 +1,175 @@
+"""Parts that several networks share: preprocessing of images, convolutions, normalizations, means.
+
+Products are of full float32 on every device: with less, keypoints move.
+
+On a CPU, 3 x 3 convolutions take half of the products: Winograd's F(4, 3) (Lavin & Gray, CVPR 2016) along the rows
+makes four rows of the result from six rows of the input by six convolutions with 1 x 3 kernels, instead of twelve. The
+rounding errors of VGG16 grow by half, and differ between the four rows: equal neighborhoods give results that differ in
+the last bits. `uniform=True` avoids this by the direct method. On other processors, the library of the device chooses.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jax import lax
+from jaxtyping import Bool, Float, Num
+
+from mfvpr.core.types import Array
+
+Preprocessing = Literal["caffe", "torch"]
+Pixels = Num[Array, "batch height width 3"]  # RGB, 0 .. 255, uint8 or float32
+Images = Float[Array, "batch height width 3"]  # inputs of networks
+
+MEAN = (0.485, 0.456, 0.406)  # of the training images, RGB in 0 .. 1
+DEVIATION = (0.229, 0.224, 0.225)
+_STATISTICS = {  # scale, mean and deviation, in the network's order of the channels
+    "caffe": (1.0, np.array([103.939, 116.779, 123.68]), np.ones(3)),
+    "torch": (255.0, np.array(MEAN), np.array(DEVIATION)),
+}
+
+PRECISION = "highest"  # of products
+EPSILON = 1e-12  # least divisor of vectors, as in the public codes
+
+matmul = partial(jnp.matmul, precision=PRECISION)
+Linear = partial(nnx.Linear, precision=PRECISION)
+LayerNorm = partial(nnx.LayerNorm, use_fast_variance=False)
+BatchNorm = partial(nnx.BatchNorm, use_running_average=True, epsilon=1e-5)
+
+_WIDE = 128  # least input channels for which fewer products outweigh more memory traffic
+# The convolution is a product of polynomials: their values at 0, 1, -1, 2, -2 and infinity, and the inverse.
+_INPUT = (
+    (4, 0, -5, 0, 1, 0),
+    (0, -4, -4, 1, 1, 0),
+    (0, 4, -4, -1, 1, 0),
+    (0, -2, -1, 2, 1, 0),
+    (0, 2, -1, -2, 1, 0),
+    (0, 4, 0, -5, 0, 1),
+)
+_KERNEL = (
+    (1 / 4, 0, 0),
+    (-1 / 6, -1 / 6, -1 / 6),
+    (-1 / 6, 1 / 6, -1 / 6),
+    (1 / 24, 1 / 12, 1 / 6),
+    (1 / 24, -1 / 12, 1 / 6),
+    (0, 0, 1),
+)
+_OUTPUT = ((1, 1, 1, 1, 1, 0), (0, 1, -1, 2, -2, 0), (0, 1, 1, 4, 4, 0), (0, 1, -1, 8, -8, 1))
+
+
+def preprocess(images: Pixels, preprocessing: Preprocessing = "torch") -> Images:
+    """RGB images from 0 to 255 -> inputs of the network, float32.
+
+    "caffe" is BGR minus the mean. "torch" is RGB in [0, 1], minus the mean, divided by the standard deviation. Results
+    for bytes are those of float64, rounded once, as in D2-Net's code.
+    """
+    scale, mean, deviation = _STATISTICS[preprocessing]
+    ordered = images[..., ::-1] if preprocessing == "caffe" else images
+    if images.dtype == jnp.uint8:  # a table, since a device has no float64
+        byte = np.arange(256, dtype=np.float32) / np.float32(scale)
+        table = jnp.asarray((byte[None] - mean[:, None]) / deviation[:, None], jnp.float32)
+        return jnp.stack([table[channel][ordered[..., channel]] for channel in range(3)], axis=-1)
+    scale, mean, deviation = (jnp.asarray(values, jnp.float32) for values in (scale, mean, deviation))
+    return (ordered / scale - mean[None, None, None]) / deviation[None, None, None]
+
+
+def of_unit_length(vectors: Float[Array, "*batch dimensions"]) -> Float[Array, "*batch dimensions"]:
+    """Vectors divided by their lengths."""
+    return vectors / jnp.maximum(jnp.linalg.norm(vectors, axis=-1, keepdims=True), EPSILON)
+
+
+def bias_of(layer: nnx.Linear | nnx.Conv) -> Array:
+    """Bias of a layer that has one; Flax's annotation allows None."""
+    assert layer.bias is not None
+    return layer.bias[...]
+
+
+def conv(
+    inputs: int, outputs: int, size: int = 3, *, stride: int = 1, use_bias: bool = False, rngs: nnx.Rngs
+) -> nnx.Conv:
+    """Convolution with equal padding on all sides; with a stride, "SAME" pads one row and column fewer before."""
+    shape, padding = (size, size), size // 2
+    return nnx.Conv(
+        inputs, outputs, shape, strides=stride, padding=padding, use_bias=use_bias, precision=PRECISION, rngs=rngs
+    )
+
+
+class PointwiseConv(nnx.Module):
+    """1 x 1 convolution without bias, `kernel` `[1, 1, C, D]`, as a matrix product, which is faster on a CPU."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int = 1, rngs: nnx.Rngs) -> None:
+        self.kernel = nnx.Param(nnx.initializers.he_normal()(rngs.params(), (1, 1, inputs, outputs), jnp.float32))
+        self.stride = stride
+
+    def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
+        return matmul(x[:, :: self.stride, :: self.stride], self.kernel[0, 0])
+
+
+class Conv3x3(nnx.Module):
+    """3 x 3 convolution that keeps the size: `kernel` `[3, 3, C, D]`, `bias` `[D]` or none; zeros outside.
+
+    `dilation` is the distance between the kernel's columns and rows.
+    """
+
+    def __init__(self, inputs: int, outputs: int, *, dilation: int = 1, use_bias: bool = True, rngs: nnx.Rngs) -> None:
+        self.kernel = nnx.Param(nnx.initializers.he_normal()(rngs.params(), (3, 3, inputs, outputs), jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32)) if use_bias else None
+        self.dilation = dilation
+
+    def __call__(
+        self, x: Float[Array, "batch height width inputs"], uniform: bool | Bool[Array, ""] = False
+    ) -> Float[Array, "batch height width outputs"]:
+        """Convolve a map; if `uniform`, equal neighborhoods give equal bits, which takes 1.5 times as long."""
+        direct = partial(_convolve, above=self.dilation, dilation=self.dilation)
+
+        def fast(x: Array, kernel: Array) -> Array:
+            return lax.cond(uniform, direct, partial(winograd, dilation=self.dilation), x, kernel)
+
+        kernel, is_wide = self.kernel[...], x.shape[-1] >= _WIDE
+        product = lax.platform_dependent(x, kernel, cpu=fast, default=direct) if is_wide else direct(x, kernel)
+        return product if self.bias is None else product + self.bias[...][None, None, None]
+
+
+def winograd(
+    x: Float[Array, "batch height width inputs"], kernel: Float[Array, "3 3 inputs outputs"], dilation: int
+) -> Float[Array, "batch height width outputs"]:
+    """Convolve a map, zeros outside."""
+    batch, height, width, channels = x.shape
+    tiles = -(-height // (4 * dilation))
+    below = dilation * (4 * tiles + 3) - height
+    x = jnp.pad(x, ((0, 0), (dilation, below), (0, 0), (0, 0)))
+    x = x.reshape(batch, tiles + 1, 4, dilation, width, channels)  # row = 4 d tile + d place + phase
+    rows = [x[:, :-1, place] for place in range(4)] + [x[:, 1:, place] for place in range(2)]
+    products = [
+        _convolve(evaluated.reshape(batch, -1, width, channels), column[None], 0, dilation)
+        for evaluated, column in zip(_combine(_INPUT, rows), _combine(_KERNEL, list(kernel)), strict=True)
+    ]
+    result = _combine(_OUTPUT, [product.reshape(batch, tiles, dilation, width, -1) for product in products])
+    return jnp.stack(result, axis=2).reshape(batch, 4 * tiles * dilation, width, -1)[:, :height]
+
+
+def _convolve(x: Array, kernel: Array, above: int, dilation: int) -> Array:
+    padding, dilations, axes = ((above, above), (dilation, dilation)), (dilation, dilation), ("NHWC", "HWIO", "NHWC")
+    return lax.conv_general_dilated(x, kernel, (1, 1), padding, None, dilations, axes, precision=PRECISION)
+
+
+def _combine(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[Array]:
+    """Product of a matrix and the column of parts."""
+    products = [[weight * part for weight, part in zip(row, parts, strict=True) if weight] for row in matrix]
+    return [sum(terms[1:], start=terms[0]) for terms in products]
+
+
+class GeneralizedMean(nnx.Module):
+    """(mean_p max(x_p, 1e-6)^power)^(1 / power) of each channel: power 1 is the mean, infinity the maximum."""
+
+    def __init__(self, power: float = 3.0) -> None:
+        self.power = nnx.Param(jnp.full(1, power, jnp.float32))
+
+    def __call__(self, maps: Float[Array, "batch height width channels"]) -> Float[Array, "batch channels"]:
+        power, values = self.power[...][0], jnp.maximum(maps, 1e-6)
+        largest = jnp.max(values, axis=(1, 2), keepdims=True)  # a divisor, so that powers of small values do not vanish
+        means = jnp.mean((values / largest) ** power, axis=(1, 2))
+        return largest[:, 0, 0] * means ** (1 / power)
