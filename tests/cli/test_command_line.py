@@ -30,12 +30,8 @@ def test_help_is_of_the_groups_that_were_chosen(succeed):
     anchor, _ = succeed("sweep", "--help", "experiment=anchor", "dataset=corridor")
     assert "  window: 10.0  # cells; a number from 1e-06" in anchor
     assert "sigma: 22.5" not in anchor
-    assert "  num_bins: [10, 15, 20]" in anchor
-
-
-def test_flags_of_hydra(succeed):
-    stdout, _ = succeed("evaluate", "--cfg", "job", "candidates=7")
-    assert stdout.startswith("candidates: 7\n")
+    job, _ = succeed("evaluate", "--cfg", "job", "candidates=7")
+    assert "\ncandidates: 7\n" in job
 
 
 def test_a_scorer_composes_with_the_values_of_its_fields():
@@ -45,32 +41,20 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
 
 
 @pytest.mark.parametrize(("program", "arguments", "words"), [
-    ("evaluate", ["experiment=histogram"], "Could not override 'experiment'"),
-    ("sweep", ["system=mix_hist_5"], "error: In 'sweep': Could not find 'system/mix_hist_5'"),
     ("sweep", ["system=mix_hist_50"], "grid: expected at least one axis"),
     ("sweep", ["fusion.c=zscore", "final=combined", "grid.sigma=[3]"], "fusion.c=zscore: expected a number or auto"),
-    ("sweep", ["scorer=histogram", "grid.c=[zscore]"], "grid.c=['zscore']: expected a list"),
-    ("evaluate", ["fusion.c=zscores"], "fusion.c=zscores: expected a number from 0 to 1e+12, or auto, zscore"),
     ("evaluate", ["fusion.weights={retrieval: 2}"], "fusion.weights: expected c='zscore'"),
-    ("evaluate", ["fusion.c=zscore", "fusion.weights={retrieval: 0}"], "'retrieval': 0}: expected weights above 0"),
     ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected retrieval"),
-    ("evaluate", ["store=DIR"], "its name is cache now"),
     ("evaluate", ["fusion.filter_score=cosine"], "its name is fusion.retrieval_score now"),
-    ("evaluate", ["scorer=histogram", "scorer.scales=[1,2]"], "Could not override 'scorer.scales'"),
-    ("evaluate", ["dataset.cache=null"], "dataset.cache=null: expected a path"),
     ("evaluate", ["cache=${oc.env:NOPE}"], "NOPE"),
     ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least"),
-    ("evaluate", ["matching=lightglue", "matching.filter_threshold=2"], "matching.filter_threshold=2: expected a"),
     ("evaluate", ["matching=lightglue", "matching.weights=d2_tf"], "weights=d2_tf: expected weights of lightglue"),
     ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),
     ("evaluate", ["figures=[1.5]"], "figures=[1.5]: expected how many"),
     ("evaluate", ["candidats=3"], "Could not override 'candidats'"),
-    ("evaluate", ["dataset=folder"], "dataset.database"),
     ("evaluate", [*OWN], "dataset.ground_truth: "),
     ("evaluate", [*OWN, "dataset.ground_truth=none"], "a: expected a folder of images"),
     ("evaluate", ["+new.key=1"], "new: unknown setting"),
-    ("evaluate", ["word"], "missing EQUAL"),
-    ("evaluate", ["features=null"], "Config group override"),
     ("evaluate", ["scorer.count.method=nope"], "scorer.count.method=nope: expected one of"),
     ("evaluate", ["+scorer.count._target_=os.system"], "scorer.count._target_: unknown setting"),
     ("evaluate", ["dataset.name=../up"], "dataset.name=../up: expected letters"),
@@ -78,7 +62,6 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
     ("evaluate", ["cluster=local", "cache=null"], "expected cache=DIR as well, a folder that all"),
     ("evaluate", ["cluster=address", "cluster.address=HOST"], "cluster.address=HOST: expected tcp://HOST:PORT"),
     ("evaluate", ["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
-    ("evaluate", ["threshold=2"], "threshold=2: expected a number from 0 to 1"),
     ("evaluate", ["confidence=/none.json"], "/none.json: expected the confidence.json"),
     ("localize", ["map=a", "images=b", "route=-2000"], "route=-2000: expected a number from -1000 to 1000"),
     ("benchmark.__main__", ["foo"], "invalid choice: 'foo'"),

@@ -29,23 +29,8 @@ def evaluate(root, tmp_path, succeed):
 
 
 @pytest.fixture
-def refused(root, tmp_path, call):
-    def run(*more):
-        code, _, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out", *more)
-        assert (code, (tmp_path / "out").exists()) == (2, False)
-        return stderr.splitlines()[-1]
-
-    return run
-
-
-@pytest.fixture
 def confidence(evaluate):
     return evaluate("first")[0] / "confidence.json"
-
-
-@pytest.fixture
-def content(confidence):
-    return json.loads(confidence.read_text())
 
 
 def test_a_run_says_how_sure_its_answers_are(evaluate):
@@ -93,11 +78,9 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     first = csv_rows(confidence.parent / "top_predictions.csv")
     least = np.median([float(line["confidence"]) for line in first])
     threshold = (f"confidence={confidence}", f"threshold={least}")
-    out, stderr, stdout = evaluate("second", *threshold)
+    out, stderr, _ = evaluate("second", *threshold)
     assert "was fitted on these very images" in stderr
     assert "other settings" not in stderr
-    header = stdout[stdout.index("AP by score") :].splitlines()[0]
-    assert header.endswith("correct  incorrect  refused  of these correct")
     top = csv_rows(out / "top_predictions.csv")
     probability, score = (np.array([float(line[name]) for line in top]) for name in ("confidence", "score"))
     lacks = np.array([line["reason"] not in ("", "low confidence") for line in top])
@@ -172,53 +155,37 @@ def test_unusable_queries_are_refused_whatever_the_threshold(evaluate, confidenc
     assert {line["outcome"] for line in top.values()} == {"refused"}
 
 
-def test_a_file_without_absent_places_is_told(evaluate, content, tmp_path):
-    for absent in (0, 5):
-        (tmp_path / "other.json").write_text(
-            json.dumps(content | {"made": content["made"] | {"absent_queries": absent}})
-        )
-        _, stderr, _ = evaluate(f"out{absent}", f"confidence={tmp_path}/other.json")
-        assert ("was fitted without absent places" in stderr) == (absent == 0)
-
-
-def test_confidence_of_other_systems_is_refused(content, refused, tmp_path):
-    del content["systems"]["histogram"]
-    (tmp_path / "other.json").write_text(json.dumps(content))
-    assert "got retrieval, histogram + retrieval; " in refused(f"confidence={tmp_path}/other.json")
-
-
-@pytest.mark.slow
 def test_confidence_of_other_settings_is_said(evaluate, confidence):
     _, stderr, _ = evaluate("second", f"confidence={confidence}", "scorer.weight=ratio", "fusion.c=2")
     assert "other settings of scorer, fusion:" in stderr
+    for changed, words in (("recall.tolerances=[0]", "recall"), ("candidates=5", "candidates")):
+        _, stderr, _ = evaluate(words, f"confidence={confidence}", changed)
+        assert f"other settings of {words}" in stderr
+    out, stderr, _ = evaluate("third", f"confidence={confidence}", "scorer=paper")
+    assert "other settings" not in stderr  # the histogram is the same beside others
+    assert "sum" not in {line["system"] for line in csv_rows(out / "confidence.csv")}
     fused = ("scorer=ratio", "fusion.c=zscore", "fusion.weights={anchor: 1}", "final=combined")
     other, *_ = evaluate("fused", *fused)
     for window, warns in ((6, True), (10, False)):
         changed = f"scorer.anchor.window={window}"
         _, stderr, _ = evaluate(f"window_{window}", f"confidence={other}/confidence.json", *fused, changed)
         assert ("other settings of scorer:" in stderr) == warns
-    _, stderr, _ = evaluate("third", f"confidence={confidence}", "scorer=paper")
-    assert "other settings" not in stderr  # the histogram is the same beside others
 
 
-def test_confidence_of_what_counted_otherwise_is_said(evaluate):
-    first, *_ = evaluate("first", "scorer=paper")
-    same = (f"confidence={first}/confidence.json", "scorer=paper")
-    for changed, words in (("recall.tolerances=[0]", "recall"), ("candidates=5", "candidates")):
-        _, stderr, _ = evaluate(words, *same, changed)
-        assert f"other settings of {words}" in stderr
-    out, stderr, _ = evaluate("sum", *same, "scorer.sum.weight=fs")
-    assert "other settings of" not in stderr
-    assert "sum" not in {line["system"] for line in csv_rows(out / "confidence.csv")}
-
-
-def test_what_it_was_fitted_on_is_known_under_any_name(evaluate, content, tmp_path):
+def test_a_file_tells_what_it_was_fitted_on(evaluate, confidence, refuse, root, tmp_path):
     """The queries tell, whatever the folder is called; the database alone may be the same."""
-    for name, side, warns in (("renamed", "query fwd", True), ("map", "database", False)):
-        seen = content["made"]["data_fingerprint"]
-        [queries] = [folder for key, folder in seen.items() if key != "database"]
-        sides = {"database": "other", side: queries} if warns else {"database": seen["database"], "query": "other"}
-        changed = content | {"made": content["made"] | {"data_fingerprint": sides}}
-        (tmp_path / f"{name}.json").write_text(json.dumps(changed))
-        _, stderr, _ = evaluate(name, f"confidence={tmp_path}/{name}.json")
-        assert ("was fitted on these very images" in stderr) == warns
+    content = json.loads(confidence.read_text())
+    seen, other = content["made"]["data_fingerprint"], tmp_path / "other.json"
+    [queries] = [folder for key, folder in seen.items() if key != "database"]
+    for number, (fingerprint, absent) in enumerate([
+        ({"database": "other", "query fwd": queries}, 0), ({"database": seen["database"], "query": "other"}, 5),
+    ]):  # fmt: skip
+        made = content["made"] | {"data_fingerprint": fingerprint, "absent_queries": absent}
+        other.write_text(json.dumps(content | {"made": made}))
+        _, stderr, _ = evaluate(f"{number}", f"confidence={other}")
+        assert ("was fitted on these very images" in stderr) == (number == 0)
+        assert ("was fitted without absent places" in stderr) == (absent == 0)
+    del content["systems"]["histogram"]
+    other.write_text(json.dumps(content))
+    error = refuse("evaluate", *small(root), *LINES, f"confidence={other}", f"out={tmp_path}/out")
+    assert "got retrieval, histogram + retrieval; " in error

@@ -1,42 +1,35 @@
 """Data sets as a program: listed, and checked beside what is published."""
 
-from functools import partial
-
 import pytest
 from PIL import Image
 
 from mfvpr.datasets.published import PUBLISHED
 from tests.datasets.test_published import put
-from tests.programs import output_of
 
 
-@pytest.fixture
-def program(monkeypatch, capsys):
-    """Runs a command: output and errors."""
-    return partial(output_of, monkeypatch, capsys, "data")
-
-
-def test_all_are_listed_with_their_numbers(program):
-    stdout, _ = program("list")
+def test_all_are_listed_with_their_numbers(call):
+    _, stdout, _ = call("data", "list")
     names = [line.split()[0].removesuffix(":") for line in stdout.splitlines()[2:]]
     assert names == [*PUBLISHED, "grief_season", "corridor", "streets_seasons"]
     assert "1,411" in next(line for line in stdout.splitlines() if line.startswith("robotcar"))
 
 
-def test_images_that_cannot_be_read_are_counted(program, tmp_path):
+def test_images_that_cannot_be_read_are_counted(call, tmp_path):
     put(tmp_path, *(f"{side}/{i}.png" for side in ("database", "queries") for i in range(3)))
     (tmp_path / "queries/1.png").write_bytes((tmp_path / "queries/1.png").read_bytes()[:30])
     (tmp_path / "queries/2.png").write_text("text")
-    stdout, stderr = program("check", "grief_season", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png", code=2)
+    code, stdout, stderr = call("data", "check", "grief_season", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
+    assert code == 2
     assert ["queries", "3", "-", "2"] in [line.split() for line in stdout.splitlines()]
     assert stdout.count("unreadable: ") == 2
     assert "2 images cannot be read" in stderr
 
 
-def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
+def test_what_is_there_stands_beside_what_is_published(call, tmp_path):
     put(tmp_path, *(f"Reference/image{i:04d}.png" for i in range(4)), *(f"Live/image{i:04d}.png" for i in range(2)))
     (tmp_path / "GroundTruth.csv").write_text("Reference,Live\n0,0\n3,1\n")
-    stdout, stderr = program("check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png", code=2)
+    code, stdout, stderr = call("data", "check", "berlin_a100", f"root={tmp_path}", "--sheet", tmp_path / "sheet.png")
+    assert code == 2
     assert ["database", "4", "85", "0"] in [line.split() for line in stdout.splitlines()]
     assert "berlin_a100: correct images of a query (±5): 4 to 4, median 4; 0 queries have none" in stdout
     assert "2 queries are images of the database" in stdout
@@ -51,7 +44,7 @@ def test_what_is_there_stands_beside_what_is_published(program, tmp_path):
     (["check", "garden"], "Could not find 'dataset/garden'"),
     (["check"], "the following arguments are required: NAME"),
 ])  # fmt: skip
-def test_mistakes_are_one_line(program, arguments, words):
-    _, stderr = program(*arguments, code=2)
+def test_mistakes_are_one_line(call, arguments, words):
+    code, _, stderr = call("data", *arguments)
+    assert (code, stderr.count("\n")) == (2, 1)
     assert words in stderr
-    assert stderr.count("\n") == 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mfvpr.cli import evaluation, sweeping
-from tests.programs import CANDIDATES, MFVPR, QUERIES, ROOT, job_of, settings_of, small
+from tests.programs import MFVPR, QUERIES, ROOT, job_of, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
@@ -38,21 +38,13 @@ def recall_of(content, **parameters):
     return entry["recall_at"]
 
 
-# --- one sweep ---------------------------------------------------------------------------------------------------
-
-
-def evaluated(root, out, *overrides):
-    """The rows of an evaluation, and their recall at ks by system and tolerance."""
-    evaluation.evaluate(settings_of(*small(root), "figures=0", f"out={out}", *overrides))
-    rows = json.loads((out / "results.json").read_text())
-    return rows, {(row["system"], f"{row['tolerance']}"): row["recall_at"] for row in rows}
-
-
 @pytest.mark.first_case
 @pytest.mark.parametrize(("final", "c"), [("score", 0), ("combined", 2)])
 def test_the_own_values_score_as_without_a_sweep(root, sweep, swept, tmp_path, final, c):
-    content = sweep(tmp_path / "swept", *GRID, f"final={final}")
-    rows, _ = evaluated(root, tmp_path / "evaluated", "scorer=histogram", GRID[-1], f"final={final}")
+    content, out = sweep(tmp_path / "swept", *GRID, f"final={final}"), f"out={tmp_path}/evaluated"
+    changes = ("figures=0", out, "scorer=histogram", GRID[-1], f"final={final}")
+    evaluation.evaluate(settings_of(*small(root), *changes))
+    rows = json.loads((tmp_path / "evaluated/results.json").read_text())
     assert content["own"] == {"sigma": 22.5, "weight": "fs", "c": c}
     deciding = {f"{row['tolerance']}": row["recall_at"] for row in rows if row["decides"]}
     assert recall_of(content, **content["own"]) == deciding
@@ -73,10 +65,6 @@ def test_every_file_tells_the_same(swept):
     assert set(map(len, content["data_fingerprint"].values())) == {16}
     assert content["ground_truth"]["kind"] == "index"
     assert content["ground_truth"]["thresholds"] == [0, 1]
-    heading = (out / "summary.txt").read_text().splitlines()[0]
-    assert f"within 0, 1 frames of the ground truth: {content['ground_truth']['files'][0]}" in heading
-    assert (out / "table.md").read_text().startswith(f"{heading}\n\n|")
-    assert (out / "table.tex").read_text().startswith(f"% {heading}\n\\begin")
     assert (content["unit"], content["thresholds"], content["ks"]) == ("frames", [0, 1], [1, 5])
 
 
@@ -95,9 +83,7 @@ def test_the_best_setting_is_chosen_and_told(swept):
         assert test["only_first"] - test["only_second"] == pytest.approx(gain)
     text = (out / "summary.txt").read_text()
     assert f"chosen: sigma = {chosen['sigma']:g}, weight = {chosen['weight']}, c = {chosen['c']}" in text
-    assert f"24 queries, {CANDIDATES} candidates of 24 database images" in text
     assert "this flatters" in text
-    assert f"along the path p = {content['report'][1]['path_test']['p_value']:.2g}" in text
 
 
 def test_where_the_combined_score_decides_every_setting_is_combined(sweep, swept, tmp_path):
@@ -131,15 +117,11 @@ def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
     assert tried != [entry["parameters"] for entry in other["settings"]]
 
 
-# --- mistakes and interruptions ----------------------------------------------------------------------------------
-
 SIGMA = "grid.sigma=[10]"
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    (["grid.sigma=[]"], "grid.sigma=[]: expected a list"),
     (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
-    (["grid.max_distance=[null]", "matching.max_distance=0.4"], "grid.max_distance=[None]: expected"),
     (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
     ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
     ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
@@ -149,13 +131,9 @@ def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, 
     assert words in refuse_at_once("sweep", *small(root), *arguments)
 
 
-@pytest.mark.parametrize(("program", "arguments", "words"), [
-    ("sweep", [SIGMA, "scorer.max_bins=3"], "max_bins=3: expected at least 22"),
-    ("sweep", ["search=optuna", "grid.bin_size=[0.1,5]"], "bin_size=0.1: expected at most 1024 bins"),
-    ("evaluate", ["scorer=histogram", "scorer.bin_size=0.01"], "bin_size=0.01: expected at most 1024 bins"),
-])  # fmt: skip
-def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse, program, arguments, words):
-    assert refuse(program, *small(root), *arguments, f"out={tmp_path}/out").startswith(f"error: {words}")
+def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse):
+    arguments = ("search=optuna", "grid.bin_size=[0.1,5]", f"out={tmp_path}/out")
+    assert "bin_size=0.1: expected at most 1024 bins" in refuse("sweep", *small(root), *arguments)
     assert list(tmp_path.iterdir()) == []
 
 
