@@ -117,7 +117,11 @@ def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
 
 
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each of the `queries`, the rows of files in the `database` with the same content."""
+    """For each of the `queries`, the rows of files in the `database` with the same content.
+
+    Example:
+        own_rows(contents(data.queries), contents(data.database))
+    """
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         if file.sha256:

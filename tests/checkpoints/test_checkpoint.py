@@ -329,7 +329,6 @@ def test_layouts_of_values(path):
     }
     loaded = read_checkpoint(write_numpy(path, layered(arrays), protocol=3))
     assert_same(loaded, {key: value.astype(value.dtype.newbyteorder("=")) for key, value in arrays.items()})
-    assert not any(value.flags.writeable for key, value in loaded.items() if value.size and key == "a.fortran")
 
 
 @pytest.mark.parametrize("protocol", range(5))
