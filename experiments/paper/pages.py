@@ -135,9 +135,10 @@ def _failures(run: Path, dataset: Dataset) -> Iterator[list[_Image]]:
         is_of_frames = sequence.truth is not None and sequence.truth.unit == "frames"
         positives = sequence.truth.positives(TOLERANCES[-1]) if sequence.truth and is_of_frames else None
         for row in read_csv(sequence_folder(run, names, place) / "failures" / "histogram.csv"):
-            predicted = dataset.database.names.index(row["prediction"])
+            if not row["correct_image"]:  # nor need there be a prediction
+                continue
             near = () if positives is None else positives.of(sequence.images.names.index(row["query"]))
-            if row["correct_image"] and predicted not in near:  # also within the widest of the paper's tolerances
+            if dataset.database.names.index(row["prediction"]) not in near:  # also within the widest tolerance
                 failures.append((sequence, row))
     failures.sort(key=lambda failure: -float(failure[1]["margin"] or 0))  # empty between two infinite scores
     for sequence, row in failures[:_FAILURES]:

@@ -166,7 +166,12 @@ def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
         elif isinstance(value, str):
             yield override(f"{prefix}{name}", value)
         else:
-            yield f"{prefix}{name}={json.dumps(value, default=np.generic.item)}"
+            yield f"{prefix}{name}={json.dumps(value, ensure_ascii=False, default=_plain)}"
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy as Python's, and a date that YAML read as its text."""
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def aliked_or_sift() -> str:

@@ -1,6 +1,7 @@
 """Notes, warnings, errors and progress of the programs, on stderr."""
 
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -34,6 +35,7 @@ def one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # pressed again, it must not end the end
         print("\ninterrupted; what was finished is kept", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # as in `| head`

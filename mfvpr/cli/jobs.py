@@ -146,7 +146,8 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
     for name, reader in _FILES.items():
         if (settings.get(name) is not None) != (kind == reader):
             expected = f"dataset.{name}=FILE" if kind == reader else f"none, or dataset.ground_truth={reader}"
-            raise InputError(f"dataset.ground_truth={kind}: expected {expected}, got dataset.{name}={settings[name]}")
+            got = f"dataset.{name}={settings.get(name)}"
+            raise InputError(f"dataset.ground_truth={kind}: expected {expected}, got {got}")
     truth = kind
     if kind == "index":
         truth = IndexFile(expand_user(settings["index_file"]), settings["widen_index"])

@@ -95,6 +95,8 @@ def localize(settings: Localize) -> None:
             print(printable(json.dumps(line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
         raise InputError(f"{failed} of the images could not be localized; their lines say why")
+    if drive.undrawn:
+        raise InputError(f"{drive.undrawn} of the figures could not be drawn; warnings say why")
     if drive.missing:
         names = ",".join(sorted(map(str, drive.missing)))
         raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
@@ -111,6 +113,7 @@ class _Drive:
         figures = settings.figures
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
+        self.undrawn = 0
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
@@ -152,6 +155,7 @@ class _Drive:
             line["figure"] = str(path)
         except Exception as error:  # of any kind from Matplotlib; the line must still be printed
             line["figure"] = None
+            self.undrawn += 1
             warn(f"{path}: not drawn ({error})")
 
     def entry_without_image(self) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def run(program: str) -> None:
     """Run a program with the arguments of the command line."""
     if program == "demo":
         program, sys.argv[1:1] = "evaluate", ["scorer=demo"]
-    if program in _COMMANDS and sys.argv[1:2] != ["build"]:
+    if program in _COMMANDS and (program != "map" or sys.argv[1:2] != ["build"]):
         run_command(f"mfvpr {program}", COMMANDS[program], partial(_add_functions, functions=_COMMANDS[program]))
         return
     if program == "map":

@@ -221,6 +221,8 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     numbers = np.array([confidence.center, confidence.scale, confidence.weights], float)
     is_known = {*confidence.inputs} <= {*get_args(Input)} and numbers.shape[1] == len(confidence.inputs)
     is_fitted = np.isfinite(numbers).all() and np.isfinite(confidence.bias) and min(confidence.scale) > 0
+    is_fitted &= min(confidence.weights) >= 0 and len(confidence.refusals) == 2 and min(confidence.refusals) > 0
+    is_fitted &= max(confidence.refusals) <= 1
     if not (is_known and is_fitted):
         raise ValueError("values that make no model")
     return confidence

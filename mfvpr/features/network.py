@@ -1,7 +1,7 @@
 """Extractors with a network: their base, which runs images in batches, and networks of global descriptors."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
@@ -38,6 +38,7 @@ class NetworkExtractor:
 
     model: Any = field(repr=False)
     image_size: tuple[int, int] = setting((336, 336), SIZE, "width, height")
+    _: KW_ONLY
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
     batch_size: int = setting(8, whole(1, 256), recipe=False)
 

@@ -71,7 +71,14 @@ class _WhitenedWindows(NetworkExtractor):
     @property
     def maps(self) -> SsmMaps:
         """Extractor of the stage's maps."""
-        return SsmMaps(self.model, self.image_size, self.interpolation, self.batch_size, self.preprocessing, self.stage)
+        return SsmMaps(
+            self.model,
+            self.image_size,
+            interpolation=self.interpolation,
+            batch_size=self.batch_size,
+            preprocessing=self.preprocessing,
+            stage=self.stage,
+        )
 
     @cached_property
     def _program(self) -> Callable[..., Any]:

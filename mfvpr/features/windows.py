@@ -20,6 +20,7 @@ from mfvpr.features.whitening import Whitening, fit_whitening
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
+from mfvpr.utils.numerics import free_host_bytes
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,12 @@ class WindowFitting:
         if self.max_windows is not None and total > self.max_windows:
             rng = np.random.default_rng([self.seed, 1])
             chosen = np.sort(rng.choice(total, self.max_windows, replace=False))
-        sample, filled = np.zeros((len(chosen) + self.zero_row, windows.dimension), self.dtype), 0
+        count = len(chosen) + self.zero_row
+        needed = np.dtype(self.dtype).itemsize * count * windows.dimension + 16 * min(count, windows.dimension) ** 2
+        if needed > (free := free_host_bytes()):
+            words = f"takes {needed / 1e9:.1f} GB of memory, but {free / 1e9:.1f} GB are free; lower max_images"
+            raise InputError(f"whitening of {count} windows of {windows.dimension} numbers: {words} or max_windows")
+        sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
         starts = {row: windows.count * number for number, row in enumerate(rows)}
         for batch in maps:
             for row, image_map in batch.items():

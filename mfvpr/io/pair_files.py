@@ -130,7 +130,8 @@ class ColmapPairs(PairReader):
             places = {}
             for (number,) in database.execute(f"SELECT pair_id FROM {self._table}"):
                 first, second = divmod(number, self._MOST_IMAGES)
-                places[names[first], names[second]] = number
+                if first in names and second in names:  # images may have been removed
+                    places[names[first], names[second]] = number
         super().__init__(path, places)
 
     def read(self, pairs: Sequence[Pair]) -> Iterator[FileMatches]:

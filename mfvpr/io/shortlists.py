@@ -223,7 +223,7 @@ def _rows(
     """Row of each foreign name, and the entry of each image; an InputError for unknown names."""
     foreign = dict.fromkeys(foreign)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
-    for name in foreign.keys() - rows.keys():
+    for name in (name for name in foreign if name not in rows):
         raise InputError(
             f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none "
             f"of the {len(names)} has, or one has by its full path"

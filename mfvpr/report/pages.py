@@ -135,11 +135,13 @@ def read_run(folder: Path) -> Run:
     """Read the files of a run folder; InputError if they are not those of an evaluation."""
     with _reading(folder):
         results, about = _read_json(folder / LAST), _read_json(folder / "run.json")
-        tables = {name: read_table(folder / f"{name}.csv") for name in _TABLES if (folder / f"{name}.csv").exists()}
         systems = list(dict.fromkeys(row["system"] for row in results))
         headline = next(row["system"] for row in results if row["decides"])
         parts, truth = dict.fromkeys(row.get("sequence", row["dataset"]) for row in results), results[0]["ground_truth"]
         sequences, thresholds = [name for name in parts if name not in MEANS], truth.get("thresholds", [])
+        files = {name: folder / f"{name}.csv" for name in _TABLES}
+        needed = () if not thresholds else _TABLES[:5]  # other tables are of some runs alone
+        tables = {name: read_table(file) for name, file in files.items() if name in needed or file.exists()}
         within = threshold_words(truth["unit"], middle(thresholds)) if thresholds else ""
         lines, sequence_of = list[dict[str, str]](), list[int]()
         for number in range(len(sequences) if thresholds else 0):

@@ -209,6 +209,8 @@ def pictures(run: Path, *, most: int = MOST_PICTURES) -> list[dict[str, Any]]:
     for path in paths[:: max(1, -(-len(paths) // most))]:
         with open_image(path) as image:
             image.load()
+            if not {*ABOUT} <= {*image.info}:
+                continue  # a figure of something else
             small, file = image.convert("RGB"), BytesIO()
         small.thumbnail((_PICTURE_WIDTH, small.height))
         small.save(file, "JPEG", quality=_QUALITY, optimize=True)

@@ -38,7 +38,17 @@ def test_what_is_there_stands_beside_what_is_published(call, tmp_path):
         assert sheet.size[0] > 500
 
 
+def test_names_are_text_in_lists_of_folders_and_where_they_look_like_dates(call, tmp_path):
+    put(tmp_path, *(f"{folder}/{i}.png" for folder in ("database", "nä", "b") for i in range(3)))
+    queries = f"queries=[{tmp_path}/nä,{tmp_path}/b]"
+    given = ("sequences", f"database={tmp_path}/database", queries, "ground_truth=order", "name=2026-01-31")
+    code, stdout, _ = call("data", "check", *given, "--sheet", tmp_path / "sheet.png")
+    assert code == 0
+    assert "nä: 3 queries are images of the database" in stdout
+
+
 @pytest.mark.parametrize(("arguments", "words"), [
+    (["check", "sequences", "database=d", "queries=[q]", "ground_truth=label"], "expected dataset.query_labels=FILE"),
     (["check", "gardens_point"], "dataset.root: expected a value"),
     (["check", "gardens_point", "root=/no/such"], "expected the folder of gardens_point, got nothing"),
     (["check", "garden"], "Could not find 'dataset/garden'"),

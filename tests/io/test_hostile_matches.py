@@ -144,6 +144,15 @@ def test_hostile_colmap(tools, tmp_path, statement, message):
         open_matches(path, side("queries/", QUERIES), side("database/", DATABASE)).read(0, [0, 1])
 
 
+def test_pairs_of_images_that_left_colmaps_database_cost_no_others(tools, tmp_path):
+    pair = 998 * (2**31 - 1) + 999
+    path = changed_database(tools, tmp_path, f"INSERT INTO matches VALUES ({pair}, 0, 2, NULL)")
+    sides = side("queries/", QUERIES), side("database/", DATABASE)
+    changed, whole = (open_matches(each, *sides).read(0, [0, 1]) for each in (path, tools / "colmap.db"))
+    for one, other in zip(changed, whole, strict=True):
+        np.testing.assert_array_equal(one.points0, other.points0)
+
+
 @pytest.mark.parametrize("file", ["pairs/q1_d1.npz", "m.h5"])
 def test_an_array_that_grows_without_limit_is_not_read(tmp_path, monkeypatch, file):
     monkeypatch.setattr(containers, "MAX_INFLATED", 1 << 20)

@@ -238,11 +238,12 @@ def test_a_map_shows_nothing_outside_of_its_folder(folder, small_street, tmp_pat
     """Its names are data: of a map that somebody gave away they may say anything."""
     query = small_street / "queries/0004.png"
     Map.open(folder).add(query, "there", name=f"..{query}")
-    [line], stderr = localize(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database")
+    [line], stderr = localize(query, "figures=1", f"out={tmp_path}/out", f"root={small_street}/database", code=2)
     assert (line["place"], line["figure"]) == ("there", None)
-    [warning] = stderr.splitlines()
+    warning, error = stderr.splitlines()
     assert warning.startswith(f"warning: {tmp_path}/out/0000_0004.png: not drawn ('..")
     assert "one that leads elsewhere" in warning
+    assert error.startswith("error: 1 of the figures ")
     assert not (tmp_path / "out").exists()
 
 
