@@ -221,6 +221,7 @@ def check_fields(owner: Any) -> None:
         if about is not None and callable(each.default) and not callable(value):  # words are for the command line
             raise InputError(f"{each.name}={value!r}: expected a weight such as RatioWeight()")
         parts = value if isinstance(value, list | tuple) else (value,)
-        is_plain = all(isinstance(part, bool | int | float | np.integer | str | list | Mapping | None) for part in parts)
+        plain = bool | int | float | np.integer | str | list | Mapping | None
+        is_plain = all(isinstance(part, plain) for part in parts)
         if about is not None and is_plain and (about.none is None or value != about.none):
             about.rule.check(each.name, value)
