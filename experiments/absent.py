@@ -18,7 +18,6 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
-from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.localization.map_settings import data_of_drive
 from mfvpr.storage import FeatureCache
 
@@ -30,8 +29,8 @@ Ranked = tuple[Float[np.ndarray, "queries inputs"], Bool[np.ndarray, " queries"]
 def rank_elsewhere(dataset: Dataset, system: System, cache: FeatureCache) -> Ranked:
     """Inputs of the confidence of queries that show no place of the database, so that no top prediction is correct."""
     result = rank_dataset(dataset, system, cache=cache)
-    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-    return confidence_inputs(ranked, by_retrieval), np.zeros(len(ranked.rows), bool)
+    [ranked] = result.systems[system.headline]
+    return confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)
 
 
 def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> list[str]:

@@ -158,8 +158,7 @@ def fit(arguments: list[str]) -> Confidence:
         dataset = folder(*argument.partition("=")[2].split(":"), ground_truth="order")
         systems, truth = rank_dataset(dataset, system, cache=cache).systems, dataset.only.truth
         assert truth is not None
-        [by_retrieval] = systems["retrieval"]
-        parts += [calibration_data(systems[name][0], by_retrieval, truth, NEAR) for name in system.scorers]
+        parts += [calibration_data(systems[name][0], truth, NEAR) for name in system.scorers]
     return CalibrationData(*map(np.concatenate, zip(*parts, strict=True))).fit()
 
 

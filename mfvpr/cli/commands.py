@@ -77,7 +77,7 @@ def add_weights(file: Path, *, as_: str | None = None, own: str | None = None) -
     print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{origin}")
 
 
-def verify_weights(names: list[str] = ()) -> None:  # pyright: ignore[reportArgumentType]
+def verify_weights(names: Sequence[str] = ()) -> None:
     """Check what is installed, byte by byte, against its manifests; by default all that is there."""
     folder, known = weights_folder(), (*REGISTRY.values(), *own_entries())
     present = [
@@ -132,7 +132,7 @@ def download_weights(name: str) -> None:
 # --- data --------------------------------------------------------------------------------------------------------
 
 
-def list_data(names: list[str] = ()) -> None:  # pyright: ignore[reportArgumentType]
+def list_data(names: Sequence[str] = ()) -> None:
     """Print a table of all data sets, or details of those that are named."""
     about = {entry.name: f"{entry.title}\n{entry.layout}\nfrom {entry.source}" for entry in PUBLISHED.values()}
     for name in names:
@@ -150,7 +150,7 @@ def list_data(names: list[str] = ()) -> None:  # pyright: ignore[reportArgumentT
 
 def check_data_set(
     name: str,
-    settings: list[str] = (),  # pyright: ignore[reportArgumentType]
+    settings: Sequence[str] = (),
     *,
     sheet: Path | None = None,
 ) -> None:

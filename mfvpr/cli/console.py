@@ -35,7 +35,7 @@ def one_line() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # pressed again, it must not end the end
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would interrupt the exit
         print("\ninterrupted; what was finished is kept", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # as in `| head`

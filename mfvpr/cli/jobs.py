@@ -1,4 +1,4 @@
-"""What jobs share: their inputs from settings, notes and warnings about these before the work, and the run folder."""
+"""Steps that jobs share: inputs from settings, warnings about them, and the run folder."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager

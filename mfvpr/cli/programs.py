@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -157,5 +157,5 @@ def _add_functions(parser: argparse.ArgumentParser, functions: str | dict[str, s
             flag = name.strip("_").replace("_", "-")
             parser.add_argument(f"--{flag}", dest=name, required=is_required, **options)
         else:
-            nargs = {"nargs": "+" if is_required else "*"} if get_origin(kind) is list else {}
+            nargs = {"nargs": "+" if is_required else "*"} if get_origin(kind) in (list, Sequence) else {}
             parser.add_argument(name, metavar=name.upper(), **nargs, **options)

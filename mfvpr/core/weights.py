@@ -1,4 +1,4 @@
-"""What scores see of one pair's matches: weights (paper, section IV-B), confidences, shifts, and image sizes."""
+"""Measurements of one pair's matches for scores: weights (paper, section IV-B), confidences, shifts, image sizes."""
 
 from dataclasses import field, replace
 from typing import Any, Protocol

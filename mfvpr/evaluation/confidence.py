@@ -5,10 +5,10 @@ query's scores, so that it can be used for other images. Precision, recall and r
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
@@ -19,36 +19,30 @@ from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
 
-Input = Literal["margin", "height", "retrieval", "score"]
-INPUTS: tuple[Input, ...] = ("margin", "height")  # by default
 APART = 5  # rows of the database, by default
 REFUSALS = 0.2, 0.5  # shares of images without enough evidence, by default
 AROUND = 5  # times the distance of a correct prediction: nearer images show the place, or are not known to be elsewhere
 _LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which would order equal predictions by rounding
-_FORMAT = "mfvpr confidence 2"
+_FORMAT = "mfvpr confidence 3"
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
 _PRIOR = 2  # added candidates of other places, with the variance of all candidates
 BINS = 10  # of probabilities from 0 to 1, by default
 
 
-def confidence_inputs(
-    ranked: Ranked, by_retrieval: Ranked, *, inputs: Sequence[Input] = INPUTS, apart: int = APART
-) -> Float[np.ndarray, "queries inputs"]:
-    """Inputs of the confidence in the top predictions; NaN without a prediction.
+def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray, "queries 2"]:
+    """Margin and height, the inputs of the confidence in the top predictions; NaN without a prediction.
 
     margin: log(1 + x), where x is the difference of the first score and that of the best candidate of another place,
         divided by the standard deviation of the scores of candidates of other places. If there are few of them, that is
         drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
     height: the same, with the mean score of candidates of other places instead of the best.
-    retrieval: minus the log of the best rank, from 1, that the retrieval gives to a candidate of the predicted place.
-    score: inverse hyperbolic sine of the first score itself, which depends on the scale of scores.
 
-    A larger input means a more confident prediction. `by_retrieval` ranks the same candidates by retrieval. Database
-    images within `apart` rows of the prediction count as its place.
+    A larger input means a more confident prediction. Database images within `apart` rows of the prediction count as its
+    place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
-    scores, first = np.where(there, ranked.scores, 0.0).astype(np.float64), ranked.rows[:, :1]
-    elsewhere = there & (np.abs(ranked.rows - first) > apart)
+    scores = np.where(there, ranked.scores, 0.0).astype(np.float64)
+    elsewhere = there & (np.abs(ranked.rows - ranked.rows[:, :1]) > apart)
 
     def moments(where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Number, mean and variance of each query's scores; 0 if there are none."""
@@ -61,21 +55,15 @@ def confidence_inputs(
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
     spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
     second = np.max(scores, axis=1, where=elsewhere, initial=-np.inf)
-    near = np.abs(by_retrieval.rows - first) <= apart  # the prediction is among them; -1, no candidate, comes last
-    margin, height = (
-        np.where(elsewhere.any(axis=1), np.log1p(np.maximum(scores[:, 0] - other, 0) / spread), np.inf)
-        for other in (second, mean)
-    )
-    retrieval, score = -np.log1p(np.argmax(near, axis=1)), np.arcsinh(scores[:, 0])
-    columns = {"margin": margin, "height": height, "retrieval": retrieval, "score": score}
-    return np.where(there[:, :1], np.stack([columns[name] for name in inputs], axis=1), np.nan)
+    above = np.maximum(scores[:, :1] - np.stack([second, mean], axis=1), 0)
+    inputs = np.where(elsewhere.any(axis=1, keepdims=True), np.log1p(above / spread[:, None]), np.inf)
+    return np.where(there[:, :1], inputs, np.nan)
 
 
 @dataclass(frozen=True)
 class Confidence:
     """A logistic model of the probability that a system's top prediction is correct."""
 
-    inputs: tuple[Input, ...]  # names, see `confidence_inputs`
     apart: int  # see `confidence_inputs`
     center: tuple[float, ...]  # mean of each input over the data that the model was fitted on
     scale: tuple[float, ...]  # standard deviation of each input over these data
@@ -84,9 +72,9 @@ class Confidence:
     # Shares of images without enough evidence (`mfvpr.evaluation.evidence`), of places that the database shows and not.
     refusals: tuple[float, float] = REFUSALS
 
-    def __call__(self, ranked: Ranked, by_retrieval: Ranked) -> Float[np.ndarray, " queries"]:
-        """Probabilities, NaN without a prediction; for the arguments see `confidence_inputs`."""
-        return self.probability(confidence_inputs(ranked, by_retrieval, inputs=self.inputs, apart=self.apart))
+    def __call__(self, ranked: Ranked) -> Float[np.ndarray, " queries"]:
+        """Probabilities, NaN without a prediction."""
+        return self.probability(confidence_inputs(ranked, apart=self.apart))
 
     def probability(self, inputs: Float[np.ndarray, "queries inputs"]) -> Float[np.ndarray, " queries"]:
         """Probabilities from inputs; an infinite input counts as its center."""
@@ -95,11 +83,7 @@ class Confidence:
 
 
 def fit_confidence(
-    values: Float[np.ndarray, "queries inputs"],
-    correct: Bool[np.ndarray, " queries"],
-    *,
-    inputs: Sequence[Input] = INPUTS,
-    apart: int = APART,
+    values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *, apart: int = APART
 ) -> Confidence:
     """Fit a logistic model with weights of at least 0 by penalized maximum likelihood.
 
@@ -107,8 +91,8 @@ def fit_confidence(
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: of `confidence_inputs` with these `inputs` and `apart`; rows that are not finite, without a prediction
-            or without candidates of other places, are left out.
+        values: of `confidence_inputs` with this `apart`; rows that are not finite, without a prediction or without
+            candidates of other places, are left out.
         correct: whether the top prediction is correct; False for queries without a place in the database.
 
     Raises:
@@ -135,7 +119,7 @@ def fit_confidence(
     start = np.zeros(len(bounds))
     best = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     bias, *weights = np.where(np.abs(best) > _LEAST_WEIGHT, best, 0.0).tolist()
-    return Confidence(tuple(inputs), apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
+    return Confidence(apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 
 
 class CalibrationData(NamedTuple):
@@ -160,33 +144,29 @@ class CalibrationData(NamedTuple):
         return fit_confidence(np.concatenate([self.present, self.absent]), np.concatenate([self.correct, never]))
 
 
-def calibration_data(ranked: Ranked, by_retrieval: Ranked, truth: Truth, threshold: float) -> CalibrationData:
-    """Count each query as it is, and once more as an image of an absent place, see `absent_rankings`.
+def calibration_data(ranked: Ranked, truth: Truth, threshold: float) -> CalibrationData:
+    """Count each query as it is, and once more as an image of an absent place, see `absent_ranking`.
 
-        confidence = calibration_data(by_score, by_retrieval, truth, 2).fit()
+        confidence = calibration_data(ranked, truth, 2).fit()
 
-    `by_retrieval` ranks the same candidates; `threshold` is the largest distance of a correct prediction.
+    `threshold` is the largest distance of a correct prediction.
     """
-    absent = confidence_inputs(*absent_rankings(ranked, by_retrieval, truth, threshold))
+    absent = confidence_inputs(absent_ranking(ranked, truth, threshold))
     correct = truth.positives(threshold).contains(ranked.rows)[:, 0]
-    return CalibrationData(confidence_inputs(ranked, by_retrieval), absent, correct)
+    return CalibrationData(confidence_inputs(ranked), absent, correct)
 
 
-def absent_rankings(ranked: Ranked, by_retrieval: Ranked, truth: Truth, threshold: float) -> tuple[Ranked, Ranked]:
-    """Both rankings without the images of each query's place, as if the database did not show it.
+def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
+    """The ranking without the images of each query's place, as if the database did not show it.
 
     Images within five times the threshold are left out, and the other candidates keep their scores. A query without
-    images to leave out has no candidates: it shows an absent place as it is. Arguments are those of `calibration_data`.
+    images to leave out has no candidates: it shows an absent place as it is.
     """
     place = truth.shows_place(AROUND * max(threshold, 1))
-
-    def leave_out(ranked: Ranked) -> Ranked:
-        is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
-        order = np.argsort(is_left_out, axis=1, kind="stable")
-        rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
-        return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
-
-    return leave_out(ranked), leave_out(by_retrieval)
+    is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
+    order = np.argsort(is_left_out, axis=1, kind="stable")
+    rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
+    return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
@@ -216,16 +196,13 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
 
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     """The confidence whose `vars` were written as JSON; a TypeError or ValueError for values that make no model."""
-    vectors = {name: tuple(values[name]) for name in ("inputs", "center", "scale", "weights", "refusals")}
-    confidence = Confidence(**{**values, **vectors})
-    numbers = np.array([confidence.center, confidence.scale, confidence.weights], float)
-    is_known = {*confidence.inputs} <= {*get_args(Input)} and numbers.shape[1] == len(confidence.inputs)
-    is_fitted = np.isfinite(numbers).all() and np.isfinite(confidence.bias) and min(confidence.scale) > 0
-    is_fitted &= min(confidence.weights) >= 0 and len(confidence.refusals) == 2 and min(confidence.refusals) > 0
-    is_fitted &= max(confidence.refusals) <= 1
-    if not (is_known and is_fitted):
+    vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
+    numbers = np.array([*vectors.values()], float)  # [4, 2]: two inputs, two shares
+    _, scale, weights, shares = numbers
+    is_fitted = numbers.shape == (4, 2) and np.isfinite(numbers).all() and np.isfinite(values["bias"])
+    if not (is_fitted and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
-    return confidence
+    return Confidence(**{**values, **vectors})
 
 
 class PrecisionRecall(NamedTuple):

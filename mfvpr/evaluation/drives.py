@@ -45,7 +45,7 @@ _MOST_ROWS, _MOST_SPREAD = 10_000, 100  # rows from one image to the next
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
 # on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
 # `python -m experiments.sequences --fit`.
-STREETS = Confidence(("margin", "height"), 5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
+STREETS = Confidence(5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Evidence(NamedTuple):
     @classmethod
     def of(cls, ranked: Ranked, confidence: Float[np.ndarray, " images"] | None = None) -> "Evidence":
         """Evidence of a ranking's images; `confidence` is that of `STREETS` by default."""
-        p = STREETS(ranked, ranked) if confidence is None else confidence
+        p = STREETS(ranked) if confidence is None else confidence
         p = np.nan_to_num(p, nan=0.0)
         odds = np.clip(p / np.maximum(1 - p, 1e-9), 1 / _MOST_ODDS, _MOST_ODDS)
         # Shares: the square of the score above the mean; 0 if it is not finite.

@@ -1,4 +1,4 @@
-"""What an extractor is and what it returns; descriptions of a folder's images: threads decode while it works."""
+"""Protocols of extractors and their results; descriptions of a folder's images, which threads decode meanwhile."""
 
 import itertools
 from collections.abc import Iterator, Sequence

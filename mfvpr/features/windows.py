@@ -138,8 +138,8 @@ def learned_whitening(extractor: WindowExtractor) -> Whitening:
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
     if len(whitening.mean) != expected or whitening.origin not in ("", origin(extractor)):
         got = f"one of {len(whitening.mean)} that was learned with others; replace it by a WindowFitting"
-        own = f"{expected} numbers of its own network, images and windows"
-        raise InputError(f"{name}: expected a whitening of {own}, got {got}")
+        same = f"{expected} numbers that was learned with the same network, images and windows"
+        raise InputError(f"{name}: expected a whitening of {same}, got {got}")
     return whitening
 
 

@@ -28,7 +28,7 @@ from mfvpr.evaluation.evidence import (
     strength,
 )
 from mfvpr.evaluation.fusion import rank_by_scores
-from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.extractor import Extractor, Source
@@ -234,12 +234,12 @@ class Map(MapImages):
         if matched is None:
             return refusal("no candidates", description, size[0])
         rows, similarities, matches, scores = matched
-        ranking, by_retrieval = self._rank(rows, similarities, scores)
+        ranking = self._rank(rows, similarities, scores)
         best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
         [score], noise = evidence_scores(best), self._noise_score(end)
         if reason := reason_against(best.mask.sum(), score, noise):
             return refusal(reason, description, size[0])
-        p = math.nan if self.confidence is None else float(self.confidence(ranking, by_retrieval)[0])
+        p = math.nan if self.confidence is None else float(self.confidence(ranking)[0])
         p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._names[row], self._places[row], score)
@@ -275,17 +275,14 @@ class Map(MapImages):
             self._noise_scores[end] = float(np.max(scores, initial=0))
         return self._noise_scores[end]
 
-    def _rank(
-        self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]
-    ) -> tuple[Ranked, Ranked]:
-        """The ranking that decides, and that of the retrieval; both compile once, for `candidates` rows."""
+    def _rank(self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]) -> Ranked:
+        """The ranking that decides; it compiles once, for `candidates` rows."""
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        final_scores = [self.system.final_scores[name] for name in dict.fromkeys((RETRIEVAL, self.system.headline))]
-        rankings = rank_by_scores(shortlist, padded_scores, final_scores, self.system.ties)
-        cut = lambda ranking: Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])  # noqa: E731
-        return cut(rankings[self.system.headline]), cut(rankings[RETRIEVAL])
+        headline = self.system.headline
+        rankings = rank_by_scores(shortlist, padded_scores, [self.system.final_scores[headline]], self.system.ties)
+        return Ranked(rankings[headline].rows[:, : len(rows)], rankings[headline].scores[:, : len(rows)])
 
 
 def match_and_score(

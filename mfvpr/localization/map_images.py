@@ -248,8 +248,8 @@ class MapImages:
         """
         before = len(self)
         if not self._is_checked and (content := self._file.part("recipe")) is not None:
-            kept, now = json.loads(content), json.loads(json.dumps(self._recipe))
-            if differing := " and ".join(name for name in now if kept.get(name) != now[name]):
+            stored, recipe = json.loads(content), json.loads(json.dumps(self._recipe))
+            if differing := " and ".join(name for name in recipe if stored.get(name) != recipe[name]):
                 fix = "Use the settings that it was made with, or name another folder"
                 raise InputError(f"{self.folder}: this map was made with another {differing}. {fix}.")
             self._is_checked = True

@@ -1,4 +1,4 @@
-"""What a map keeps in its file beside images: its settings, and the confidence that is fitted on a drive."""
+"""Parts of a map's file beside its images: settings, and the confidence that is fitted on a drive."""
 
 import json
 import warnings
@@ -16,13 +16,13 @@ from mfvpr.evaluation.confidence import (
     REFUSALS,
     CalibrationData,
     Confidence,
-    absent_rankings,
+    absent_ranking,
     calibration_data,
     confidence_from_json,
 )
 from mfvpr.evaluation.dataset_ranking import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
-from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import Note, System
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import MapFile
@@ -107,8 +107,8 @@ def data_of_drive(
     if truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
     result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
-    [ranked], [by_retrieval] = result.systems[system.headline], result.systems[RETRIEVAL]
-    absent, _ = absent_rankings(ranked, by_retrieval, truth, threshold)
+    [ranked] = result.systems[system.headline]
+    absent = absent_ranking(ranked, truth, threshold)
 
     def refused(rankings: Ranked) -> Bool[np.ndarray, " queries"]:
         [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
@@ -120,7 +120,7 @@ def data_of_drive(
     shares = [
         (np.sum(part) + _USUAL * usual) / (len(part) + _USUAL) for part, usual in zip(parts, REFUSALS, strict=True)
     ]
-    return calibration_data(ranked, by_retrieval, truth, threshold), (float(shares[0]), float(shares[1]))
+    return calibration_data(ranked, truth, threshold), (float(shares[0]), float(shares[1]))
 
 
 def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
@@ -160,10 +160,13 @@ def read_confidence(file: MapFile, system: System) -> Confidence | None:
     if (part := file.part("confidence")) is None:
         return None
     content = json.loads(part)
-    if content["system"] != _fingerprint(system):
-        got = "that of another system or version; calibrate again"
-        raise InputError(f"{file.folder}: expected the confidence of this map's system, got {got}")
-    return confidence_from_json(content["confidence"])
+    try:
+        if content["system"] == _fingerprint(system):
+            return confidence_from_json(content["confidence"])
+    except (LookupError, TypeError):  # of another version
+        pass
+    got = "that of another system or version; calibrate again"
+    raise InputError(f"{file.folder}: expected the confidence of this map's system, got {got}")
 
 
 def _fingerprint(system: System) -> str | None:

@@ -152,8 +152,15 @@ def winograd(
 
 
 def _convolve(x: Array, kernel: Array, above: int, dilation: int) -> Array:
-    padding, dilations, axes = ((above, above), (dilation, dilation)), (dilation, dilation), ("NHWC", "HWIO", "NHWC")
-    return lax.conv_general_dilated(x, kernel, (1, 1), padding, None, dilations, axes, precision=PRECISION)
+    return lax.conv_general_dilated(
+        x,
+        kernel,
+        (1, 1),
+        padding=((above, above), (dilation, dilation)),
+        rhs_dilation=(dilation, dilation),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        precision=PRECISION,
+    )
 
 
 def _combine(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[Array]:

@@ -1,7 +1,7 @@
 """The report of an evaluation in memory: recall, confidences of the first predictions, and their tables."""
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from mfvpr.evaluation.confidence import (
     CalibrationData,
     Confidence,
     PrecisionRecall,
-    absent_rankings,
+    absent_ranking,
     calibration_data,
     chance_calibration_error,
     precision_recall,
@@ -26,7 +26,7 @@ from mfvpr.evaluation.confidence import (
 )
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
-from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
+from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import Table
 from mfvpr.utils.errors import InputError
@@ -146,12 +146,12 @@ class EvaluationReport:
         probabilities = {name: np.full((2, self.num_queries), np.nan) for name in names if name in self.ranked.systems}
         for name, (present, absent) in probabilities.items():
             if self.confidences is not None:
-                fitted, pairs = self.confidences[name], [*self._pairs(name)]
-                present[:] = np.concatenate([fitted(*pair) for pair in pairs])
+                fitted, rankings = self.confidences[name], self.ranked.systems[name]
+                present[:] = np.concatenate([fitted(ranked) for ranked in rankings])
                 if self.thresholds:
-                    parts = zip(pairs, self._truths, strict=True)
-                    without = [absent_rankings(*pair, truth, self.threshold) for pair, truth in parts]
-                    absent[:] = np.concatenate([fitted(*pair) for pair in without])
+                    parts = zip(rankings, self._truths, strict=True)
+                    without = [absent_ranking(ranked, truth, self.threshold) for ranked, truth in parts]
+                    absent[:] = np.concatenate([fitted(ranked) for ranked in without])
                 continue
             for half in self.path_halves():
                 tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
@@ -171,8 +171,8 @@ class EvaluationReport:
         """Data that the confidence of a system is fitted on, by system; nothing without ground truth."""
         calibration = {}
         for name in self.ranked.systems if self.thresholds else ():
-            pairs = zip(self._pairs(name), self._truths, strict=True)
-            parts = [calibration_data(*pair, truth, self.threshold) for pair, truth in pairs]
+            pairs = zip(self.ranked.systems[name], self._truths, strict=True)
+            parts = [calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
             calibration[name] = CalibrationData(*map(np.concatenate, zip(*parts, strict=True)))
         return calibration
 
@@ -205,10 +205,6 @@ class EvaluationReport:
         if system in self.probabilities:
             values["confidence"] = self.probabilities[system]
         return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
-
-    def _pairs(self, system: str) -> Iterator[tuple[Ranked, Ranked]]:
-        """Rankings of each sequence by a system, and by retrieval."""
-        return zip(self.ranked.systems[system], self.ranked.systems[RETRIEVAL], strict=True)
 
     @property
     def _truths(self) -> list[Truth]:

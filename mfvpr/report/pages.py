@@ -39,7 +39,8 @@ from mfvpr.utils.errors import InputError
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
-_TABLES = ("table", "differences", "confidence", "rerank_share", "precision_recall", "changes", "skipped")
+_WITH_TRUTH = ("table", "differences", "confidence", "rerank_share", "precision_recall")  # tables
+_OF_SOME = ("changes", "skipped")  # tables that not every run has
 _SIZES = {"queries": "queries", "database": "database images", "candidates": "candidates of a query"}
 _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
@@ -51,7 +52,7 @@ class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`; `common` is one of them, for values that all share.
+        results: rows of `results.json`.
         about: the content of `run.json`.
         tables: of CSV files, by name without suffix.
         systems: names in the order of the results; the `headline` decides.
@@ -66,7 +67,6 @@ class Run:
 
     folder: Path
     results: Sequence[Mapping[str, Any]]
-    common: Mapping[str, Any]
     about: Mapping[str, Any]
     tables: Mapping[str, Table]
     systems: Sequence[str]
@@ -78,6 +78,11 @@ class Run:
     sequence_of: Int[np.ndarray, " queries"]
     places: Int[np.ndarray, " queries"]
     ranks: Mapping[str, Int[np.ndarray, " queries"]]
+
+    @property
+    def common(self) -> Mapping[str, Any]:
+        """Values that all rows of the results share, among others."""
+        return self.results[0]
 
     def hits(self, system: str, k: int = 1, sequence: int | None = None) -> Bool[np.ndarray, " queries"]:
         """In the order of the path, whether one of the first k candidates is correct; `sequence` None = of all."""
@@ -139,9 +144,8 @@ def read_run(folder: Path) -> Run:
         headline = next(row["system"] for row in results if row["decides"])
         parts, truth = dict.fromkeys(row.get("sequence", row["dataset"]) for row in results), results[0]["ground_truth"]
         sequences, thresholds = [name for name in parts if name not in MEANS], truth.get("thresholds", [])
-        files = {name: folder / f"{name}.csv" for name in _TABLES}
-        needed = () if not thresholds else _TABLES[:5]  # other tables are of some runs alone
-        tables = {name: read_table(file) for name, file in files.items() if name in needed or file.exists()}
+        names = [*_WITH_TRUTH] if thresholds else []
+        names += [name for name in _OF_SOME if (folder / f"{name}.csv").exists()]
         within = threshold_words(truth["unit"], middle(thresholds)) if thresholds else ""
         lines, sequence_of = list[dict[str, str]](), list[int]()
         for number in range(len(sequences) if thresholds else 0):
@@ -149,9 +153,21 @@ def read_run(folder: Path) -> Run:
             sequence_of += [number] * (len(lines) - len(sequence_of))
         queries, places = [line["query"] for line in lines], np.array([line["place"] for line in lines], int)
         ranks = {name: np.array([line[f"{name} rank"] or 0 for line in lines], int) for name in systems if lines}
-        names = systems, headline, sequences, thresholds, within
-        of_queries = queries, np.array(sequence_of, int), places, ranks
-        return Run(folder, results, results[0], about, tables, *names, *of_queries)
+        return Run(
+            folder,
+            results,
+            about,
+            tables={name: read_table(folder / f"{name}.csv") for name in names},
+            systems=systems,
+            headline=headline,
+            sequences=sequences,
+            thresholds=thresholds,
+            within=within,
+            queries=queries,
+            sequence_of=np.array(sequence_of, int),
+            places=places,
+            ranks=ranks,
+        )
 
 
 def _read_json(path: Path) -> Any:

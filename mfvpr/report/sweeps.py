@@ -274,9 +274,9 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
         panel.tick_params("x", rotation=30)
     corner = best[second] - 0.5, best[first] - 0.5
     panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))
-    own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
-    if own[first] in values[first] and own[second] in values[second]:
-        place = values[second].index(own[second]), values[first].index(own[first])
+    defaults = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
+    if defaults[first] in values[first] and defaults[second] in values[second]:
+        place = values[second].index(defaults[second]), values[first].index(defaults[first])
         panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=MARK)
     fixed = [f"{name} = {values[name][place]}" for name, place in best.items() if name not in ("", first, second)]
     panel.set_title("; ".join([_label(outcome), *fixed]), fontsize=9, parse_math=False)

@@ -213,7 +213,7 @@ def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or several, by name: a weight is a word, null is no limit, a list a tuple of numbers."""
-    made = {}
+    scorers = {}
     for name, values in expand_weights(settings).items():
         scorer, plain = SCORERS[values["method"]], without(values, "method")
         known = parameters_of(scorer)
@@ -222,8 +222,8 @@ def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
             for field, value in plain.items()
         }
         with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
-            made[name] = scorer(**options)
-    return made
+            scorers[name] = scorer(**options)
+    return scorers
 
 
 @contextmanager

@@ -118,9 +118,6 @@ def _retrieval() -> dict[str, dict[str, Any]]:
     known |= {"vlad": settings_of(features.VladFitting), "same": {}, "import": without(files, "image_size")}
     for name in ("gem", "dinov2"):
         del known[name]["components"]
-    for name, side in (("mixvpr", 320), ("ssm", 224)):
-        rule = Rule(lambda size, side=side: [*size] == [side, side], f"[{side}, {side}], as its network takes no other")
-        known[name]["image_size"] = Setting([side, side], rule, "width, height")
     known["dinov2"] |= {
         "image_size": Setting([224, 224], SIZE, "width, height, multiples of 14"),
         "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),

@@ -22,11 +22,9 @@ from mfvpr.evaluation import (
     reliability,
     write_confidences,
 )
-from mfvpr.evaluation.confidence import absent_rankings, chance_calibration_error
+from mfvpr.evaluation.confidence import absent_ranking, chance_calibration_error
 from mfvpr.report.evaluations import EvaluationReport, recalls_by_share
 from mfvpr.utils import InputError
-
-NAMES = ("margin", "height", "retrieval", "score")
 
 
 def rank_by_scores(scores, rows):
@@ -39,22 +37,20 @@ def rank_by_scores(scores, rows):
 
 
 @pytest.fixture(scope="module")
-def rankings():
-    """Rankings of a system and of retrieval: 30 queries, 20 of 60 images; lists are short, empty, or of one place."""
+def ranking():
+    """30 queries, 20 of 60 images; lists are short, empty, or of one place."""
     rng = np.random.default_rng(0)
     rows = np.argsort(rng.random((30, 60)), axis=1)[:, :20]
     rows[rng.random(rows.shape) < 0.1] = -1
     rows[3] = -1
     rows[4] = np.arange(20) // 5
-    scores = rng.gamma(2.0, 5.0, (2, 30, 20))
-    return rank_by_scores(scores[0], rows), rank_by_scores(scores[1], rows)
+    return rank_by_scores(rng.gamma(2.0, 5.0, (30, 20)), rows)
 
 
 @pytest.mark.parametrize("apart", [0, 5])
-def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
-    system, by_retrieval = rankings
-    inputs = confidence_inputs(system, by_retrieval, inputs=NAMES, apart=apart)
-    for query, (rows, scores) in enumerate(zip(system.rows.tolist(), system.scores.tolist(), strict=True)):
+def test_inputs_are_those_of_loops_over_candidates(ranking, apart):
+    inputs = confidence_inputs(ranking, apart=apart)
+    for query, (rows, scores) in enumerate(zip(ranking.rows.tolist(), ranking.scores.tolist(), strict=True)):
         if rows[0] < 0:
             assert np.isnan(inputs[query]).all()
             continue
@@ -64,19 +60,17 @@ def test_inputs_are_those_of_loops_over_candidates(rankings, apart):
         spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(elsewhere) + 2))
         margin = math.log(1 + (scores[0] - max(elsewhere)) / spread) if elsewhere else math.inf
         height = math.log(1 + (scores[0] - statistics.fmean(elsewhere)) / spread) if elsewhere else math.inf
-        place = [row >= 0 and abs(row - rows[0]) <= apart for row in by_retrieval.rows[query].tolist()]
-        expected = [margin, height, -math.log(1 + place.index(True)), math.asinh(scores[0])]
-        np.testing.assert_allclose(inputs[query], expected, rtol=1e-9)
-    assert np.isinf(inputs[4, :2]).all() == (apart == 5)
+        np.testing.assert_allclose(inputs[query], [margin, height], rtol=1e-9)
+    assert np.isinf(inputs[4]).all() == (apart == 5)
 
 
 def test_scores_that_are_all_equal_are_sure_of_nothing():
     rows = np.arange(20)[None]
     same = Ranked(rows, np.full((1, 20), 7.0))
-    assert confidence_inputs(same, same).tolist() == [[0.0, 0.0]]
+    assert confidence_inputs(same).tolist() == [[0.0, 0.0]]
     alone = Ranked(rows, np.where(rows == 0, 7.0, 3.0))  # above 14 of other places without a spread of their own
     spread = math.sqrt(2 * 16 * 0.05 * 0.95 / 16)
-    np.testing.assert_allclose(confidence_inputs(alone, alone), np.log1p(4 / spread))
+    np.testing.assert_allclose(confidence_inputs(alone), np.log1p(4 / spread))
 
 
 @pytest.mark.parametrize("num_others", [1, 2])
@@ -88,17 +82,17 @@ def test_few_candidates_of_other_places_make_no_answer_certain(num_others):
     scores[:, 0] = np.where(correct, 3.0, scores[:, 0])
     rows = np.concatenate([np.zeros((200, 1)), 10 * np.arange(1, 50) + np.zeros((200, 1))], axis=1).astype(int)
     many = Ranked(rows, scores)
-    model = fit_confidence(confidence_inputs(many, many), correct)
+    model = fit_confidence(confidence_inputs(many), correct)
     few = Ranked(np.array([[0, 100, 200][: 1 + num_others]]), np.array([[2.2, 2.0, 1.8][: 1 + num_others]]))
-    assert 0.02 < model(few, few)[0] < 0.7
+    assert 0.02 < model(few)[0] < 0.7
     place = Ranked(np.arange(4)[None], np.array([[2.2, 2.1, 2.0, 1.9]]))  # no other: what is known of all predictions
-    assert model(place, place)[0] == pytest.approx(special.expit(model.bias))
+    assert model(place)[0] == pytest.approx(special.expit(model.bias))
 
 
 @pytest.mark.parametrize(("tolerance", "around"), [(0, 5), (1, 5), (2, 10)])
 def test_an_absent_place_is_five_times_as_far_as_a_correct_prediction_at_least_five_frames(tolerance, around):
     ranked = Ranked(np.arange(30)[None], -np.arange(30.0)[None])
-    absent, _ = absent_rankings(ranked, ranked, FrameTruth(((0,),), 30), tolerance)
+    absent = absent_ranking(ranked, FrameTruth(((0,),), 30), tolerance)
     assert absent.rows[0, : 29 - around].tolist() == list(range(around + 1, 30))
     assert (absent.rows[0, 29 - around :] == -1).all()
 
@@ -153,26 +147,26 @@ def test_where_all_answers_are_right_or_wrong_p_is_not_certain(correct):
         fit_confidence(np.full((2, 2), np.nan), np.zeros(2, bool))
 
 
-def test_what_is_written_is_read(rankings, tmp_path):
-    values = confidence_inputs(*rankings, inputs=NAMES, apart=3)
-    model = fit_confidence(values, values[:, 0] > 0.3, inputs=NAMES, apart=3)
-    assert np.isnan(model(*rankings)).sum() == 1
+def test_what_is_written_is_read(ranking, tmp_path):
+    values = confidence_inputs(ranking, apart=3)
+    model = fit_confidence(values, values[:, 0] > 0.3, apart=3)
+    assert np.isnan(model(ranking)).sum() == 1
     write_confidences(tmp_path / "confidence.json", {"histogram + retrieval": model}, {"dataset": "ä"})
     systems, recipe = read_confidences(tmp_path / "confidence.json")
     assert (systems, recipe) == ({"histogram + retrieval": model}, {"dataset": "ä"})
-    np.testing.assert_array_equal(systems["histogram + retrieval"](*rankings), model(*rankings))
+    np.testing.assert_array_equal(systems["histogram + retrieval"](ranking), model(ranking))
 
 
 def broken(**changes):
-    confidence = {"inputs": ["margin"], "apart": 5, "center": [0.0], "scale": [1.0], "weights": [1.0], "bias": 0.0}
+    confidence = {"apart": 5, "center": [0.0, 0.0], "scale": [1.0, 1.0], "weights": [1.0, 1.0], "bias": 0.0}
     content = {"histogram": confidence | {"refusals": [0.2, 0.5]} | changes}
-    return json.dumps({"format": "mfvpr confidence 2", "made": {}, "systems": content})
+    return json.dumps({"format": "mfvpr confidence 3", "made": {}, "systems": content})
 
 
 @pytest.mark.parametrize(
     "content",
-    ["", "[]", '{"format": 3}', broken(inputs=["else"]), broken(center=[0, 1]), broken(scale=[0]), broken(more=[1]),
-     broken(bias=float("nan")), broken(weights=["a"]), broken(bias=None)],
+    ["", "[]", '{"format": 3}', broken(center=[0]), broken(scale=[1, 0]), broken(more=[1]), broken(weights=[1, -1]),
+     broken(bias=float("nan")), broken(weights=["a", 1]), broken(bias=None), broken(refusals=[0, 2])],
 )  # fmt: skip
 def test_other_files_are_refused_in_one_line(content, tmp_path):
     path = tmp_path / "confidence.json"

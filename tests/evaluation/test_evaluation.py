@@ -96,8 +96,7 @@ def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several)
     """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
     result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
     report = EvaluationReport(result, [0, 1], [1])
-    predictions, by_retrieval = result.systems["count"], result.systems["retrieval"]
-    inputs = np.concatenate([confidence_inputs(*pair) for pair in zip(predictions, by_retrieval, strict=True)])
+    inputs = np.concatenate([confidence_inputs(ranked) for ranked in result.systems["count"]])
     correct, halved = report.hits("count"), halves(dataset.truth.positives(1))
     for half in halved:
         fitted = fit_confidence(inputs[half.tune], correct[half.tune])

@@ -1,4 +1,4 @@
-"""What to learn on: queries to train on and to validate on, of one half of a path or of several joined data sets."""
+"""Queries to train on and to validate on, of one half of a path or of several joined data sets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
