@@ -165,7 +165,7 @@ def describe_folder(
             elif skip_bad:
                 bad[row] = str(image)
             else:
-                raise InputError(f"{image}, or skip bad images")
+                raise InputError(f"{image}, or set on_bad_image=skip (Python: FeatureCache(skip_bad=True))")
 
     images = readable()
     while batch := list(itertools.islice(images, extractor.batch_size)):

@@ -180,7 +180,7 @@ def _reading(folder: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, LookupError, TypeError, AttributeError, OSError, SyntaxError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = error.strerror if isinstance(error, OSError) else " ".join(f"{type(error).__name__}: {error}".split())
         raise InputError(f"{folder}: expected the run folder of an evaluation of this version ({reason})") from None
 
 

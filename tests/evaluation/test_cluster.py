@@ -117,7 +117,7 @@ def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path)
     (tmp_path / "bad.png").write_bytes(b"no image")
     folder = mfvpr.datasets.image_folder(tmp_path)
     for runtime in (Runtime(), Runtime(cluster=cluster)):
-        with pytest.raises(InputError, match=r"bad\.png: .*, or skip bad images") as raised:
+        with pytest.raises(InputError, match=r"bad\.png: .*, or set on_bad_image=skip") as raised:
             FeatureCache(tmp_path / "store", runtime=runtime).local(folder, SIFT)
         assert "\n" not in str(raised.value)
     cache = FeatureCache(tmp_path / "store", skip_bad=True, runtime=runtime)
