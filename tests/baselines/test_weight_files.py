@@ -96,7 +96,7 @@ def test_weights_of_the_package_have_a_provenance(name):
     assert weights.std() > 0.01
     path = Path(mfvpr.__file__).parent / "baselines" / "learned" / f"{name}.json"
     assert provenance(name) == read_weight(path)[1]
-    assert provenance(name)["command"].startswith("mfvpr learn dataset=streets:seed=")
+    assert provenance(name)["command"].startswith("python -m experiments.learn dataset=streets:seed=")
     assert not re.search(r"/(home|root|work|tmp|Users)/", path.read_text())
 
 
