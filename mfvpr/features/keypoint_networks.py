@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -20,10 +21,23 @@ from mfvpr.networks import aliked, d2net
 from mfvpr.networks.layers import Preprocessing
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, SHAPED_SIZE, SIZE, setting, whole, word_of
+from mfvpr.utils.numerics import device_bytes
 
 _PIXELS_PER_SLOT = 40  # of ALIKED; photographs have a keypoint in 65 px at most
 _SHARE = 0.3  # keypoint slots of D2-Net per position of its map; photographs take about a tenth
 _SMALLEST_MAP = 2  # of D2-Net
+
+
+def _without_empty_slots(result: Any, count_of: Callable[[Any], Array]) -> Any:
+    """A batch's result without most of the slots that no image fills: an accelerator returns them slowly."""
+    if device_bytes(()) is None:  # a CPU, where nothing moves
+        return result
+    return _first_slots(result, 256 * math.ceil(np.max(count_of(result)) / 256))  # few sizes: each is a program
+
+
+@partial(jax.jit, static_argnums=1)
+def _first_slots(result: Any, slots: int) -> Any:
+    return jax.tree.map(lambda field: field[:, :slots] if field.ndim > 1 else field, result)
 
 
 @dataclass(frozen=True)
@@ -71,7 +85,12 @@ class AlikedFeatures(NetworkExtractor):
         def extract(model: aliked.Aliked, images: Array, *, capacity: int) -> Any:
             return model.extract(images.astype(jnp.float32) / 255, self.threshold, capacity)
 
-        return cache(lambda capacity: compile_network(self.model, partial(extract, capacity=capacity)))
+        @cache
+        def program(capacity: int) -> Callable[[Any], Any]:
+            run = compile_network(self.model, partial(extract, capacity=capacity))
+            return lambda images: _without_empty_slots(run(images), lambda result: result[0].count)
+
+        return program
 
     def describe_result(self, result: tuple[Any, Float[np.ndarray, "slots dimensions"]]) -> Description:
         detections, descriptors = result
@@ -130,7 +149,13 @@ class D2NetFeatures(NetworkExtractor):
     def _program(self) -> Callable[[float], Callable[..., Any]]:
         """The compiled network for a share of positions that have a keypoint slot."""
         function = partial(d2net.extract, preprocessing=self.preprocessing, scales=self._network_scales)
-        return cache(lambda share: compile_network(self.model, partial(function, share=share)))
+
+        @cache
+        def program(share: float) -> Callable[[Any], Any]:
+            run = compile_network(self.model, partial(function, share=share))
+            return lambda images: tuple(_without_empty_slots(level, lambda level: level.count) for level in run(images))
+
+        return program
 
     def describe_result(self, result: tuple[d2net.Detections, ...]) -> Description:
         keypoints, descriptors, scores = (

@@ -205,7 +205,9 @@ def test_what_does_not_fit_is_counted_and_the_strongest_stay():
     np.testing.assert_allclose(few.descriptors, all_keypoints.descriptors[strongest], atol=1e-6)
 
 
-def test_crowded_images_are_extracted_again(small, images, monkeypatch):
+@pytest.mark.parametrize("memory", [None, 1e9])  # of a CPU, of an accelerator
+def test_crowded_images_are_extracted_again(small, images, monkeypatch, memory):
+    monkeypatch.setattr(keypoint_networks, "device_bytes", lambda _: memory)
     monkeypatch.setattr(keypoint_networks, "_SHARE", 0.01)
     crowded = D2NetFeatures(small.model, small.image_size)
     for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
