@@ -18,7 +18,7 @@ from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Localization, Located, Map, Route
-from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
+from mfvpr.localization.map_images import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
@@ -35,8 +35,8 @@ def build_map(settings: MapBuild) -> None:
     system = assembly.system(settings)
     images = dataset_of(settings.dataset).database
     folder = expand_user(settings.map)
-    robot_map = Map(folder, fit_to_map(folder, system, images, warn))
-    added = robot_map.build(images, track=track("images"))
+    robot_map = Map(folder, fit_to_map(folder, system, images, warn), runtime=Runtime(progress=track))
+    added = robot_map.build(images)
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
 
 
@@ -72,8 +72,9 @@ def localize(settings: Localize) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
     folder, runtime = expand_user(settings.map), Runtime(memory=settings.memory)
     system = read_system(folder)
-    confidence = _confidence(settings, system)
-    robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
+    robot_map = Map(
+        folder, system, confidence=_confidence(settings, system), threshold=settings.threshold, runtime=runtime
+    )
     drive, failed = _Drive(robot_map, settings), 0
     for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):
@@ -91,12 +92,10 @@ def localize(settings: Localize) -> None:
             if localized is not None:
                 drive.add(name, localized, line)
                 drive.draw(number, name, pixels, localized, line)
-        finally:  # the prediction must not be lost if its image cannot be added
+        finally:  # the prediction must not be lost if its image cannot be added or drawn
             print(printable(json.dumps(line, ensure_ascii=False, allow_nan=False)), flush=True)
     if failed:
         raise InputError(f"{failed} of the images could not be localized; their lines say why")
-    if drive.undrawn:
-        raise InputError(f"{drive.undrawn} of the figures could not be drawn; warnings say why")
     if drive.missing:
         names = ",".join(sorted(map(str, drive.missing)))
         raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
@@ -106,14 +105,12 @@ class _Drive:
     """One drive through a map: images are localized, added and drawn one by one."""
 
     def __init__(self, robot_map: Map, settings: Localize) -> None:
-        self._map, self._settings = robot_map, settings
+        self._map, self._settings, figures = robot_map, settings, settings.figures
         advance = None if isinstance(settings.route, str) else settings.route
         tell_route = lambda text: warn(f"route={advance}: {text} (route=auto)")  # noqa: E731
         self._route = None if settings.route is None else Route(Drive(advance), warn=tell_route)
-        figures = settings.figures
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
-        self.undrawn = 0
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
@@ -132,36 +129,28 @@ class _Drive:
 
     def add(self, name: str, localized: Localization, line: dict[str, Any]) -> None:
         """Add an image to the end of the map if the settings say so, unless the map has one of this name."""
-        if not self._settings.add:
-            return
-        features, vector = localized.described
-        is_new = self._map.row(name) is None
-        if is_new:
-            self._map.add_described([Entry(name, name, vector)], [features])
-        line["added"] = is_new
+        if self._settings.add:
+            is_new, (features, vector) = self._map.row(name) is None, localized.described
+            if is_new:
+                self._map.add_described([Entry(name, name, vector)], [features])
+            line["added"] = is_new
 
     def draw(self, number: int, name: str, pixels: Pixels, localized: Localization, line: dict[str, Any]) -> None:
-        """Draw the figure of an image, `number` from 0, if the settings name it; warn if that fails."""
-        settings, names = self._settings, {number, name, PurePath(name).name}
-        if settings.out is None or not self._wanted & names:
+        """Draw the figure of an image, `number` from 0, if the settings name it."""
+        out, names = self._settings.out, {number, name, PurePath(name).name}
+        if out is None or not self._wanted & names:
             return
-        self.missing -= names
-        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
-        path = expand_user(settings.out) / f"{file}.png"
         from mfvpr.report.figures import localization_figure  # here: Matplotlib takes 0.4 s
 
-        try:
-            localization_figure(path, self._map, name, pixels, localized, root=self._root)
-            line["figure"] = str(path)
-        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
-            line["figure"] = None
-            self.undrawn += 1
-            warn(f"{path}: not drawn ({error})")
+        self.missing -= names
+        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+        path = expand_user(out) / f"{file}.png"
+        localization_figure(path, self._map, name, pixels, localized, root=self._root)
+        line["figure"] = str(path)
 
     def entry_without_image(self) -> dict[str, Any]:
         """The route's entry in the line of an image that cannot be read: the robot has moved."""
-        rows = self._map.there
-        rows = rows[: max(0, len(rows) - self._settings.recent)]
+        rows = self._map.there[: max(0, len(self._map) - self._settings.recent)]
         return self._route_entry(self._route and self._route(None, rows))
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:

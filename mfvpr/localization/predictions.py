@@ -54,12 +54,12 @@ class Prediction:
         located: position on the route, if there is one.
     """
 
-    place: Any
-    alternatives: tuple[Alternative, ...] = field(repr=False)
-    score: float
-    confidence: float | None
-    shift: tuple[float, float] | None
-    shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
+    place: Any = None
+    alternatives: tuple[Alternative, ...] = field(default=(), repr=False)
+    score: float = 0.0
+    confidence: float | None = None
+    shift: tuple[float, float] | None = None
+    shift_interval: tuple[tuple[float, float], tuple[float, float]] | None = None
     reason: Reason | None = None
     image_width: int = 0
     located: Located | None = None
@@ -107,8 +107,3 @@ class Localization(NamedTuple):
     prediction: Prediction
     described: Described
     matches: Matches | None
-
-
-def refusal(reason: Reason, described: Described, image_width: int) -> Localization:
-    """A prediction without place and candidates."""
-    return Localization(Prediction(None, (), 0.0, None, None, None, reason, image_width), described, None)

@@ -187,11 +187,9 @@ def _whitening(
     )
     whitening = files.get(key)
     if whitening is None:
-        is_damaged = key in files
-        if is_damaged:
+        if key in files:
             cache.warn(f"{files.path(key)}: is damaged; learned again")
         whitening = learn()
-        files.update({key: whitening}, once=not is_damaged)  # the first of several counts: bits may differ
-        cache.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
-        whitening = files.get(key) or whitening
+        files.update({key: whitening})
+        cache.runtime.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
     return whitening

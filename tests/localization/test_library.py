@@ -14,7 +14,7 @@ from mfvpr.datasets.streets import streets_folder
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import VladFitting
-from mfvpr.localization.map_settings import read_settings
+from mfvpr.localization.map_images import read_settings
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile
 from tests.builders import map_system
@@ -87,14 +87,6 @@ def test_a_robot_off_the_map_has_no_place(street, small_street):
     assert (back[-1].place, back[-1].located.row, back[-1].reason) == ("0008.png", 8, None)
 
 
-def test_what_is_there_is_not_added_again(street, small_street):
-    lines = []
-    runtime = mfvpr.Runtime(log=lines.append)
-    extended = Map.create(street.folder, small_street / "database", street.system, runtime=runtime)
-    assert len(extended) == len(street) == 10
-    assert [line for line in lines if "has 10 of 10 images already, by their names" in line]
-
-
 def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
     """The scores are those of `system=mfvpr` in 0.2.0."""
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
@@ -141,7 +133,7 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
     query = small_street / "queries/0003.png"
     assert known.localize(query).confidence is None
-    with pytest.raises(InputError, match=r"threshold=0\.5: expected a confidence"):
+    with pytest.raises(InputError, match=r"threshold=0\.5: expected .* a confidence"):
         Map.open(tmp_path, threshold=0.5)
     with pytest.raises(InputError, match=r"threshold=1\.5: expected a number from 0 to 1"):
         Map.open(tmp_path, threshold=1.5)
@@ -155,15 +147,6 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert prediction == known.localize(query)
     assert 0 < prediction.confidence < 1
     assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
-
-
-@pytest.mark.slow
-def test_a_confidence_that_tells_nothing_is_a_warning(street, small_street, tmp_path):
-    rows = ["query,database", *(f"{row:04d}.png,{(row + 5) % 10:04d}.png" for row in range(10))]
-    (tmp_path / "far.csv").write_text("\n".join(rows))
-    truth = mfvpr.datasets.IndexFile(tmp_path / "far.csv")
-    with pytest.warns(UserWarning, match=r"scores do not tell correct predictions \(0 of 10\) from"):
-        street.calibrate(small_street / "database", small_street / "queries", ground_truth=truth)
 
 
 @pytest.mark.slow

@@ -8,8 +8,7 @@ import pytest
 from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import Description
-from mfvpr.localization import Map, Prediction, map_images
-from mfvpr.storage.maps import MapFile
+from mfvpr.localization import Map, Prediction
 from tests.builders import map_system
 from tests.localization.test_map import SURE, Constant, opened
 
@@ -17,7 +16,7 @@ pytestmark = pytest.mark.thorough
 
 
 def without_place(reason, image):
-    return Prediction(None, (), 0.0, None, None, None, reason, image.shape[1])
+    return Prediction(reason=reason, image_width=image.shape[1])
 
 
 @pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])
@@ -30,7 +29,8 @@ def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
         image[:, :40] = np.arange(40, 0, -1)[:, None]
     prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
     assert (prediction, matches) == (without_place("too few features", image), None)
-    assert prediction.as_json()["reason"] == "too few features"
+    assert (prediction.as_json()["reason"], prediction.image_width) == ("too few features", 640)
+    assert (prediction.shift_fraction, prediction.shift_angles(60)) == (None, None)
 
 
 def test_strong_features_with_few_matches_have_no_place(folder):
@@ -46,16 +46,6 @@ def test_noise_has_no_place_whatever_the_confidence(folder, grain):
     image = noise_images((160, 120), seeds=(7,), grains=(grain,))[0]
     prediction = opened(folder, confidence=replace(SURE, bias=100.0)).localize(image)
     assert prediction == without_place("no better than noise", image)
-
-
-def test_the_strength_of_a_map_is_of_a_few_of_its_rows(folder, monkeypatch):
-    known, read = opened(folder), []
-    monkeypatch.setattr(MapFile, "features", lambda _, rows: (read.extend(rows), ((row, row) for row in rows))[1])
-    monkeypatch.setattr(map_images, "strength", float)
-    assert known._mean_strength(0) == 0
-    assert known._mean_strength(50) == np.mean(range(50))
-    assert known._mean_strength(1000) == np.mean(range(0, 1000, 16))
-    assert len(read) == len({*read}) < 110
 
 
 @dataclass(frozen=True)

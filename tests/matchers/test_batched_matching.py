@@ -25,7 +25,7 @@ from mfvpr.matchers import MatchSet, NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers.batched_matching import QUERIES
 from mfvpr.matchers.match_set import batches, shapes, slots, split_pairs, split_rows
-from mfvpr.storage.packing import round_as_stored
+from mfvpr.storage.cache_files import round_as_stored
 from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
 
