@@ -50,8 +50,6 @@ def test_a_run_records_the_size_that_the_images_decide(tmp_path):
 @pytest.mark.parametrize(("name", "settings", "words"), [
     ("mix", {}, "Could not find 'system/mix'"),
     ("steering", {"sigma": 3}, "Could not override 'sigma'"),
-    ("steering", {"scorer": {"sgma": 3}}, "Could not override 'scorer.sgma'"),
-    ("steering", {"features": "xfeat"}, "Could not find 'features/xfeat'"),
     ("steering", {"features": "import"}, "^features.image_size=auto: expected a list of 2"),
     ("mfvpr", {"features": "import"}, "^features: files of other programs belong to a data set"),
     ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),
