@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from mfvpr.systems.choices import choices_of
+from mfvpr.systems.assembly import choices_of
 from tests.programs import ROOT, composed, run, small
 
 pytestmark = pytest.mark.thorough

@@ -6,7 +6,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 
 from mfvpr.cli import schema
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.assembly import CONF
 from tests.needs import reason
 from tests.programs import composed, csv_rows, results, run, small
 

@@ -11,7 +11,7 @@ from mfvpr import InputError, load_system
 from mfvpr.cli import evaluation, jobs, programs
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.assembly import CONF
 from mfvpr.utils.fingerprints import recipe_of
 from tests.programs import CANDIDATES, composed, csv_rows, settings_of, small
 
