@@ -16,7 +16,7 @@ from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_mo
 from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_provenance
 from mfvpr.checkpoints.networks import how_to_install
 from mfvpr.cli.command_line import compose_data_sets
-from mfvpr.cli.console import Progress, refuse, track
+from mfvpr.cli.console import progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
 from mfvpr.datasets import Dataset, QuerySequence, image_folder
 from mfvpr.datasets.contents import own_rows
@@ -111,9 +111,9 @@ def download_weights(name: str) -> None:
     else:
         try:
             with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
-                with temporary.open("wb") as file, Progress(entry.file, entry.size or 0) as progress:
-                    while (chunk := response.read(_CHUNK)) and not (entry.size and progress.n > entry.size):
-                        progress.reach(progress.n + file.write(chunk), entry.size or 0)
+                with temporary.open("wb") as file, progress(entry.file, entry.size or 0) as bar:
+                    while (chunk := response.read(_CHUNK)) and not (entry.size and bar.n > entry.size):
+                        bar.update(file.write(chunk))
                 check_sha256(temporary, entry, entry.source)
         except (OSError, HTTPException) as error:
             if isinstance(error, HTTPError):
