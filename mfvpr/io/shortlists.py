@@ -135,7 +135,7 @@ def write_shortlist(
     require_replaceable(path)
     if layout == "preds":
         path.mkdir(parents=True)
-        for row in np.flatnonzero(mask.any(axis=1)):  # the number of a file is the query's row
+        for row in np.flatnonzero(mask.any(axis=1)).tolist():  # the number of a file is the query's row
             parts = [[QUERY, query_names[row]], [PREDICTIONS, *(database_names[i] for i in indices[row][mask[row]])]]
             if positives is not None:
                 parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
