@@ -30,7 +30,7 @@ from mfvpr.storage.cache_files import pack_arrays, round_as_stored, unpack_array
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import SystemSettings
+from mfvpr.systems.assembly import SystemSettings
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values
 from mfvpr.utils.files import canonical_name
