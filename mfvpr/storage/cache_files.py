@@ -22,7 +22,7 @@ import struct
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import lru_cache
@@ -107,47 +107,43 @@ class CacheFiles(Generic[Item]):
                 pass
 
 
-class MatchStore(CacheFiles[QueryMatches]):
-    """Matches of `num_queries` queries by row, of a recipe that determines database, queries, shortlist and matcher."""
+class MatchStore(CacheFiles[QueryMatches], Sequence[Matches]):
+    """Matches of queries by row, of a recipe that determines database, queries, shortlist and matcher.
+
+    As a sequence, every access reads the Matches of a query, as in QueryMatches; slices are not supported.
+    """
 
     def __init__(self, root: Path, recipe: Mapping[str, Any], num_queries: int) -> None:
         # Compressed, since every candidate repeats points of the query: a match takes about 23 bytes instead of 32.
         super().__init__(root, "matches", recipe, pack_matches, unpack_matches, compress=True)
-        self.num_queries = num_queries
+        self._rows = range(num_queries)
 
-    def has_all(self, rows: Iterable[int]) -> bool:
-        """Whether there are files of all rows."""
-        return all(_key(row) in self for row in rows)
+    @property
+    def is_complete(self) -> bool:
+        """Whether there are files of all queries."""
+        return all(_key(row) in self for row in self._rows)
 
-    def read(self, rows: Sequence[int]) -> Iterator[tuple[int, QueryMatches | None]]:
-        """(row, matches) in the order of rows; None if there is no file, or a damaged one."""
-        yield from zip(rows, ordered_map(self.get, map(_key, rows), workers=THREADS), strict=True)
+    def read(self) -> Iterator[QueryMatches | None]:
+        """Matches in the order of rows; None if there is no file, or a damaged one."""
+        return ordered_map(self.get, map(_key, self._rows), workers=THREADS)
 
     def write(self, queries: Mapping[int, QueryMatches]) -> None:
         """Write matches by row; see `CacheFiles.update`."""
         self.update({_key(row): query for row, query in queries.items()})
 
-
-class StoredMatches(Sequence[Matches]):
-    """Matches of queries of a store, as in QueryMatches: every access reads them; slices are not supported."""
-
-    def __init__(self, store: MatchStore, rows: Sequence[int]) -> None:
-        self._store, self._rows = store, rows
-
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, query: Any) -> Matches:
-        return next(self._read([self._rows[query]]))
+    def __getitem__(self, row: Any) -> Matches:
+        return self._matches(self.get(_key(self._rows[row])))
 
     def __iter__(self) -> Iterator[Matches]:
-        return self._read(self._rows)
+        return map(self._matches, self.read())
 
-    def _read(self, rows: Sequence[int]) -> Iterator[Matches]:
-        for row, query in self._store.read(rows):
-            if query is None:
-                raise InputError(f"{self._store.folder}: matches of row {row} were removed or damaged; run again")
-            yield query.matches
+    def _matches(self, query: QueryMatches | None) -> Matches:
+        if query is None:
+            raise InputError(f"{self.folder}: matches were removed or damaged meanwhile; run again")
+        return query.matches
 
 
 def _key(row: int) -> str:

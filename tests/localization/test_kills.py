@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,6 +147,7 @@ def test_a_map_that_may_only_be_read(tmp_path):
 
 def fill(disk, street):
     """Add images until the disk is full, localize, and go on when it has grown."""
+    disk, street = Path(disk), Path(street)
     images, system = image_folder(street / "database"), map_system(SMALL_SIFT, VladFitting(num_words=8))
     mount(disk, "-o", "size=600k")
     known = Map(disk / "map", system)
@@ -171,6 +173,6 @@ def test_on_a_full_disk_images_stay_and_adding_goes_on(tmp_path):
     need_small_disks(tmp_path)
     street = streets_folder(tmp_path / "data", num_frames=12, image_size=(160, 120))
     (tmp_path / "disk").mkdir()
-    code = f"from tests.localization.test_kills import *; fill(Path({str(tmp_path / 'disk')!r}), Path({str(street)!r}))"
+    code = f"from tests.localization.test_kills import fill; fill({str(tmp_path / 'disk')!r}, {str(street)!r})"
     done = subprocess.run([*UNSHARE, sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

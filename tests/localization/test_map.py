@@ -17,7 +17,7 @@ from mfvpr.localization import Map
 from mfvpr.localization import map as map_module
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.maps import MapFile, check_entry
+from mfvpr.storage.maps import check_entry
 from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, map_system
@@ -204,18 +204,6 @@ def test_a_map_of_other_settings_is_refused(folder):
     ):
         with pytest.raises(InputError, match=f"made with {words}. Use what"):
             Map(folder, map_system(extractor, describer))
-
-
-def test_the_least_recently_used_features_make_room(folder, monkeypatch):
-    read, features = [], MapFile.features
-    known = opened(folder)
-    monkeypatch.setattr(MapFile, "features", lambda self, rows: (read.extend(rows), features(self, rows))[1])
-    known._free_bytes = 3.5 * sum(leaf.nbytes for leaf in jax.tree.leaves(known._read_features([0])[0]))
-    known._features.clear()
-    read.clear()
-    for rows in ([0, 1, 2], [0, 3], [0], [1], [2, 3]):
-        assert [len(each.scores) for each in known._read_features(rows)] == [60] * len(rows)
-    assert read == [0, 1, 2, 3, 1, 2]
 
 
 JSON = "expected a place that JSON can say"

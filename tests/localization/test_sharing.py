@@ -2,7 +2,7 @@
 
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,32 +67,6 @@ def test_builders_share_one_vocabulary(images, tmp_path):
     assert again.names == list(images.names)
 
 
-@dataclass(frozen=True)
-class Counting(Constant):
-    """Counts the images that it gets."""
-
-    calls: list = field(default_factory=list, compare=False, metadata={"recipe": False})
-
-    def __call__(self, images):
-        self.calls.extend(range(len(images)))
-        return super().__call__(images)
-
-
-def test_the_vocabulary_is_learned_from_the_features_that_are_added(images, tmp_path):
-    extractor, maps = Counting(), []
-    for name in ("at once", "one after the other"):
-        maps.append(opened(tmp_path / name, extractor, VladFitting(num_words=2)))
-        if name == "one after the other":
-            maps[-1].learn(images)
-        extractor.calls.clear()
-        assert maps[-1].build(images) == len(images)
-        assert len(extractor.calls) == len(images)
-        assert not (tmp_path / name / ".features").exists()
-    predictions = [[known.localize(path) for path in images.paths] for known in maps]
-    assert predictions[0] == predictions[1]
-    assert maps[0].names == maps[1].names
-
-
 def test_nothing_is_written_of_rows_that_cannot_be_stored(images, folder):
     known = opened(folder)
     features, vector = known.describing.image(images.paths[6])
@@ -118,13 +92,3 @@ def test_an_open_map_whose_file_was_replaced_stays_as_it_is_and_takes_no_images(
     with pytest.raises(InputError, match=r"map\.sqlite: cannot be used"):
         known.add(images.paths[7], 7)
     assert opened(folder).names == list(images.names[:2])
-
-
-def test_a_map_stays_where_it_is_when_the_working_directory_changes(images, folder, monkeypatch):
-    monkeypatch.chdir(folder.parent)
-    known = opened(folder.name)
-    monkeypatch.chdir("/")
-    opened(folder).add(images.paths[6], "new", name="new")
-    assert known.localize(images.paths[6]).place == "new"
-    known.add(images.paths[7], "newer", name="newer")
-    assert opened(folder).names == known.names
