@@ -90,10 +90,8 @@ class Map(MapImages):
         Args:
             folder: of the map.
             system: extracts local features of one scale, and retrieves candidates by global descriptors: of an
-                extractor, or aggregated from the local features by a vocabulary, which is learned once (`learn`, or
-                `build`) and stored in the folder. The ranking that decides may combine scores.
-            confidence: gives the probability that the top prediction is correct, as an evaluation with the same system
-                wrote it; None = that of `calibrate`, or no probability.
+                extractor, or aggregated by a vocabulary, which is learned once (`learn`, or `build`) and stored.
+            confidence: gives the probability that the top prediction is correct; None = that of `calibrate`, or none.
             threshold: of the confidence, below which there is no place.
             runtime: memory that features may take, progress, and messages.
 
@@ -292,9 +290,8 @@ def match_and_score(
     """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
 
     Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
-    on the other pairs. A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes
-    a few pairs at a time. `typical` is a usual number of keypoints, or the detector's limit. If no score is finite, an
-    InputError is raised.
+    on the other pairs. Each core takes a few pairs at a time, since the steps after a pair's product keep one core
+    busy. `typical` is a usual number of keypoints, or the detector's limit. An InputError if no score is finite.
     """
     padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
     by_size = defaultdict[int, list[int]](list)

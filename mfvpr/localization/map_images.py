@@ -286,8 +286,7 @@ class MapImages:
     def refresh(self) -> int:
         """Read the images that other processes added since; return their number.
 
-        Raises:
-            InputError: the map was made with other settings, or is damaged.
+        An InputError if the map was made with other settings, or is damaged.
         """
         before = len(self)
         for part, now in () if self._is_checked else self._parts.items():

@@ -11,18 +11,12 @@ from mfvpr.utils.errors import InputError
 
 
 class Located(NamedTuple):
-    """The position of a robot on a route.
+    """The position of a robot on a route."""
 
-    row: of the map, the most probable one; None = the robot is off the map.
-    p: probability that the robot is there or at most 2 rows away.
-    advance: mean motion from one image to the next, rows.
-    off: probability that the robot is not on the map.
-    """
-
-    row: int | None
-    p: float
-    advance: float
-    off: float
+    row: int | None  # of the map, the most probable one; None = the robot is off the map
+    p: float  # probability that the robot is there or at most 2 rows away
+    advance: float  # mean motion from one image to the next, rows
+    off: float  # probability that the robot is not on the map
 
 
 @dataclass(frozen=True)
@@ -97,13 +91,8 @@ class Prediction:
 
 
 class Localization(NamedTuple):
-    """A prediction with the features and matches that led to it.
-
-    prediction: to the query.
-    described: features and global descriptor of the query, with which it can be added to the map.
-    matches: with the best candidate, `[K, ...]`, NumPy; None if there is none.
-    """
+    """A prediction with the features and matches that led to it."""
 
     prediction: Prediction
-    described: Described
-    matches: Matches | None
+    described: Described  # features and global descriptor of the query, with which it can be added to the map
+    matches: Matches | None  # with the best candidate, `[K, ...]`, NumPy; None if there is none

@@ -11,16 +11,19 @@ from PIL import Image
 import mfvpr
 from mfvpr.core.types import Features
 from mfvpr.evaluation import Confidence
+from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.stages import explain
+from mfvpr.evaluation.system import noise_images
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
-from mfvpr.localization import Map
+from mfvpr.localization import Map, Prediction
 from mfvpr.localization import map as map_module
+from mfvpr.localization.map import match_and_score
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import check_entry
 from mfvpr.utils import InputError
 from tests import scorers
-from tests.builders import evaluate_parts, map_system
+from tests.builders import evaluate_parts, make_features, map_system
 from tests.core.test_types import Tensor as TensorWithGradient
 from tests.programs import snapshot
 
@@ -28,6 +31,14 @@ pytestmark = pytest.mark.thorough
 
 SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
 SURE = Confidence(1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(dataset, tmp_path_factory):
+    """A map of the database, whose places are rows."""
+    folder = tmp_path_factory.mktemp("maps") / "map"
+    Map(folder, map_system(SIFT, VLAD)).build(dataset.database, list(range(len(dataset.database))))
+    return folder
 
 
 def opened(folder, *, scorer=None, candidates=5, **options):
@@ -291,3 +302,79 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
         known.add(dataset.queries.paths[0], "a query", name="q")
         for image in (*dataset.database.paths, dataset.queries.paths[0]):
             assert len(known.localize(image).alternatives) == 3
+
+
+# Images without a place
+
+
+def without_place(reason, image):
+    return Prediction(reason=reason, image_width=image.shape[1])
+
+
+@pytest.mark.parametrize("kind", ["black", "gray", "dark noise", "lens cap"])
+def test_images_of_nothing_have_no_place_whatever_the_confidence(folder, kind):
+    rng, values = np.random.default_rng(0), {"black": 0, "gray": 90, "dark noise": 5}
+    image = np.full((480, 640, 3), values.get(kind, 0), np.uint8)
+    if kind == "dark noise":
+        image += rng.integers(0, 5, image.shape, np.uint8)
+    if kind == "lens cap":  # with a little light at its rim
+        image[:, :40] = np.arange(40, 0, -1)[:, None]
+    prediction, _, matches = opened(folder, confidence=replace(SURE, bias=100.0)).localize_with_evidence(image)
+    assert (prediction, matches) == (without_place("too few features", image), None)
+    assert (prediction.as_json()["reason"], prediction.image_width) == ("too few features", 640)
+    assert (prediction.shift_fraction, prediction.shift_angles(60)) == (None, None)
+
+
+def test_strong_features_with_few_matches_have_no_place(folder):
+    image = np.zeros((120, 160, 3), np.uint8)
+    image[40:60, 70:95] = 255
+    prediction, (features, _), matches = opened(folder, confidence=SURE).localize_with_evidence(image)
+    assert 0 < len(features.scores) < LEAST_MATCHES
+    assert (prediction, matches) == (without_place("too few matches", image), None)
+
+
+@pytest.mark.parametrize("grain", [1, 3])
+def test_noise_has_no_place_whatever_the_confidence(folder, grain):
+    image = noise_images((160, 120), seeds=(7,), grains=(grain,))[0]
+    prediction = opened(folder, confidence=replace(SURE, bias=100.0)).localize(image)
+    assert prediction == without_place("no better than noise", image)
+
+
+@dataclass(frozen=True)
+class Bright(Constant):
+    """Keypoints as strong as the image is bright."""
+
+    def describe(self, image):
+        vector, (features,) = super().describe(image)
+        return Description(vector, (replace(features, scores=np.full(9, image.max() / 255, np.float32)),))
+
+
+def test_rows_that_are_left_out_do_not_say_how_strong_a_query_must_be(tmp_path):
+    rng, known = np.random.default_rng(0), Map(tmp_path / "map", map_system(Bright(), Bright(), candidates=3))
+    images = [rng.integers(0, 2 if row < 3 else 256, (3, 4, 3), np.uint8) for row in range(8)]
+    images = [image.repeat(4, axis=0).repeat(4, axis=1) for image in images]
+    for row, image in enumerate(images):
+        known.add(image, row, name=str(row))
+    assert known.localize(images[0]).reason == "too few features"
+    assert known.localize_with_evidence(images[0], before=3).prediction.place == 0
+
+
+# Matches and scores
+
+
+def test_a_pair_is_padded_by_its_own_keypoints_and_is_the_same_alone():
+    rng, sizes = np.random.default_rng(0), set()
+
+    def matcher(query, candidate):
+        sizes.add((len(query.mask), len(candidate.mask)))
+        return mfvpr.match(query, candidate, with_ratio=True)
+
+    query, scorers = make_features(rng, 40), {"it": mfvpr.MatchCount()}
+    images = [make_features(rng, count) for count in (600, *[300] * 9)]
+    matches, scores = match_and_score(query, images, matcher, scorers, 300)
+    assert sizes == {(256, 320), (256, 1024)}
+    for number in (0, 1, 9):
+        [alone], alone_scores = match_and_score(query, [images[number]], matcher, scorers, 300)
+        np.testing.assert_array_equal(alone.points1, matches[number].points1)
+        np.testing.assert_array_equal(alone_scores["it"], scores["it"][[number]])
+        assert matches[number].mask.any()

@@ -1,14 +1,16 @@
-"""Compiled programs stay on disk between processes, for one processor and version."""
+"""Compiled programs stay on disk between processes, for one processor and version; processors and memory."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from mfvpr.utils import compiled_programs, numerics
+from mfvpr.utils.numerics import available_cpus, free_host_bytes
 from tests.programs import ROOT
 
 PROGRAM = """
@@ -120,3 +122,17 @@ def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path
     folders.append(compiled_programs._folder())
     assert folders[0] == folders[2]
     assert len({*folders}) == 4
+
+
+def test_any_system_has_free_memory(monkeypatch):
+    assert free_host_bytes() > 10**7
+    monkeypatch.setattr(Path, "read_text", lambda _: "something else")
+    assert free_host_bytes() > 10**7
+
+
+def test_processors_are_those_that_this_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {3, 5, 8}, raising=False)
+    assert available_cpus() == 3
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert available_cpus() == 1
