@@ -27,8 +27,7 @@ from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
-from mfvpr.evaluation import Confidence, System, rank_dataset
-from mfvpr.evaluation.confidence import CalibrationData, calibration_data
+from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.drives import Drive, DriveFilter
 from mfvpr.evaluation.fusion import FrameCorrelation
 from mfvpr.evaluation.rankings import Ranked
@@ -125,48 +124,26 @@ class Place:
 
 def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
     """Rows of the table: recall of each set and drive, then gains over single images, pooled over the sets."""
-    pooled = {drive: (list[Hits](), list[np.ndarray]()) for drive in drives(1)}
+    pooled = {drive: list[tuple[Int[np.ndarray, " images"], Hits]]() for drive in drives(1)}  # with places along a path
     for number, (name, parts) in enumerate(places.items()):
-        for drive, (all_hits, all_places) in pooled.items():
+        for drive, all_hits in pooled.items():
             images = [drives(place.number)[drive] for place in parts]
             hits = [place.hits(each) for place, each in zip(parts, images, strict=True)]
-            all_hits += hits
-            all_places += [number * 10**6 + each for each in images]
-            yield [name, drive, *(f"{100 * _joined(hits, method).mean():.1f}" for method in hits[0])]
-    for drive, (hits, images) in pooled.items():
-        yield ["all", drive, *(_gain(hits, method, np.concatenate(images)) for method in hits[0])]
+            all_hits += [(number * 10**6 + each, part) for each, part in zip(images, hits, strict=True)]
+            recalls = [np.concatenate([part[method] for part in hits]).mean() for method in hits[0]]
+            yield [name, drive, *(f"{100 * recall:.1f}" for recall in recalls)]
+    for drive, all_hits in pooled.items():
+        path = np.argsort(np.concatenate([images for images, _ in all_hits]), kind="stable")
+        hits = {method: np.concatenate([part[method] for _, part in all_hits])[path] for method in all_hits[0][1]}
+        alone, cells = hits.pop("single"), []
+        for correct in hits.values():
+            gain, p = correct.mean() - alone.mean(), path_test(correct, alone).p_value
+            cells.append(f"{100 * correct.mean():.1f} ({100 * gain:+.1f}, p {p:.3f})")
+        yield ["all", drive, f"{100 * alone.mean():.1f}", *cells]
 
 
-def _joined(hits: Sequence[Hits], method: str) -> Bool[np.ndarray, " images"]:
-    return np.concatenate([part[method] for part in hits])
-
-
-def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"]) -> str:
-    """Recall over all sets, and its gain over single images, with p along the path."""
-    correct, alone = _joined(hits, method), _joined(hits, "single")
-    if method == "single":
-        return f"{100 * alone.mean():.1f}"
-    path = np.argsort(places, kind="stable")
-    p = path_test(correct[path], alone[path]).p_value
-    return f"{100 * correct.mean():.1f} ({100 * (correct.mean() - alone.mean()):+.1f}, p {p:.3f})"
-
-
-def fit(arguments: list[str]) -> Confidence:
-    """The confidence of all scores of `scorer=demo` with SIFT on some drives, see `mfvpr.evaluation.drives.STREETS`."""
-    system, cache, parts = load_system("mfvpr", features="sift", scorer="demo"), FeatureCache(), []
-    for argument in arguments:
-        dataset = folder(*argument.partition("=")[2].split(":"), ground_truth="order")
-        systems, truth = rank_dataset(dataset, system, cache=cache).systems, dataset.only.truth
-        assert truth is not None
-        parts += [calibration_data(systems[name][0], truth, NEAR) for name in system.scorers]
-    return CalibrationData(*map(np.concatenate, zip(*parts, strict=True))).fit()
-
-
-def run(arguments: list[str], features: str, *, is_fit: bool = False) -> None:
-    """Print a table of all data sets, or the confidence that is fitted on them."""
-    if is_fit:
-        print(fit(arguments))
-        return
+def run(arguments: list[str], features: str) -> None:
+    """Print a table of all data sets."""
     system, cache = load_system("mfvpr", features=features), FeatureCache()
     places = defaultdict[str, list[Place]](list)
     for name, _, paths in (argument.partition("=") for argument in arguments):
@@ -183,7 +160,6 @@ def add_arguments(parser: Parser) -> None:
     """Declare the command line."""
     parser.add_argument("arguments", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives along data sets")
     parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
-    parser.add_argument("--fit", dest="is_fit", action="store_true", help="fit a confidence on the drives instead")
     parser.set_defaults(run="experiments.sequences:run")
 
 
