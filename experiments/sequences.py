@@ -14,7 +14,6 @@ The field's methods see the same images as "causal": those before.
 - SeqSLAM 1, SeqSLAM any: straight trajectories of 10 images, 0.8 to 1.2 or -8 to 8 rows from one to the next, through
   the similarities of global descriptors, which are standardized for each image (after Milford & Wyeth, ICRA 2012)
 - scores 1, scores any: the same, through the standardized scores
-- descriptors: mean global descriptors of 5 images on both sides (as SeqNet, without learning)
 """
 
 from collections import defaultdict
@@ -37,7 +36,7 @@ from mfvpr.storage import FeatureCache
 
 NEAR = 2  # frames
 STEADY, ANY = np.arange(0.8, 1.25, 0.1), np.arange(-8, 8.5, 0.5)  # rows from one image to the next
-TRAJECTORY, WINDOW = 10, 5  # images
+TRAJECTORY = 10  # images
 
 Drives = dict[str, Int[np.ndarray, " images"]]
 Matrix = Float[np.ndarray, "queries rows"]
@@ -77,16 +76,6 @@ def trajectories(values: Matrix, speeds: Float[np.ndarray, " speeds"], length: i
     return best
 
 
-def mean_descriptors(queries: Float[np.ndarray, "queries d"], database: Float[np.ndarray, "rows d"]) -> Matrix:
-    """Similarities of mean descriptors of the last images on both sides."""
-
-    def means(vectors: np.ndarray) -> np.ndarray:
-        sums = np.stack([vectors[max(0, end - WINDOW + 1) : end + 1].sum(axis=0) for end in range(len(vectors))])
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-
-    return means(queries) @ means(database).T
-
-
 class Place:
     """A data set, ranked once: drives along it take some of its queries."""
 
@@ -96,7 +85,8 @@ class Place:
         [self._ranked] = ranked.systems[system.headline]
         self.number, self._rows = len(dataset.only.images), len(dataset.database)
         sides = (dataset.only.images, dataset.database)
-        self._vectors = [cache.vectors(images, retriever.describer, dataset.database).values for images in sides]
+        queries, database = (cache.vectors(each, retriever.describer, dataset.database).values for each in sides)
+        self._similarities = queries @ database.T
         self._scores = np.full((self.number, self._rows), np.nan)
         there = self._ranked.rows >= 0
         self._scores[np.nonzero(there)[0], self._ranked.rows[there]] = self._ranked.scores[there]
@@ -111,13 +101,12 @@ class Place:
         first["at speed 1"] = DriveFilter("causal", Drive(advance=1))(ranked, self._rows).rows[:, 0]
         frames = np.where(shortlist.mask, FrameCorrelation()(shortlist, ranked.scores), -np.inf)
         first["frames"] = ranked.rows[np.arange(len(images)), frames.argmax(axis=1)]
-        vectors, scores = self._vectors[0][images], standardized(self._scores[images])
-        similarities = standardized(vectors @ self._vectors[1].T)
+        similarities, scores = standardized(self._similarities[images]), standardized(self._scores[images])
         matrices = {
             f"{name} {rows}": trajectories(values, speeds, TRAJECTORY)
             for name, values in (("SeqSLAM", similarities), ("scores", scores))
             for rows, speeds in (("1", STEADY), ("any", ANY))
-        } | {"descriptors": mean_descriptors(vectors, self._vectors[1])}
+        }
         first |= {name: values.argmax(axis=1) for name, values in matrices.items()}
         return {name: np.abs(rows - images) <= NEAR for name, rows in first.items()}
 

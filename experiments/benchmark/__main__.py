@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mfvpr.cli.programs import Parser, run_command
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT
 from mfvpr.utils.files import require_replaceable
 
 PROGRAM = "python -m experiments.benchmark"
@@ -36,13 +37,14 @@ def add_arguments(parser: Parser) -> None:
     parser.epilog = "\n".join(["benchmarks:", *(f"  {name:<12} {about}" for name, about in BENCHMARKS.items())])
     parser.add_argument("benchmark", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")
     parser.add_argument("groups", nargs="*", help="accelerator: groups of steps, in this order (default: all)")
-    parser.add_argument("--rounds", type=positive_int, help="timed calls of each implementation (default: see below)")
+    parser.add_argument("--rounds", type=int, help="timed calls of each implementation (default: see below)")
     parser.add_argument("--out", type=Path, help="JSON file to write (default: runs/benchmark_BENCHMARK.json)")
     parser.set_defaults(run="experiments.benchmark.__main__:run")
 
 
 def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None) -> None:
     """Run a benchmark."""
+    (COUNT | None).check("--rounds", rounds)
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # leaves torch its part of a GPU
     module, function = _FUNCTIONS.get(benchmark, (benchmark, "run"))
     run_benchmark = getattr(import_module(f"experiments.benchmark.{module}"), function)
@@ -54,13 +56,6 @@ def run(benchmark: str, groups: list[str], rounds: int | None, out: Path | None)
         raise InputError(f"groups: expected none for {benchmark}, got {' '.join(groups)}; they belong to accelerator")
     else:
         run_benchmark(rounds, out)
-
-
-def positive_int(text: str) -> int:
-    """Parse an option's whole number above 0."""
-    if not text.isascii() or not text.isdigit() or not int(text[:9]) > 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number above 0, got {text}")
-    return int(text[:9])
 
 
 if __name__ == "__main__":
