@@ -237,7 +237,9 @@ def to_onnx(program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, 
 
             logging.getLogger("onnx_ir").setLevel(logging.ERROR)
             model = jax2onnx.to_onnx(function, structs, **names).SerializeToString()
-            session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+            options = onnxruntime.SessionOptions()
+            options.log_severity_level = 3  # errors alone
+            session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
             values: Any = session.run([*outputs], inputs)
     except Exception as error:  # of any kind: NotImplementedError, RuntimeError, AssertionError
         expected = f"operations that jax2onnx converts, got {_one_line(error)}"

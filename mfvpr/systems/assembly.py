@@ -10,7 +10,7 @@ from typing import Any
 
 from mfvpr import features
 from mfvpr.baselines import SCORERS
-from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, named_weight
+from mfvpr.baselines.learned_weight import named_weight
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
 from mfvpr.core.scorer import parameters_of
@@ -204,7 +204,7 @@ def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
     return {
-        name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
+        name: {**values, "weight_content": fingerprint(recipe_of(named_weight(values["weight"])))}
         if values.get("weight", "fs") not in WEIGHTS
         else {**values}
         for name, values in expand_weights(settings).items()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mfvpr import features
-from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, SUFFIX
+from mfvpr.baselines.learned_weight import SUFFIX, WORDS
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.features.windows import WindowFitting
@@ -142,7 +142,7 @@ def _matching() -> dict[str, dict[str, Any]]:
 def _scorers() -> dict[str, dict[str, Any]]:
     """Settings of each scorer; a match weight may also be one that is named, or a file."""
     all_known = {name: settings_of(scorer) for name, scorer in SCORERS.items()}
-    rule = one_of(*NAMED_WEIGHTS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
+    rule = one_of(*WORDS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
     for known in all_known.values():
         if "weight" in known:
             known["weight"] = replace(known["weight"], rule=rule, note="a list: a scorer of each")

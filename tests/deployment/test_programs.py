@@ -70,18 +70,6 @@ def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     assert outputs["scores"][-1] == 0  # without matches
 
 
-@pytest.mark.slow
-@pytest.mark.optimized
-def test_a_program_has_the_bits_of_the_jitted_function():
-    for method in (HISTOGRAM, make_system({"count": mfvpr.MatchCount(), "histogram": HISTOGRAM}, final="histogram")):
-        program = make_program(method, SHAPES, with_shift=True)
-        inputs, outputs = outputs_of(method, with_shift=True)
-        jax.clear_caches()
-        expected = jax.jit(lambda *arrays: program.call(*arrays))(*inputs.values())  # noqa: B023
-        for values, each in zip(outputs.values(), expected, strict=True):
-            np.testing.assert_array_equal(values, np.asarray(each))
-
-
 def test_a_system_matches_and_scores_by_all_scorers_the_deciding_one_first():
     scorers = {"count": mfvpr.MatchCount(), "histogram": HISTOGRAM}
     matcher = mfvpr.NearestNeighborMatcher(max_distance=0.7)
@@ -176,13 +164,11 @@ COUNT = {"count": mfvpr.MatchCount()}
 @pytest.mark.parametrize(
     ("system", "options", "message"),
     [
-        (lambda: make_system({}), {}, "final='retrieval': expected a scorer"),
         (
             lambda: make_system(COUNT, fused={"count": Fusion()}, final="count + retrieval"),
             {},
             r"final='count \+ retrieval': expected a scorer, got a ranking that needs the retrieval",
         ),
-        (lambda: make_system(COUNT | {"cv": mfvpr.OpenCvHomography()}), {}, "OpenCvHomography: expected a scorer"),
         (
             lambda: make_system(COUNT, extractor=TwoScales()),
             {},
