@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.cli.console import Progress
+from mfvpr.cli.console import progress
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import versions
@@ -43,11 +43,11 @@ def measure(entries: Sequence[Entry], rounds: int) -> tuple[list[dict[str, Any]]
     caches, and their idle threads may still be spinning.
     """
     results, first_calls, seconds = {}, {}, {(step, name): list[float]() for step, name, _ in entries}
-    for step, name, call in Progress("warm-up", len(entries), entries):
+    for step, name, call in progress("warm-up", len(entries), entries):
         start = time.perf_counter()
         results[step, name] = call()
         first_calls[step, name] = time.perf_counter() - start
-    for _ in Progress("rounds", rounds, range(rounds)):
+    for _ in progress("rounds", rounds, range(rounds)):
         for step, name, call in entries:
             times = seconds[step, name]
             for _ in range(min(REPEATED, int(QUICK / times[-1])) if times else 0):

@@ -238,5 +238,3 @@ def test_missing_pairs_are_a_warning_of_every_run_and_score_0(files, tmp_path):
         assert "2 of 12 pairs" in line
         assert imported.matches[0].counts[0, 1] == imported.matches[0].counts[2, 0] == 0
         assert (imported.matches[0].counts > 0).sum() == 10
-
-
