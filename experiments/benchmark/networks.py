@@ -117,11 +117,11 @@ def torch_entries(
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cudnn.benchmark = True
     on_gpu, table = torch.cuda.is_available(), NETWORKS[contest.checkpoint].table
+    network = contest.peer(torch_networks)
 
     def run_with(layout: torch.memory_format) -> Callable[[list[np.ndarray]], list[Any]]:
         device = "cuda" if on_gpu else "cpu"
         weights = torch_networks.torch_weights(arrays, table, device, layout)
-        network = contest.peer(torch_networks)
         return partial(torch_networks.run_network, network, weights=weights, device=device, layout=layout)
 
     default, channels_last = run_with(torch.contiguous_format), run_with(torch.channels_last)

@@ -115,7 +115,8 @@ def make_program(
     A system returns the scores of all of its scorers, first those of the scorer that decides. An `InputError` says why
     a method cannot be exported.
     """
-    matcher, left_out = None, ()
+    matcher: Any = None
+    left_out: tuple[str, ...] = ()
     table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
     scorers: dict[str, Scorer]
     if isinstance(method, System):
