@@ -191,5 +191,5 @@ def _whitening(
             cache.warn(f"{files.path(key)}: is damaged; learned again")
         whitening = learn()
         files.update({key: whitening})
-        cache.runtime.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
+        cache.runtime.log(f"{name} in {files.folder}")
     return whitening
