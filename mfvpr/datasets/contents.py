@@ -65,7 +65,7 @@ class Contents:
         return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, int | bool | None]:
-        """Conversions of the images when they are read: numbers of turned and of scaled images, for results."""
+        """Numbers of images that are turned and scaled when they are read, for results."""
         largest = [file.largest for file in self.files if file.largest is not None]
         return {
             "orient": self.folder.orient,
