@@ -18,11 +18,10 @@ from mfvpr.datasets import (
     RadiusTruth,
 )
 from mfvpr.datasets.ground_truth import threshold_words
-from mfvpr.evaluation import evaluation_protocol
 from mfvpr.utils.files import write_text
 from tests import oracles
 from tests.builders import fill
-from tests.io.checks import memory_below, one_line_error
+from tests.io.checks import one_line_error
 
 
 @pytest.fixture
@@ -139,24 +138,6 @@ def test_many_labels_are_a_loop_over_all_pairs():
         is_correct = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
         np.testing.assert_array_equal(positives.of(query), np.flatnonzero(is_correct))
         np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
-
-
-@pytest.mark.slow
-def test_nordland_takes_a_few_megabytes():
-    """A matrix of 27,592 frames on each side takes 761 MB."""
-    number, tolerance = 27_592, 10
-    truth = FrameTruth(tuple((row,) for row in range(number)), number)
-    frames = np.arange(number)[:, None]
-    rankings = np.stack([frames, frames - tolerance, frames - tolerance - 1])
-    with memory_below(60e6):
-        protocol = evaluation_protocol(truth, [tolerance], "both")
-        recall, difference = protocol.recall(rankings), protocol.positives[0] - protocol.places
-    [positives] = protocol.positives
-    assert positives.counts.sum() == number * (2 * tolerance + 1) - tolerance * (tolerance + 1)
-    np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
-    assert [len(half.tune) for half in protocol.halves] == [number // 2 - 2 * tolerance] * 2
-    np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
-    assert not difference.rows.size
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))

@@ -30,14 +30,7 @@ LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
 CLOUDS = {weather: place for place, weather in enumerate(WEATHERS.values())}  # seeds of the clouds of each weather
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
-TRAFFIC = (
-    (LANE, 7, 25, False),
-    (-LANE, 5, 22, True),
-    (-LANE, 25, 50, True),
-    (4.0, 5, 18, False),
-    (4.0, 25, 50, False),
-    (-4.0, 5, 18, True),
-)
+TRAFFIC = ((LANE, 7, 25, 0), (-LANE, 5, 22, 1), (-LANE, 25, 50, 1), (4.0, 5, 18, 0), (4.0, 25, 50, 0), (-4.0, 5, 18, 1))
 
 Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
 
@@ -318,9 +311,9 @@ def build_furniture(seed: int, length: float) -> list[Prop]:
 
 
 def draw_sign(rng: Rng) -> Sheet:
-    sheet, red, white = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232)
+    """A traffic sign on its post: a red circle, a red triangle, or a blue square."""
+    sheet, red, white, kind = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232), rng.integers(3)
     sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
-    kind = rng.integers(3)
     if kind == 0:
         sheet.ellipse(0.45, 0.45, 0.42, 0.42, red)
         sheet.ellipse(0.45, 0.45, 0.32, 0.32, white)
