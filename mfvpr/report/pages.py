@@ -38,7 +38,7 @@ _EXPECTED = "expected the run folder of an evaluation of this version"
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
 _POOLED = MEANS[-1]
-_TABLES = ("table", "confidence", "precision_recall", "changes", "skipped")  # not every run has all
+_WITH_TRUTH, _OF_SOME = ("table", "confidence", "precision_recall"), ("changes", "skipped")  # tables
 _OUTCOMES = {"1": "correct", "0": "incorrect", "": "best"}  # by `correct` of predictions
 _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
@@ -48,7 +48,7 @@ class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`; `common` is the first, for values that all of them share.
+        results: rows of `results.json`; `common` is the first, for values that all share, such as the `description`.
         about: the content of `run.json`.
         tables: of CSV files, by name without suffix.
         systems: names in the order of the results; the `headline` decides.
@@ -68,7 +68,7 @@ class Run:
             self.results: list[dict[str, Any]] = _read_json(folder / LAST)
             self.about: dict[str, Any] = _read_json(folder / "run.json")
             self.common = self.results[0]
-            truth = self.common["ground_truth"]
+            self.description, truth = self.common["description"], self.common["ground_truth"]
             self.systems = list(dict.fromkeys(row["system"] for row in self.results))
             self.headline = next(row["system"] for row in self.results if row["decides"])
             sequences = dict.fromkeys(row.get("sequence", row["dataset"]) for row in self.results)
@@ -76,8 +76,9 @@ class Run:
             self.parts = {name: number for number, name in enumerate(self.sequences)} | {_POOLED: None}
             self.thresholds: list[float] = truth.get("thresholds", [])
             self.within = threshold_words(truth["unit"], middle(self.thresholds)) if self.thresholds else ""
-            paths = [path for name in _TABLES if (path := folder / f"{name}.csv").exists()]
-            self.tables = {path.stem: read_table(path) for path in paths}
+            names = [*_WITH_TRUTH] if self.thresholds else []
+            names += [name for name in _OF_SOME if (folder / f"{name}.csv").exists()]
+            self.tables = {name: read_table(folder / f"{name}.csv") for name in names}
             lines = list[tuple[int, dict[str, str]]]()
             for number in range(len(self.sequences) if self.thresholds else 0):
                 gains = read_csv(sequence_folder(folder, self.sequences, number) / "gains.csv")
@@ -142,7 +143,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     title, dataset = run.common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
         title = " in ".join("/".join(Path(dataset[side]).parts[-2:]) for side in ("queries", "database"))
-    write_page(path, title=title, words=run.common["description"], facts=facts, sections=sections)
+    write_page(path, title=title, words=run.description, facts=facts, sections=sections)
     return path
 
 
@@ -159,7 +160,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     overview, facts, settings = [], {}, {}
     for label, run in runs.items():
         overview.append({"run": label, "data set": run.common["dataset"], "decides": run.headline})
-        overview[-1]["what was evaluated"] = run.common["description"]
+        overview[-1]["what was evaluated"] = run.description
         if run.queries:
             facts[f"{label}, R@1{run.within}, %"] = format_estimate(run.recall(run.headline))
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
@@ -218,7 +219,7 @@ def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
     bars = bar_chart("intervals", "Recall at 1, with intervals", groups, axis="recall at 1, %")
     words = "In %, correct at the middle tolerance; intervals are 95 % and know that neighbors along the path fail "
     recall = {"Recall of every system": table_of(rows, ("run", "system", "sequence"))}
-    charts = [bars, _depths_chart(curves)]
+    charts = [bars, *_tolerance_chart(curves), _depths_chart(curves)]
     precision = _precision_charts(curves, "score") + _precision_charts(curves, "confidence")
     about = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
     return [
@@ -238,6 +239,19 @@ def _depths_chart(curves: Curves) -> Chart:
     return line_chart(
         "depths", "Recall over K", points, axes=("K, the first candidates", "recall at K, %"), scale="log"
     )
+
+
+def _tolerance_chart(curves: Curves) -> list[Chart]:
+    """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
+    points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
+    unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
+    for name, (run, system) in curves.items():
+        if len(run.thresholds) > 1 and run.common["ground_truth"]["unit"] == unit and k in run.common["recall_at"]:
+            rows = [row for row in run.results if row["system"] == system]
+            recalls = [row["recall_at"][k] for row in rows if row.get("sequence", _POOLED) == _POOLED]
+            points[name] = [(at, 100 * recall) for at, recall in zip(run.thresholds, recalls, strict=True)]
+    axes = f"tolerance, {unit}", f"recall at {k}, %"
+    return [line_chart("tolerances", "Recall over tolerance", points, axes=axes, scale="linear")] if points else []
 
 
 def _precision_charts(curves: Curves, by: str) -> list[Chart]:

@@ -91,7 +91,7 @@ def line_chart(
     curves: Mapping[str, Sequence[tuple[float, float]]],
     *,
     axes: tuple[str, str],
-    scale: Literal["log", "percent"],
+    scale: Literal["linear", "log", "percent"],
 ) -> Chart:
     """A curve of points (x, y in %) for each name; the others are compared with the first.
 

@@ -218,8 +218,8 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
     for (row, column), value in np.ndenumerate(plane):
         color = "white" if value < top - 0.45 * spread else "black"
         panel.text(column, row, f"{value:.1f}", ha="center", va="center", fontsize=9, color=color)
-    panel.set_yticks(range(len(words[first])), words[first])
-    panel.set_xticks(range(len(words[second])), words[second], rotation=30)
+    panel.set_yticks(range(len(words[first])), [Path(word).name for word in words[first]])  # weights may be files
+    panel.set_xticks(range(len(words[second])), [Path(word).name for word in words[second]], rotation=30)
     panel.set(xlabel=second, ylabel=first)
     corner = best[second] - 0.5, best[first] - 0.5
     panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))

@@ -18,7 +18,7 @@ from mfvpr.report import pages
 from mfvpr.report.pages import Run, write_comparison, write_report
 from mfvpr.utils import InputError
 from tests.programs import typed
-from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, write_run
+from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, write_run
 
 pytestmark = pytest.mark.thorough
 
@@ -130,6 +130,9 @@ def test_recall_and_its_intervals_are_those_of_the_files(page):
         assert (trace["x"], trace["y"]) == ([1, 2, 3], [10 * sum(0 < rank <= k for rank in ranks) for k in (1, 2, 3)])
     [bars] = page.charts["intervals"]["data"]
     assert bars["x"] == [30.0, 80.0, 60.0]
+    for trace in page.charts["tolerances"]["data"]:
+        assert trace["x"] == TOLERANCES
+        assert trace["y"] == pytest.approx([trace["y"][2] / 3, 2 * trace["y"][2] / 3, trace["y"][2]])
     [curve] = page.charts["precision-score"]["data"]
     assert curve["name"] == f"{HEADLINE}: AP {100 * (0.25 + 0.25 + 0.25 * 0.75):.1f}"
     assert (curve["x"], curve["y"]) == ([25.0, 50.0, 75.0], [100.0, 100.0, 75.0])

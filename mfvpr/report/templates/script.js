@@ -86,7 +86,7 @@ const look = {
   legend: { orientation: "h", yanchor: "bottom", y: 1.02, x: 0 }, hoverlabel: { namelength: -1 },
 };
 const scales = {
-  percent: { range: [-1, 101] }, share: { range: [0, 102] },
+  linear: {}, percent: { range: [-1, 101] }, share: { range: [0, 102] },
   log: { type: "log", tickvals: [...Array(6).keys()].flatMap((power) => [1, 2, 5].map((step) => step * 10 ** power)) },
 };
 const axis = (text, rest) => (
