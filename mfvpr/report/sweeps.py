@@ -43,7 +43,7 @@ class Sweep:
 
     def __repr__(self) -> str:
         recall = f"{_label(self.outcome)} in % {format_estimate(self.interval)}"
-        about = f"{self.dataset}, {self.scorer}: {len(self.outcome.settings)} settings"
+        about = f"{self.dataset}, {self.scorer}: {self.outcome.axes.size} settings"
         return f"Sweep({about}; best {format_values(self.best)}; {recall})"
 
     @property
