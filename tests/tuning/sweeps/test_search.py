@@ -7,7 +7,7 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError
-from mfvpr.baselines.learned_weight import NAMED_WEIGHTS
+from mfvpr.baselines.learned_weight import named_weight
 from mfvpr.core import hits
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
@@ -64,7 +64,7 @@ def test_own_values_follow_from_the_scorer_unless_they_are_given():
     assert axes.values["sigma"] == [5, 10]
     assert type(axes.values["sigma"][0]) is int
     assert axes.own == {"sigma": 22.5, "truncate": None, "weight": "fs"}
-    learned = mfvpr.AggregatedScore(weight=NAMED_WEIGHTS["learned_aliked"])
+    learned = mfvpr.AggregatedScore(weight=named_weight("learned_aliked"))
     assert Axes(learned, {"weight": ["fs"]}).own == {"weight": "learned_aliked"}
     wrapped = Axes(Wrapped(), {"inner.sigma": [9.0], "c": ["auto"], "max_distance": [0.5]}, {"c": 2, "sigma": 1})
     assert wrapped.own == {"inner.sigma": 18.0, "c": 2, "max_distance": None}
