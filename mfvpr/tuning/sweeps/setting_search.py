@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from mfvpr.baselines.learned_weight import WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.batch import WEIGHTINGS, refuse_own_names
+from mfvpr.core.batch import MATCH_AXES, refuse_own_names
 from mfvpr.core.scorer import (
     Scorer,
     check_bounds,
@@ -61,7 +61,7 @@ class Axes:
 
     def __post_init__(self) -> None:
         scorer = self.scorer
-        refuse_own_names(scorer, self.values, reserved=(*WEIGHTINGS, FUSION))
+        refuse_own_names(scorer, self.values, reserved=(*MATCH_AXES, FUSION))
         known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}
