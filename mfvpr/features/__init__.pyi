@@ -32,4 +32,4 @@ from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeature
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows
 from .vlad import Vlad, VladFitting
-from .windows import WindowFitting
+from .whitening import WindowFitting

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor
+from mfvpr.networks.backbones import STRIDE
+from mfvpr.networks.global_descriptors import VggNetVlad
 from mfvpr.networks.layers import of_unit_length
-from mfvpr.networks.netvlad import VggNetVlad
-from mfvpr.networks.vgg import STRIDE
 from mfvpr.networks.vit import LOCAL, PATCH, SelaVpr, VisionTransformer, require_patches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import POSITIVE, SIZE, list_of, number, setting, whole, word_of

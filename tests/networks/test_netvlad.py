@@ -11,8 +11,8 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import NETVLAD_MATLAB
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
+from mfvpr.networks.global_descriptors import CHANNELS
 from mfvpr.networks.layers import GeneralizedMean
-from mfvpr.networks.netvlad import CHANNELS
 from mfvpr.utils import InputError
 from tests.golden.make_netvlad import CASES, GEM, MATLAB, PATCHES, image, name, samples
 from tests.networks.checkpoints import fill, fill_netvlad, fill_published
