@@ -128,10 +128,9 @@ class GlobalDescriptor(NetworkExtractor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.model.require(self.image_size)
-        if self.components is not None and not self.model.has_components:
-            raise InputError(f"components={self.components}: expected None, since these weights have no whitening")
-        if self.components is not None and self.components > self.model.dimension:
-            raise InputError(f"components={self.components}: expected from 1 to {self.model.dimension}")
+        most = self.model.dimension if self.model.has_components else 0
+        if self.components is not None and self.components > most:
+            raise InputError(f"components={self.components}: expected null, or at most {most} of these weights")
 
     @property
     def vector_size(self) -> int:

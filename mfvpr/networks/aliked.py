@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.core.types import Array
 from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
-from mfvpr.utils.errors import InputError
 
 STRIDE = 32  # px, of the coarsest map
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
@@ -78,16 +77,10 @@ class Block(nnx.Module):
 class Aliked(nnx.Module):
     """ALIKED's network. The detector has no weights and is not part of it.
 
-    Args:
-        variant: "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
-
-    Raises:
-        InputError: there is no such variant.
+    `variant` is "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
     """
 
     def __init__(self, variant: str = "aliked-n16", *, rngs: nnx.Rngs) -> None:
-        if variant not in VARIANTS:
-            raise InputError(f"ALIKED: expected one of {', '.join(VARIANTS)}, got {variant}")
         widths, self.dimension, positions = VARIANTS[variant]
         inputs = 3
         for place, width in enumerate(widths, start=1):

@@ -186,14 +186,9 @@ class MixVPR(nnx.Module):
     preprocess = staticmethod(preprocess)
 
     def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
-        """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px.
-
-        Raises:
-            ValueError: images of another size.
-        """
+        """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px."""
         if images.shape[1:3] != IMAGE_SIZE[::-1]:
-            height, width = images.shape[1:3]
-            raise ValueError(f"MixVPR takes images of 320 x 320 px only, got {width} x {height}")
+            raise ValueError(f"MixVPR takes images of 320 x 320 px only, got {images.shape[2]} x {images.shape[1]}")
         return self.aggregate(self.backbone(images))
 
     def aggregate(self, maps: Float[Array, "batch 20 20 1024"]) -> Float[Array, "batch dimensions"]:

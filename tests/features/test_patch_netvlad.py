@@ -52,7 +52,6 @@ def test_patches_are_where_the_public_code_has_them(model, position):
         ({"patch_sizes": ()}, r"patch_sizes=\(\): expected a list of one or more"),
         ({"patch_sizes": (9,)}, "expected sizes from 1 to 8, .*10 x 8"),
         ({"patch_sizes": (0, 2)}, "from 1"),
-        ({"patch_sizes": (2, 2)}, r"patch_sizes=\[2, 2\]: .*once"),
         ({"scale_weights": (1.0, 2.0)}, r"scale_weights=\[1.0, 2.0\]: .*patch_sizes=\[5\], or None"),
     ],
 )
