@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from mfvpr.core import ranking
-from mfvpr.core.batch import WEIGHTINGS, by_capacity, score_settings
+from mfvpr.core.batch import MATCH_AXES, by_capacity, score_settings
 from mfvpr.core.scorer import check_host, static_names, whole_numbers, with_parameters, with_static_functions
 from mfvpr.core.types import Array, Shortlist
 from mfvpr.core.weights import ChosenWeight
@@ -85,15 +85,15 @@ def group_by_program(
             chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
         chosen = with_static_functions(chosen)
         # Split the members into products `[G, W]` of settings and weightings.
-        columns = _group_by(settings, members, lambda name, _: name in WEIGHTINGS)
+        columns = _group_by(settings, members, lambda name, _: name in MATCH_AXES)
         column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
         products: dict[tuple[int, ...], list[list[int]]] = {}
-        for _, line in _group_by(settings, members, lambda name, _: name not in WEIGHTINGS):
+        for _, line in _group_by(settings, members, lambda name, _: name not in MATCH_AXES):
             line = sorted(line, key=column.__getitem__)
             products.setdefault(tuple(column[row] for row in line), []).append(line)
         for rows in map(np.array, products.values()):
-            values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *WEIGHTINGS})
-            parameter_names = set(settings[0]) - set(WEIGHTINGS)
+            values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *MATCH_AXES})
+            parameter_names = set(settings[0]) - set(MATCH_AXES)
             weightings = _arrays([settings[row] for row in rows[0]], weights, integers, without=parameter_names)
             for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
