@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float, Num
 
+from mfvpr.core.types import Array
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
 from mfvpr.features.whitening import Whitening, WindowFitting, Windows, kernels, learned_whitening
