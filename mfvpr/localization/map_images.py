@@ -20,14 +20,8 @@ from numpy.typing import ArrayLike
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import read_image, resize
-<<<<<<< HEAD
-from mfvpr.evaluation.evidence import strength
-from mfvpr.evaluation.system import System
-from mfvpr.features.extractor import Description, Extractor, describe_images
-=======
 from mfvpr.evaluation.system import Note, System
-from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
->>>>>>> main
+from mfvpr.features.extractor import Description, Extractor, describe_images
 from mfvpr.features.feature_set import SHARE, check_features
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.matchers.host_matcher import PairSource
