@@ -180,6 +180,6 @@ def test_one_match_that_is_no_number_leaves_no_score(field, broken):
     assert np.isnan(score(AggregatedScore(weight=weight), pair))
     assert np.isnan(HistogramOfShifts(weight=weight).dominant_shift(pair)).all()
     rapid = RapidSpatialScore(), RapidSpatialScore(reach="largest_shift")
-    relatives = *rapid, VisualPhrases(), LostScore(), LostScore("described"), Homography(max_iterations=100.0)
+    relatives = *rapid, VisualPhrases(), LostScore(), Homography(max_iterations=100.0)
     for scorer in relatives if "points" in field else ():
         assert np.isnan(score(scorer, pair))

@@ -55,7 +55,6 @@ RELATIVES = [
     VisualPhrases(length=3, cell_size=90.0),
     LostScore(),
     LostScore(form="unweighted", mirrored=True),
-    LostScore(form="described"),
 ]
 NUMBERS = ("bin_size", "sigma", "tolerance", "temperature", "weight")  # the window moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
