@@ -112,9 +112,9 @@ def _read_matches(
     if not stores:
         return None
     number = len(sequence.images)
-    is_done = all(store.has_all(range(number)) for store in stores)
+    is_done = all(store.is_complete for store in stores)
     line = f"all {number} queries from" if is_done else f"{number} queries with {depth} candidates, in"
-    cache.log(f"{sequence.name} matches: {line} {stores[0].folder}")
+    cache.runtime.log(f"{sequence.name} matches: {line} {stores[0].folder}")
     if not is_done:
         return None
     try:

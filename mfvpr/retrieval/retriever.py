@@ -11,8 +11,7 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
-from mfvpr.features.whitening import Whitening
-from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
+from mfvpr.features.whitening import Whitening, WindowExtractor, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
@@ -185,11 +184,11 @@ def _whitening(
         pack=lambda whitening: {"mean": whitening.mean, "components": whitening.components},
         unpack=lambda arrays: Whitening(arrays["mean"], arrays["components"], own_origin),
     )
-    if (whitening := files.get(key)) is None:
-        if is_damaged := key in files:
+    whitening = files.get(key)
+    if whitening is None:
+        if key in files:
             cache.warn(f"{files.path(key)}: is damaged; learned again")
-        files.update({key: learn()}, once=not is_damaged)  # the first of several counts: bits may differ
-        whitening = files.get(key)
-        cache.log(f"{name} in {files.folder}")
-    assert whitening is not None
+        whitening = learn()
+        files.update({key: whitening})
+        cache.runtime.log(f"{name} in {files.folder}")
     return whitening

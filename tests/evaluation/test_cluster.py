@@ -121,15 +121,17 @@ def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path)
             FeatureCache(tmp_path / "store", runtime=runtime).local(folder, SIFT)
         assert "\n" not in str(raised.value)
     cache = FeatureCache(tmp_path / "store", skip_bad=True, runtime=runtime)
-    assert [*cache.describe(folder, SIFT).bad] == [0]
+    with pytest.raises(InputError, match=r"none of 1 images .*bad\.png"):
+        cache.local(folder, SIFT)
 
 
 def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
     extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
     with pytest.raises(InputError, match="cluster: 4 workers died in one block"):
-        cache.describe(dataset.database, extractor)
-    assert (cache.describe(dataset.database, SIFT).counts > 0).all()
+        cache.local(dataset.database, extractor)
+    [features] = cache.local(dataset.database, SIFT)
+    assert (features.counts > 0).all()
 
 
 def test_a_cluster_needs_a_folder(dataset, cluster):
