@@ -101,6 +101,7 @@ def masked_mean(
 def masked_median(values: Float[Array, " entries *rest"], mask: Bool[Array, " entries"]) -> Float[jax.Array, "*rest"]:
     """Median of `values` over axis 0 where `mask` is True (mean of the middle two when even); 0 if there are none.
 
+    Example:
         mfvpr.masked_median(jnp.array([1.0, 9.0, 2.0, 7.0]), jnp.array([True, False, True, True]))  # 2.0
     """
     if len(mask) == 0:
