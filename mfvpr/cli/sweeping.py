@@ -92,7 +92,7 @@ def sweep_program(settings: Settings) -> None:
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results),
             figures=sweeps.sweep_figures(outcome),
         )
-        forget_rankings(axes.scorer, options)
+        forget_rankings(axes.scorer, matches, candidates, outcome.protocol.views, options)
 
 
 def axes_of(settings: Searched) -> Axes:

@@ -19,7 +19,6 @@ from mfvpr.evaluation.rankings import (
     Ties,
     fuse_scales,
     fuse_shortlist,
-    rank_shortlist,
     retrieval_scores,
 )
 from mfvpr.utils.errors import InputError, require_word
@@ -192,7 +191,5 @@ def rank_by_scores(
             known[score.name] = score.step(score.base, candidates, known)
         elif isinstance(score.step, FrameCorrelation):
             known[score.name] = score.step(candidates, known[score.base])
-        order = rank_shortlist(candidates, known[score.name], ties=ties)
-        ranked = (np.take_along_axis(values, order, axis=1) for values in (candidates.indices, known[score.name]))
-        rankings[score.name] = Ranked(*ranked)
+        rankings[score.name] = Ranked.of(candidates, known[score.name], ties)
     return rankings

@@ -170,11 +170,17 @@ class EvaluationProtocol:
         """R@K with its threshold, for tables."""
         return f"R@{k}{threshold_words(self.unit, threshold)}"
 
+    def hits(
+        self, rows: Int[np.ndarray, "*batch queries depth"], queries: Int[np.ndarray, " queries"], k: int = 1
+    ) -> Bool[np.ndarray, "tolerances *batch queries"]:
+        """Whether the first k rows of the rankings of some queries have a positive, by threshold."""
+        return np.stack([hits(rows, positives.take(queries), k) for positives in self.positives])
+
     def recall(
         self, rows: Int[np.ndarray, "settings queries depth"], k: int = 1
     ) -> Float[np.ndarray, "settings tolerances"]:
         """Recall@k over all queries."""
-        return np.stack([hits(rows, positives, k).mean(axis=-1) for positives in self.positives], axis=-1)
+        return self.hits(rows, np.arange(rows.shape[1]), k).mean(axis=-1).T
 
     def tuning(
         self, rows: Int[np.ndarray, "views settings queries depth"]
@@ -182,23 +188,17 @@ class EvaluationProtocol:
         """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
-        seen = [
-            [hits(rows[view][:, half.tune], positives.take(half.tune)).mean(axis=-1) for positives in self.positives]
-            for view, half in enumerate(self.halves, start=1)
-        ]
-        return np.moveaxis(np.array(seen), 1, -1)
+        views = zip(rows[1:], self.halves, strict=True)
+        return np.stack([self.hits(view[:, half.tune], half.tune).mean(axis=-1).T for view, half in views])
 
     def reported_hits(
         self, rows: Int[np.ndarray, "views settings queries depth"], chosen: Sequence[int]
     ) -> Bool[np.ndarray, "tolerances reported"]:
         """Hits of the queries to report on, each with the setting that was chosen without it."""
         if not self.halves:
-            return np.stack([hits(rows[0][chosen[0]], positives) for positives in self.positives])[:, self.order]
-        parts = [
-            [hits(rows[0][setting][half.report], positives.take(half.report)) for positives in self.positives]
-            for setting, half in zip(chosen, self.halves, strict=True)
-        ]
-        return self.join_halves([np.array(part) for part in parts])
+            return self.hits(rows[0][chosen[0]], np.arange(rows.shape[2]))[:, self.order]
+        parts = zip(chosen, self.halves, strict=True)
+        return self.join_halves([self.hits(rows[0][setting][half.report], half.report) for setting, half in parts])
 
     def join_halves(self, parts: Sequence[Bool[np.ndarray, "tolerances _"]]) -> Bool[np.ndarray, "tolerances reported"]:
         """Join the hits of each half in the order of the path, which confidence intervals depend on."""

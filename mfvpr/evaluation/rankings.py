@@ -121,17 +121,12 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
     return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
 
 
-def breaks_ties_by_row(ties: Ties) -> bool:
-    """Whether ties are broken by the database row."""
-    require_word("ties", ties, Ties)
-    return ties == "index"
-
-
 def rank_shortlist(
     candidates: Shortlist, scores: Scores, *, ties: Ties = "retrieval"
 ) -> Int[np.ndarray, "queries candidates"]:
     """Positions into the shortlist, best first, missing candidates last; ties by retrieval or by database index."""
-    tie_break = candidates.indices if breaks_ties_by_row(ties) else None
+    require_word("ties", ties, Ties)
+    tie_break = candidates.indices if ties == "index" else None
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 
@@ -166,6 +161,12 @@ class Ranked:
 
     rows: Int[np.ndarray, "queries candidates"]  # of the database, best first; -1 = none
     scores: Scores  # in this order
+
+    @classmethod
+    def of(cls, candidates: Shortlist, scores: Scores, ties: Ties) -> "Ranked":
+        """Rank candidates by scores in the order of the shortlist."""
+        order, rows = rank_shortlist(candidates, scores, ties=ties), np.where(candidates.mask, candidates.indices, -1)
+        return cls(*(np.take_along_axis(values, order, axis=1) for values in (rows, scores)))
 
     def __repr__(self) -> str:
         return "Ranked({} queries, {} candidates each)".format(*self.rows.shape)

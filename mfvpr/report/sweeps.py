@@ -166,7 +166,7 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
         verdict |= {name: verdict[name]._asdict() for name in ("chosen", "own", "mcnemar", "path_test")}
     values = {
         "axes": axes_json(outcome.axes),
-        "own": dict(outcome.axes.own),
+        "own": dict(outcome.axes.own_values),
         "search": "grid" if outcome.is_grid else "optuna",
         "unit": protocol.unit,
         "thresholds": list(protocol.thresholds),
@@ -274,7 +274,7 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
         panel.tick_params("x", rotation=30)
     corner = best[second] - 0.5, best[first] - 0.5
     panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))
-    defaults = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
+    defaults = {"": ""} | {name: format_value(value) for name, value in axes.own_values.items()}
     if defaults[first] in values[first] and defaults[second] in values[second]:
         place = values[second].index(defaults[second]), values[first].index(defaults[first])
         panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=MARK)

@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, Runtime, score_candidates
+from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, score_candidates
 from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.models import (
@@ -19,8 +19,6 @@ from mfvpr.tuning.learning.models import (
     cross_entropy,
     first_numbers,
     mean_loss,
-    of_matches,
-    start,
 )
 from mfvpr.tuning.learning.splits import Batch
 from mfvpr.tuning.learning.training import Schedule, fit
@@ -64,7 +62,7 @@ def test_statistics_of_a_learned_weight_are_of_nothing_hidden():
     """Distances of hidden candidates, and of candidates of no account, are moved out of range: nothing changes."""
 
     def weight(at):
-        return start(at, AggregatedScore(), OPTIONS, learned_weight=True).start["weight"]
+        return Model.of_ranking(at, AggregatedScore(), OPTIONS, learned_weight=True).start["weight"]
 
     at = split()
     moved = []
@@ -95,14 +93,14 @@ def test_images_of_two_sizes_are_reported_on_as_one_by_one():
     for query in at.half.report:
         order = np.argsort(-(scores_of(HISTOGRAM, at, query) + c * at.candidates.scores[query]), kind="stable")
         expected.append([abs(at.candidates.indices[query][order[0]] - query) <= width for width in TOLERANCES])
-    compared = comparison._HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, Runtime())
+    compared = comparison.HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS)
     np.testing.assert_array_equal(compared.evaluate("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
 
 
 def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     """The loss of a batch is that of its queries' scores, which are finite."""
     at = split()
-    model = start(at, HISTOGRAM, OPTIONS)
+    model = Model.of_ranking(at, HISTOGRAM, OPTIONS)
     batch = at.batch(at.train, len(at.train))
     loss = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
     scores = np.stack([scores_of(model.scorer_of(model.start), at, query) for query in at.train])
@@ -214,7 +212,7 @@ def test_the_teacher_goes_with_the_size_of_the_images_that_learning_sees():
     for query in taught_split.half.report:
         matches[query] = replace(matches[query], image_size0=np.float32([900, 900]))
     taught_split = replace(taught_split, match_set=replace(taught_split.match_set, matches=matches))
-    taught_model = of_matches(taught_split, HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
+    taught_model = Model.of_matches(taught_split, HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
     assert taught_model.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
     assert taught_model.teacher.bin_size == pytest.approx(taught_model.teacher.sigma / 2)
     assert taught_model.teacher.max_bins >= 2 * max(SIZES) / taught_model.teacher.bin_size

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from mfvpr import HistogramOfShifts, InputError, Runtime
+from mfvpr import HistogramOfShifts, InputError
 from mfvpr.core.types import per_match
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.models import Options
@@ -83,9 +83,9 @@ def test_the_last_quarter_of_each_set_validates_and_nothing_reported_is_seen(joi
 def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
     [split] = training_splits(joined.match_set, joined.candidates, joined.protocol)
     scorer = HistogramOfShifts(bin_size=20.0, sigma=20.0)
-    compared = comparison._HalfComparison(split, Axes(scorer, {}, {}), Options(), None, Runtime())
+    compared = comparison.HalfComparison(split, Axes(scorer, {}, {}), Options())
     alone = training_splits(parts[2].match_set, parts[2].candidates, path(seed=2)[0])[0]
-    expected = comparison._HalfComparison(alone, Axes(scorer, {}, {}), Options(), None, Runtime())
+    expected = comparison.HalfComparison(alone, Axes(scorer, {}, {}), Options())
     for setting in ({}, {"c": None}, {"c": 3.0}):
         got = compared.evaluate("it", scorer, setting).hits[:, alone.half.report]
         np.testing.assert_array_equal(got, expected.evaluate("it", scorer, setting).hits)
