@@ -30,8 +30,7 @@ from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import Confidence, System, rank_dataset
 from mfvpr.evaluation.confidence import CalibrationData, calibration_data
 from mfvpr.evaluation.drives import Drive, DriveFilter
-from mfvpr.evaluation.fusion import FrameCorrelation
-from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.rankings import FrameCorrelation, Ranked
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache

@@ -255,7 +255,7 @@ def grid_anchors(index, side, *, patch=None, wrap=True, outside=-1000):
 # --- fusion and ranking -------------------------------------------------------------------------------------
 
 
-def fuse_scales(scores, mask, weights, normalize):
+def fuse_scales(scores, mask, weights):
     """Sum over scales of z-scores over the candidates with a finite score, `[C, S]` -> `[C]` (Patch-NetVLAD)."""
     fused = np.full(len(mask), np.nan)
     real = [place for place in range(len(mask)) if mask[place]]
@@ -264,7 +264,7 @@ def fuse_scales(scores, mask, weights, normalize):
         for scale, weight in enumerate(weights):
             score = float(scores[place, scale])
             finite = [float(scores[row, scale]) for row in real if np.isfinite(scores[row, scale])]
-            if normalize == "zscore" and np.isfinite(score):
+            if np.isfinite(score):
                 deviation = np.std(finite) if min(finite) < max(finite) else 0.0
                 score = (score - np.mean(finite)) / deviation if deviation else 0.0
             fused[place] += weight * score

@@ -25,9 +25,8 @@ from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.image_reading import gray, resize, write_image
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason
+from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason, match_sequence
 from mfvpr.evaluation.rankings import Matched
-from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import Pipeline, noise_images
 from mfvpr.features.extractor import Source
 from mfvpr.retrieval.retriever import Retrieval

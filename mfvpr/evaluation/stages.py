@@ -41,6 +41,13 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
+SHIFTS_AT_ONCE = 64  # pairs
+STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's longer side: near and
+# far things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
+SHIFT_FLOOR = 0.03
+WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
+
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 
 
@@ -66,15 +73,10 @@ def score(
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
     fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
-
-    def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
-        for part in parts:
-            part_batches = all_batches(match_set, part, settings=1)
-            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=runtime.devices):
-                yield part, places, values
-
     total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
-    for part, places, values in runtime.progress("scores")(score_parts(), total):
+    run = partial(run_batches, _score_all, (fitted,), devices=runtime.devices)
+    scored = ((part, *batch) for part in parts for batch in run(all_batches(match_set, part, settings=1)))
+    for part, places, values in runtime.progress("scores")(scored, total):
         scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
         for name, pair_scores in values.items():
             scores[name][scale, part.start + query, place] = pair_scores
@@ -127,7 +129,7 @@ def fuse_all(
     if not isinstance(match_set, Scales):
         return scores[0]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
-    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
+    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights))
 
 
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
@@ -142,17 +144,6 @@ def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     for name, values in scores.items():
         require_scores(name, values, len(matches.mask))
     return scores
-
-
-__all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
-
-SHIFTS_AT_ONCE = 64  # pairs
-STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's longer side: near and
-# far things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
-SHIFT_FLOOR = 0.03
-WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
-Limits = tuple[float | None, Sequence[Device] | None]  # of memory, GB, and devices
 
 
 def match(
@@ -183,11 +174,12 @@ def match(
             got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
             raise InputError(f"features: expected as many dimensions on both sides, got {got}")
     is_on_host = isinstance(matcher, PairSource)
-    runtime = replace(runtime, cluster=None) if store is None or is_on_host else runtime
-    limits = runtime.memory, runtime.devices
+    if store is None or is_on_host:
+        runtime = replace(runtime, cluster=None)
+    memory, devices = runtime.memory, runtime.devices
     if runtime.cluster is not None:
-        limits = runtime.memory or WORKER_MEMORY, None
-    shared = queries, database, candidates, matcher, limits
+        memory, devices = runtime.memory or WORKER_MEMORY, None
+    shared = queries, database, candidates, matcher, memory, devices
     if store is None:
         results = runtime.map(_match_queries, shared, range(len(queries)), "matching", batched.QUERIES)
         matched = [query for _, query in results]
@@ -209,13 +201,19 @@ def match(
 
 
 def _match_queries(
-    queries: Any, database: Any, candidates: Shortlist, matcher: Any, limits: Limits, rows: Sequence[int]
+    queries: Any,
+    database: Any,
+    candidates: Shortlist,
+    matcher: Any,
+    memory: float | None,
+    devices: Sequence[Device] | None,
+    rows: Sequence[int],
 ) -> Iterator[tuple[int, QueryMatches]]:
-    """(row, matches) of queries, in the order of `rows`, within limits of memory and devices."""
-    sides, (memory, devices) = (queries, database, candidates), limits
+    """(row, matches) of queries, in the order of `rows`, within limits of memory (GB) and devices."""
     if isinstance(matcher, PairSource):
-        return host.match_queries(*sides, rows, matcher)
-    return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
+        return host.match_queries(queries, database, candidates, rows, matcher)
+    devices = devices or [device_of(())]
+    return batched.match_queries(queries, database, candidates, rows, matcher, memory=memory, devices=devices)
 
 
 def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist] | None:

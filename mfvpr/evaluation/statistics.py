@@ -37,14 +37,14 @@ def estimate(hits: Bool[np.ndarray, " queries"]) -> Estimate:
     return Estimate(float(np.mean(hits)), recall_interval(hits))
 
 
-def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of the recall of queries along a path, which succeed and fail together with their neighbors.
+def recall_interval(hits: np.ndarray) -> tuple[float, float]:
+    """95 % confidence interval of the recall of queries along a path, where neighbors succeed and fail together.
 
     The interval of Clopper and Pearson (1934) for the effective number of independent queries, Q / `design_effect`. If
     the path is worth few independent queries, the data do not support an interval, and it is nearly [0, 1]. Only hits
     give a lower end of 18 % with 101 queries, 43 % with 300, and 69 % with 1,000.
 
-    In simulations with recalls of 0.5 to 0.95 and autocorrelations of the hits up to 0.9 from query to query, the 95 %
+    In simulations with recalls of 0.5 to 0.95 and autocorrelations of the hits up to 0.9 from query to query, the
     interval covers the recall in at least 90 %. It covers less if noise of single queries hides a slow change.
 
     Hits `[Q]` are bool, in the order of the path. The interval is (0, 1) without queries.
@@ -52,15 +52,13 @@ def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, fl
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
         raise InputError(f"hits: expected [Q], one of every query, got {list(hits.shape)}; call it for each row")
-    if not 0 < level < 1:
-        raise InputError(f"level={level}: expected a number between 0 and 1, such as 0.95")
     if len(hits) == 0:
         return 0.0, 1.0
     effective = len(hits) / design_effect(hits)
     correct = hits.mean() * effective
-    incorrect, tail = effective - correct, (1 - level) / 2
-    low = special.betaincinv(correct, incorrect + 1, tail) if correct > 0 else 0.0
-    high = special.betaincinv(correct + 1, incorrect, 1 - tail) if incorrect > 0 else 1.0
+    incorrect = effective - correct
+    low = special.betaincinv(correct, incorrect + 1, 0.025) if correct > 0 else 0.0
+    high = special.betaincinv(correct + 1, incorrect, 0.975) if incorrect > 0 else 1.0
     return float(low), float(high)
 
 

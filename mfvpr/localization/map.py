@@ -27,8 +27,7 @@ from mfvpr.evaluation.evidence import (
     reason_against_image,
     strength,
 )
-from mfvpr.evaluation.fusion import rank_by_scores
-from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.rankings import Ranked, rank_by_scores
 from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.extractor import Extractor, Source

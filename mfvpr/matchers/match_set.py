@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -25,7 +24,6 @@ BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
 
 Row = Mapping[str, np.ndarray]  # matches [n, ...] by field
-Normalize = Literal["zscore", "none"]
 
 
 @dataclass(frozen=True)
@@ -125,12 +123,10 @@ class Scales:
     Attributes:
         match_sets: S match sets of the same queries and candidates.
         weights: of the scales; None = 1 each.
-        normalize: normalization of the scores of a scale before fusion.
     """
 
     match_sets: Sequence[MatchSet]
     weights: Sequence[float] | None = None
-    normalize: Normalize = "zscore"
 
     def __post_init__(self) -> None:
         shapes = {match_set.counts.shape for match_set in self.match_sets}

@@ -15,11 +15,10 @@ from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.confidence import write_confidences
+from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.drives import DriveFilter
-from mfvpr.evaluation.fusion import FinalScore, Fusion
 from mfvpr.evaluation.protocol import places_along_path
-from mfvpr.evaluation.rankings import RETRIEVAL, Ranked
-from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.evaluation.rankings import RETRIEVAL, FinalScore, Fusion, Ranked
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.evaluation.statistics import mcnemar, path_test
 from mfvpr.report.evaluations import (

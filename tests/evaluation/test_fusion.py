@@ -13,8 +13,7 @@ import mfvpr
 from mfvpr import balancing_c, combine, datasets
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import FrameCorrelation, Fusion, match_sequence, stages
-from mfvpr.evaluation.fusion import final_scores, rank_by_scores
-from mfvpr.evaluation.rankings import fuse, fuse_scales, fuse_shortlist, rank_shortlist
+from mfvpr.evaluation.rankings import final_scores, fuse, fuse_scales, fuse_shortlist, rank_by_scores, rank_shortlist
 from tests import oracles
 from tests.builders import evaluate_parts
 from tests.evaluation.conftest import SCORERS, SIFT, VLAD
@@ -41,7 +40,7 @@ def assert_fused(fused, candidates, parts, weights):
     """The scores are those of the oracle, in float64, query by query."""
     stacked = np.stack(parts, axis=-1).astype(np.float64)
     for query, mask in enumerate(candidates.mask):
-        expected = oracles.fuse_scales(stacked[query], mask, weights, "zscore")
+        expected = oracles.fuse_scales(stacked[query], mask, weights)
         np.testing.assert_allclose(fused[query], expected, rtol=1e-4, atol=1e-4)
 
 
@@ -184,15 +183,14 @@ def test_balanced_fusion_has_a_gradient_where_all_scores_are_equal():
         assert np.isfinite(jax.grad(total)(scores)).all()
 
 
-@pytest.mark.parametrize("normalize", ["zscore", "none"])
 @given(data=st.data())
-def test_scales_are_fused_as_in_patch_netvlad(normalize, data):
+def test_scales_are_fused_as_in_patch_netvlad(data):
     scores = np.array(data.draw(st.lists(ROUGH, min_size=12, max_size=12)), np.float32).reshape(4, 3)
     mask = np.array(data.draw(st.lists(st.booleans(), min_size=4, max_size=4)))
     weights = (0.45, 0.15, 0.4)
     with np.errstate(invalid="ignore"):
-        expected = oracles.fuse_scales(scores, mask, weights, normalize)
-    got = fuse_scales(scores, mask, np.array(weights, np.float32), normalize=normalize)
+        expected = oracles.fuse_scales(scores, mask, weights)
+    got = fuse_scales(scores, mask, np.array(weights, np.float32))
     np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-4)
 
 
@@ -206,10 +204,8 @@ def test_no_score_is_no_fault_of_a_program():
 
 
 def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
-    scores, mask = np.array([[np.inf, 1], [1, 2], [3, np.nan]], np.float32), np.array([True, True, False])
-    for weight in (1, -2):
-        fused = fuse_scales(scores, mask, np.array([0, weight], np.float32), normalize="none")
-        np.testing.assert_array_equal(fused, [weight, 2 * weight, np.nan])
+    scores, mask = np.array([[np.inf, 1], [1, 3], [3, np.nan]], np.float32), np.array([True, True, False])
+    np.testing.assert_allclose(fuse_scales(scores, mask, np.float32([0, -2])), [2, -2, np.nan], rtol=1e-6)
     assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
 
 

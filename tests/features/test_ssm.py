@@ -13,7 +13,7 @@ from mfvpr import datasets
 from mfvpr.baselines import GridAnchors
 from mfvpr.datasets import ImageFolder
 from mfvpr.evaluation import match_sequence
-from mfvpr.evaluation.sequence_matching import matches_recipe
+from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.features import Aggregated, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting
 from mfvpr.features.ssm_features import SsmMaps
 from mfvpr.features.whitening import Whitening, fit_whitening

@@ -16,7 +16,7 @@ from mfvpr.evaluation.stages import explain
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map
 from mfvpr.localization import map as map_module
-from mfvpr.retrieval import FeatureFiles, Retrieval
+from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile, check_entry
 from mfvpr.utils import InputError
@@ -149,19 +149,6 @@ def test_nothing_is_compiled_after_the_warm_up(dataset, folder, compilations):
     assert predictions == [opened(folder).localize(path) for path in dataset.queries.paths]
     with pytest.raises(InputError, match="expected a map with images"):
         opened(folder.with_name("empty")).warm_up()
-
-
-def test_a_system_warms_up(compilations):
-    system = map_system(SIFT, VLAD, candidates=5)
-    system.warm_up((320, 240))
-    assert compilations.count
-    compilations.reset()
-    system.warm_up((320, 240))
-    replace(system, pipeline=replace(system.pipeline, candidates="all")).warm_up((20, 10))
-    assert compilations.count == 0
-    pipeline = replace(system.pipeline, extractor=FeatureFiles({}))
-    with pytest.raises(InputError, match=r"^FeatureFiles: expected an extractor of images, got a reader of features$"):
-        replace(system, pipeline=pipeline).warm_up((320, 240))
 
 
 def test_unsure_answers_are_no_place(dataset, folder):

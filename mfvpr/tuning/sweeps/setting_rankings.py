@@ -217,7 +217,7 @@ def _files(
     except TypeError as error:
         options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
         return None
-    fusion = (match_set.weights, match_set.normalize) if isinstance(match_set, Scales) else ()
+    fusion = f"scales of {match_set.weights}" if isinstance(match_set, Scales) else "one scale"
     matches = [[content_hash(query) for query in scale.matches] for scale in scales(match_set)]
     recipe["data"] = content_hash(fusion, matches, [scale.counts for scale in scales(match_set)], candidates, views)
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
