@@ -93,11 +93,8 @@ def test_what_is_reported_is_what_the_set_has_alone(parts, joined):
 
 def test_sets_that_do_not_go_together_are_refused(parts):
     a, b, c = parts
-    with pytest.raises(InputError, match=r"learn on .*report on, got 3 and 0"):
-        join_data_sets(parts, [])
     with pytest.raises(InputError, match=r"names, got a, b, a"):
         join_data_sets([a, b], [replace(c, name="a")])
-    with pytest.raises(InputError, match=r"c: .*unit of a, frames, got m;"):
-        join_data_sets([a], [replace(c, protocol=replace(c.protocol, unit="m"))])
-    with pytest.raises(InputError, match=r"c: .*thresholds of a, \(0, 1, 2\), got \(0, 1, 3\);"):
-        join_data_sets([a], [replace(c, protocol=replace(c.protocol, thresholds=(0, 1, 3)))])
+    for changes, words in ({"unit": "m"}, r"unit m"), ({"thresholds": (0, 1, 3)}, r"thresholds \(0, 1, 3\)"):
+        with pytest.raises(InputError, match=rf"^c: expected unit frames with .* as a has, got .*{words}"):
+            join_data_sets([a], [replace(c, protocol=replace(c.protocol, **changes))])
