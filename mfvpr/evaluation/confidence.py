@@ -37,8 +37,7 @@ def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray
         drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
     height: the same, with the mean score of candidates of other places instead of the best.
 
-    A larger input means a more confident prediction. Database images within `apart` rows of the prediction count as its
-    place.
+    Database images within `apart` rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores = np.where(there, ranked.scores, 0.0).astype(np.float64)
@@ -85,18 +84,14 @@ class Confidence:
 def fit_confidence(
     values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *, apart: int = APART
 ) -> Confidence:
-    """Fit a logistic model with weights of at least 0 by penalized maximum likelihood.
+    """Fit a logistic model with weights of at least 0 by penalized maximum likelihood; InputError without predictions.
 
     If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: of `confidence_inputs` with this `apart`; rows that are not finite, without a prediction or without
-            candidates of other places, are left out.
+        values: of `confidence_inputs` with this `apart`; rows that are not finite are left out.
         correct: whether the top prediction is correct; False for queries without a place in the database.
-
-    Raises:
-        InputError: no predictions.
     """
     there = np.isfinite(values).all(axis=1)
     values, correct = values[there], correct[there]
@@ -135,7 +130,7 @@ class CalibrationData(NamedTuple):
         return int(np.isfinite(self.absent).all(axis=1).sum())
 
     def take(self, queries: Int[np.ndarray, " _"]) -> "CalibrationData":
-        """Select queries by their numbers."""
+        """The data of some queries."""
         return CalibrationData(*(values[queries] for values in self))
 
     def fit(self) -> Confidence:
@@ -170,10 +165,7 @@ def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
-    """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values).
-
-    An earlier file of confidences is replaced; an InputError for other files.
-    """
+    """Write confidences by name as JSON, with the recipe of their rankings; an InputError for another file."""
     require_replaceable(Path(path), _FORMAT.encode())
     values = {name: vars(confidence) for name, confidence in systems.items()}
     content = {"format": _FORMAT, "made": recipe, "systems": values}

@@ -40,6 +40,7 @@ _STEADY = 0.95  # otherwise, probability that it stays; else it changes by a few
 _BESIDE = 1.0  # rows, standard deviation: candidates speak for the rows next to them
 _MOST_ODDS = 50.0  # of a correct prediction: images may look like those of another place
 _REACH = 4  # standard deviations of the motion
+_EXACT = jax.lax.Precision.HIGHEST
 
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
 # on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
@@ -155,7 +156,7 @@ class DriveModel:
     ) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
         """The belief after the next image, of total 1, and the image's probability, from its likelihood."""
         reach, size = self.reach, len(self.there)
-        wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
+        wide = jnp.pad(jnp.matmul(self.changes.T, belief, precision=_EXACT), ((0, 0), (2 * reach, 2 * reach)))
         starts = reach - self.shifts - self.steps.shape[1] // 2
         moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
         outside = jnp.where(self._is_inside, 0.0, moved).sum()
@@ -172,7 +173,7 @@ class DriveModel:
         anywhere = (later * self.anywhere).sum()
         wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
         starts = self.reach + self.shifts - self.steps.shape[1] // 2
-        moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
+        moved = jnp.matmul(self.changes, self._convolve(wide, self.steps, starts, len(self.there)), precision=_EXACT)
         seen = (1 - self.kidnapped) * moved + self.kidnapped * anywhere
         return jnp.where(seen.max() > 0, seen / jnp.where(seen.max() > 0, seen.max(), 1.0), 1.0)
 
@@ -181,7 +182,7 @@ class DriveModel:
         size, beside = len(self.there), _gaussian(0.0, _BESIDE)
         places = jnp.where(evidence.rows < 0, size, evidence.rows)  # beyond the end: dropped
         shares = jnp.zeros(size).at[places].add(evidence.shares, mode="drop")
-        shares = jnp.convolve(shares, beside, precision=jax.lax.Precision.HIGHEST)[len(beside) // 2 :][:size]
+        shares = jnp.convolve(shares, beside, precision=_EXACT)[len(beside) // 2 :][:size]
         near = jnp.where(self.there, shares, 0.0)
         total = near.sum()
         relative = near * jnp.sum(self.there, dtype=near.dtype) / jnp.where(total > 0, total, 1.0)
@@ -197,10 +198,6 @@ class DriveModel:
         """Whether rows from -reach to size + reach are on the map or in a gap."""
         rows = jnp.arange(-self.reach, len(self.there) + self.reach)
         return ((rows >= 0) & (rows < len(self.there) - jnp.argmax(self.there[::-1])))[None]
-
-    def _changed(self, changes: Array, values: Array) -> Array:
-        """Products of changes `[speeds, speeds]` and values `[speeds, rows]`."""
-        return jnp.matmul(changes, values, precision=jax.lax.Precision.HIGHEST)
 
     def _convolve(self, values: Array, steps: Array, starts: Array, size: int) -> Array:
         """Totals over k of steps[v, k] * values[v, starts[v] + k + row], for `size` rows."""

@@ -16,7 +16,7 @@ from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matchers.match_set import MatchSet, Scales
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE
-from mfvpr.utils.numerics import at_least_single, compiled, is_concrete, masked, masked_mean, safe_sqrt
+from mfvpr.utils.numerics import at_least_single, compiled, masked, masked_mean, safe_sqrt
 
 if TYPE_CHECKING:
     from mfvpr.evaluation.drives import DriveFilter  # which ranks the rankings of this module again
@@ -264,19 +264,18 @@ def fuse(
     mask: Bool[Array, "queries candidates"],
     c: float | Array | None,
 ) -> Float[jax.Array, "queries candidates"]:
-    """Combined scores of several queries; None as `c` is `balancing_c` of each query."""
+    """Combined scores of several queries, NaN without a candidate; None as `c` is `balancing_c` of each query."""
     if c is None:
         c = jax.vmap(balancing_c)(retrieval_scores, scores, mask)[:, None]
-    retrieval_scores, scores = masked(retrieval_scores, mask), masked(scores, mask)
-    return combine(retrieval_scores, scores, c=c)
+    combined = combine(masked(retrieval_scores, mask), masked(scores, mask), c=c)
+    return jnp.where(mask, combined, jnp.nan)
 
 
 def fuse_shortlist(
     candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
 ) -> Scores:
-    """Combined scores of retrieval and re-ranking, see `fuse`; NaN without a candidate."""
-    fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
-    return np.asarray(_or_nan(fused, candidates.mask))
+    """Combined scores of retrieval and re-ranking, see `fuse`."""
+    return np.asarray(fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c))
 
 
 def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
@@ -293,6 +292,7 @@ def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> 
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
 
+@compiled
 def fuse_scales(
     scores: Num[Array, "*batch candidates scales"],
     mask: Bool[Array, "... candidates"],
@@ -304,12 +304,6 @@ def fuse_scales(
     candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation, and affects
     only the sum of its own candidate.
     """
-    return _or_nan(_fuse_scales(scores, mask, weights), mask)
-
-
-@compiled
-def _fuse_scales(scores: Array, mask: Array, weights: Array | None) -> Array:
-    """`fuse_scales`, 0 without a candidate."""
     scores = at_least_single(scores)
     weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
     mask = jnp.broadcast_to(mask, scores.shape[:-1])
@@ -317,7 +311,8 @@ def _fuse_scales(scores: Array, mask: Array, weights: Array | None) -> Array:
     scores = jnp.moveaxis(standardize(jnp.moveaxis(scores, -1, -2), mask[..., None, :]), -2, -1)
     counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
     scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be NaN
-    return jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+    fused = jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+    return jnp.where(mask, fused, jnp.nan)
 
 
 def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Array:
@@ -345,10 +340,3 @@ def _masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> 
     """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
     values, mask = values.reshape(-1), mask.reshape(-1)
     return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
-
-
-def _or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
-    """`values` where `mask`, NaN elsewhere."""
-    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
-        return jax.device_put(np.where(mask, values, np.nan))
-    return jnp.where(mask, values, jnp.nan)

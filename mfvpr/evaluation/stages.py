@@ -30,7 +30,7 @@ from mfvpr.core.scorer import (
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.rankings import Scores, fuse_scales
-from mfvpr.features.feature_set import FeatureSet, memory_budget
+from mfvpr.features.feature_set import memory_budget
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
@@ -168,11 +168,6 @@ def match(
     Raises:
         InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
     """
-    if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
-        is_known = (queries.counts > 0).any() and (database.counts > 0).any()
-        if is_known and queries.dimension != database.dimension:
-            got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
-            raise InputError(f"features: expected as many dimensions on both sides, got {got}")
     is_on_host = isinstance(matcher, PairSource)
     if store is None or is_on_host:
         runtime = replace(runtime, cluster=None)
@@ -285,31 +280,20 @@ def dominant_shifts(
     return shifts, intervals, sizes
 
 
+@compiled
 def pair_shifts(
     scorer: HistogramOfShifts, matches: Matches
-) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"]]:
+) -> tuple[Float[Array, "pairs 2"], Float[Array, "pairs 2 2"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
-    votes, *values = jax.tree.map(np.array, _pair_shifts(scorer, matches))
-    for of_pairs in values:  # the host makes the NaN: `jax_debug_nans` stops at those of programs
-        of_pairs[~votes] = np.nan
-    shifts, intervals = values
-    return shifts, intervals
 
-
-@compiled
-def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
-    """Whether any match votes `[P]`, and `pair_shifts`, 0 without votes."""
-
-    def of_pair(pair: Matches) -> tuple[Array, Array, Array]:
-        votes = scorer(pair) > 0
+    def of_pair(pair: Matches) -> tuple[Array, Array]:
         shifts = jnp.concatenate([scorer.dominant_shift(pair, refine=True)[None], scorer.shift_interval(pair)])
         if scorer.direction == "query_minus_candidate":
             shifts = -shifts[jnp.array([0, 2, 1])]
-        shifts = jnp.where(votes, shifts, 0.0)
-        shift, low, high = shifts
+        shift, low, high = jnp.where(scorer(pair) > 0, shifts, jnp.nan)
         floor = SHIFT_FLOOR * at_least_single(pair.image_size0).max()
         half = jnp.sqrt(((high - low) / 2) ** 2 + floor**2)
-        return votes, shift, (low + high)[None] / 2 + jnp.stack([-half, half])
+        return shift, (low + high)[None] / 2 + jnp.stack([-half, half])
 
     return jax.vmap(of_pair)(matches)
 

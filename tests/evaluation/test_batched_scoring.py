@@ -112,14 +112,3 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, tmp_path):
             order = rankings.rank_shortlist(listed, rankings.fuse_shortlist(listed, scores, setting["c"]))
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
-
-
-def test_scales_of_other_queries_or_weights_raise(data):
-    match_set, _ = data
-    for words, *arguments in (
-        (r"queries and candidates, got \[\(2, 5", [match_set, match_set.take(range(2))]),
-        (r"weight .*2 scales, got 1", [match_set] * 2, [1.0]),
-        ("expected match sets", []),
-    ):
-        with pytest.raises(mfvpr.InputError, match=words):
-            Scales(*arguments)

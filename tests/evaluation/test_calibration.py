@@ -63,15 +63,6 @@ def test_inputs_are_those_of_loops_over_candidates(ranking, apart):
     assert np.isinf(inputs[4]).all() == (apart == 5)
 
 
-def test_scores_that_are_all_equal_are_sure_of_nothing():
-    rows = np.arange(20)[None]
-    same = Ranked(rows, np.full((1, 20), 7.0))
-    assert confidence_inputs(same).tolist() == [[0.0, 0.0]]
-    alone = Ranked(rows, np.where(rows == 0, 7.0, 3.0))  # above 14 of other places without a spread of their own
-    spread = math.sqrt(2 * 16 * 0.05 * 0.95 / 16)
-    np.testing.assert_allclose(confidence_inputs(alone), np.log1p(4 / spread))
-
-
 @pytest.mark.parametrize(("tolerance", "around"), [(0, 5), (1, 5), (2, 10)])
 def test_an_absent_place_is_five_times_as_far_as_a_correct_prediction_at_least_five_frames(tolerance, around):
     ranked = Ranked(np.arange(30)[None], -np.arange(30.0)[None])

@@ -30,11 +30,10 @@ from mfvpr.tuning.learning.training import Fit, Schedule, fit
 from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
 
 Loss = Callable[[Array, Array, Array], Array]
+Scores, Mask = Num[Array, " candidates"], Bool[Array, " candidates"]
 
 
-def cross_entropy(
-    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"]
-) -> Float[Array, ""]:
+def cross_entropy(scores: Scores, positives: Mask, mask: Mask) -> Float[Array, ""]:
     """-log of the probability that softmax(scores) gives to all positives together, in nats."""
     scores, positives, real, teaches = _usable(scores, positives, mask)
     # The highest score is subtracted first: else scores in the thousands round a small loss away.
@@ -44,10 +43,7 @@ def cross_entropy(
 
 
 def smooth_recall_at_1(
-    scores: Num[Array, " candidates"],
-    positives: Bool[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
-    temperature: float | Float[Array, ""],
+    scores: Scores, positives: Mask, mask: Mask, temperature: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
 
@@ -59,10 +55,7 @@ def smooth_recall_at_1(
 
 
 def smooth_average_precision(
-    scores: Num[Array, " candidates"],
-    positives: Bool[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
-    temperature: float | Float[Array, ""],
+    scores: Scores, positives: Mask, mask: Mask, temperature: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), in [0, 1].
 
@@ -78,12 +71,11 @@ def smooth_average_precision(
     return jnp.where(teaches, 1 - masked_mean(rank_among_positives / rank, positives), 0.0)
 
 
-LOSSES: dict[str, Loss] = {
+LOSSES: dict[str, Loss] = {  # of the programs
     "cross_entropy": cross_entropy,
     "recall": partial(smooth_recall_at_1, temperature=1.0),
     "average_precision": partial(smooth_average_precision, temperature=1.0),
 }
-"""Losses of the programs, by name."""
 
 
 def mean_loss(

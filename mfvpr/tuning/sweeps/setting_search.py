@@ -210,7 +210,8 @@ def search_grid(
     axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), axes.grid()
     settings += [] if dict(axes.own_values) in settings else [dict(axes.own_values)]
-    rows = _rank(axes, settings, protocol, match_set, candidates, options)
+    of_scorer = list(map(axes.setting, settings))
+    rows = rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
     return Outcome(axes, protocol, settings, rows, sorted({*options.ks}), is_grid=True)
 
 
@@ -234,32 +235,23 @@ def search_optuna(
 
     axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), [dict(axes.own_values)]
+
+    def rank(settings: list[dict[str, Any]], label: str) -> np.ndarray:
+        of_scorer, labeled = list(map(axes.setting, settings)), replace(options, label=label)
+        return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=labeled)
+
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
-    rows = [_rank(axes, settings, protocol, match_set, candidates, replace(options, label="own values"))]
+    rows = [rank(settings, "own values")]
     while (done := len(settings) - 1) < trials:
         batch = [study.ask() for _ in range(min(BATCH, trials - done))]
         proposed = [suggest_setting(trial, axes) for trial in batch]
-        label = f"trials {done + 1} to {done + len(batch)} of {trials}"
-        rows.append(_rank(axes, proposed, protocol, match_set, candidates, replace(options, label=label)))
+        rows.append(rank(proposed, f"trials {done + 1} to {done + len(batch)} of {trials}"))
         recall = protocol.tuning(rows[-1])[..., protocol.main].mean(axis=0)
         for trial, value in zip(batch, recall, strict=True):
             study.tell(trial, float(value))
         settings += proposed
     return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
-
-
-def _rank(
-    axes: Axes,
-    settings: Sequence[Mapping[str, Any]],
-    protocol: EvaluationProtocol,
-    match_set: MatchSet | Scales,
-    candidates: Shortlist,
-    options: SweepOptions,
-) -> Int[np.ndarray, "views settings queries depth"]:
-    """Rows of the rankings by plain settings."""
-    of_scorer = [axes.setting(plain) for plain in settings]
-    return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
 
 
 def require_optuna() -> None:

@@ -9,11 +9,10 @@ import optax
 import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, score_candidates
-from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
+from mfvpr.baselines.learned_weight import ABSOLUTE, LearnedWeight
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.models import (
     LOSSES,
-    TEACHER_SIGMA,
     Model,
     Options,
     cross_entropy,
@@ -195,16 +194,3 @@ def test_it_finds_what_tells_right_matches_from_wrong_ones():
     )
     weigh = jax.jit(LearnedWeight.__call__)
     assert np.all((weigh(learned.weight, clear) > 2 * weigh(learned.weight, doubtful))[:24])
-
-
-def test_the_teacher_goes_with_the_size_of_the_images_that_learning_sees():
-    taught_split = split()
-    matches = [*taught_split.match_set.matches]
-    for query in taught_split.half.report:
-        matches[query] = replace(matches[query], image_size0=np.float32([900, 900]))
-    taught_split = replace(taught_split, match_set=replace(taught_split.match_set, matches=matches))
-    taught_model = Model.of_matches(taught_split, HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
-    assert taught_model.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
-    assert taught_model.teacher.bin_size == pytest.approx(taught_model.teacher.sigma / 2)
-    assert taught_model.teacher.max_bins >= 2 * max(SIZES) / taught_model.teacher.bin_size
-    assert taught_model.start["weight"].names == RELATIVE
