@@ -231,6 +231,7 @@ def off_the_map(drive: Drive, off: float, chance: float) -> float:
 
 
 Method = Literal["causal", "lagged", "smoothed"]
+Rows = Bool[np.ndarray, " rows"]  # of the database, that are there
 LAG = 5  # images
 
 
@@ -285,11 +286,7 @@ class DriveFilter:
 
 
 def follow(
-    evidence: Evidence,
-    drive: Drive,
-    there: Bool[np.ndarray, " rows"],
-    method: Method = "causal",
-    depth: int | None = None,
+    evidence: Evidence, drive: Drive, there: Rows, method: Method = "causal", depth: int | None = None
 ) -> Followed:
     """The first `depth` rows of each image of a drive, None = as many as candidates; see `DriveFilter`."""
     images, candidates = evidence.rows.shape

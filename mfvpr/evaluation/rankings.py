@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
 Scores = Float[np.ndarray, "queries candidates"]
+AnyScores = Num[Array, "queries candidates"]
 
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
 SEQUENCE = "sequence"  # in names of rankings by the motion along a drive
@@ -249,20 +250,15 @@ def balancing_c(
 
     Candidates count if `mask` is True, and both `retrieval_scores` and `rerank_scores` are finite.
     """
-    both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
-    retrieval_deviation, deviation = (
-        _masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
-    )
+    both, pair = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores), (retrieval_scores, rerank_scores)
+    retrieval_deviation, deviation = (_masked_std(at_least_32_bits(scores), both) for scores in pair)
     c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
     return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
 
 
 @compiled
 def fuse(
-    retrieval_scores: Num[Array, "queries candidates"],
-    scores: Num[Array, "queries candidates"],
-    mask: Bool[Array, "queries candidates"],
-    c: float | Array | None,
+    retrieval_scores: AnyScores, scores: AnyScores, mask: Bool[Array, "queries candidates"], c: float | Array | None
 ) -> Float[jax.Array, "queries candidates"]:
     """Combined scores of several queries, NaN without a candidate; None as `c` is `balancing_c` of each query."""
     if c is None:
