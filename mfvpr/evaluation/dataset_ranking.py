@@ -199,8 +199,8 @@ def match_sequence(
     if recipe is not None and cache.root is not None:
         scales = range(len(pipeline.scales))
         stores = [MatchStore(cache.root, recipe | {"scale": scale}, len(sequence.images)) for scale in scales]
-    matched = _read_matches(sequence, stores, cache, watch) if stores else None
-    if matched is None:
+    kept = _read_matches(sequence, stores, cache, watch) if stores else None
+    if kept is None:
         with watch("retrieval"):
             retrieved = retriever.shortlist(sequence, database, number, cache)
             retrieved = _check_candidates(retrieved, type(retriever).__name__, (len(sequence.images), number), database)
@@ -214,16 +214,19 @@ def match_sequence(
                 stages.match(*scale, retrieved.candidates, pipeline.matcher, store=store, runtime=cache.runtime)
                 for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
             )
-        matched = _matched(sequence, retrieved.candidates, matches, remarks, cache)
-    there = matched.candidates.mask
-    empty = int((there & (matched.matches[0].counts == 0)).sum())
+        kept = matches, retrieved.candidates, remarks
+    matches, candidates, remarks = kept
+    for line in remarks["warnings"]:
+        cache.warn(line)
+    bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
+    there = candidates.mask
+    empty = int((there & (matches[0].counts == 0)).sum())
     if pipeline.image_source is not None and empty and 2 * empty >= there.sum():
         cache.warn(f"{sequence.name}: {empty} of {there.sum()} pairs have no matches; they score 0")
-    missing = [row for row in np.flatnonzero(~there.any(axis=1)) if row not in matched.bad_queries]
-    if missing:
+    if missing := [row for row in np.flatnonzero(~there.any(axis=1)) if row not in bad[0]]:
         queries = f"{len(missing)} such queries of {len(sequence.images)}"
         cache.warn(f"{sequence.images.paths[missing[0]]}: no candidates ({queries}), which counts as a failure")
-    return replace(matched, weights=tuple(scale.weight for scale in pipeline.scales))
+    return Matched(sequence, candidates, matches, *bad, tuple(scale.weight for scale in pipeline.scales))
 
 
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:
@@ -252,8 +255,8 @@ def matches_recipe(
 
 def _read_matches(
     sequence: QuerySequence, stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch
-) -> Matched | None:
-    """Matches of all scales from the stores; None if some are missing."""
+) -> tuple[tuple[MatchSet, ...], Shortlist, dict[str, Any]] | None:
+    """Matches of all scales from the stores, their shortlist, and remarks on images; None if some are missing."""
     if not all(store.has_all(range(len(sequence.images))) for store in stores):
         return None
     try:
@@ -267,21 +270,7 @@ def _read_matches(
         cache.warn(f"{stores[0].folder}: has damaged files; their queries are matched again")
         return None
     match_sets, [shortlist, *_] = zip(*scales, strict=True)
-    return _matched(sequence, shortlist, match_sets, remarks, cache)
-
-
-def _matched(
-    sequence: QuerySequence,
-    candidates: Shortlist,
-    matches: tuple[MatchSet, ...],
-    remarks: Mapping[str, Any],
-    cache: FeatureCache,
-) -> Matched:
-    """Matches with the remarks on their images, whose warnings are given."""
-    for line in remarks["warnings"]:
-        cache.warn(line)
-    bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
-    return Matched(sequence, candidates, matches, *bad)
+    return match_sets, shortlist, remarks
 
 
 def _extract(

@@ -178,7 +178,7 @@ class EvaluationProtocol:
         """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
-        views = zip(rows[1:], self.halves, strict=True)
+        views = zip(rows[1:], self.halves, strict=False)
         return np.stack([self.hits(view[:, half.tune], half.tune).mean(axis=-1).T for view, half in views])
 
     def reported_hits(

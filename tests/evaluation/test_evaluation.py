@@ -10,8 +10,8 @@ import pytest
 
 import mfvpr
 from mfvpr import datasets
-from mfvpr.datasets import IndexFile, Positives
-from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, match_sequence
+from mfvpr.datasets import IndexFile
+from mfvpr.evaluation import Fusion, match_sequence
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
@@ -88,20 +88,6 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, result,
         assert [float(value) for value in path] == pytest.approx(path_test(hits[first], hits[second]), rel=1e-6)
 
 
-def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
-    """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
-    result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
-    report = EvaluationReport(result, [0, 1], [1])
-    inputs = np.concatenate([confidence_inputs(ranked) for ranked in result.systems["count"]])
-    correct, halved = report.hits("count"), halves(dataset.truth.positives(1))
-    for half in halved:
-        fitted = fit_confidence(inputs[half.tune], correct[half.tune])
-        expected = fitted.probability(inputs[half.report])
-        assert np.isfinite(expected).all()
-        np.testing.assert_allclose(report.probabilities["count"][half.report], expected)
-    assert [len(part) for part in report.by_sequence(report.scores("count"))] == [3, 7]
-
-
 def test_only_candidates_are_extracted(dataset, tmp_path):
     few = replace(dataset.only, images=replace(dataset.queries, names=dataset.queries.names[:2]), truth=None)
     lines = []
@@ -167,20 +153,6 @@ def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result
             np.testing.assert_allclose(got.scores, expected.scores, rtol=1e-5)
 
 
-def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
-    excluded = Positives.from_rows([[row] for row in range(10)], 10)
-    sequence = replace(dataset.only, excluded=excluded)
-    listed = ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")})
-    for width in (2, 7):
-        candidates = listed.shortlist(sequence, dataset.database, width, FeatureCache()).candidates
-        assert candidates.indices.shape == (10, width)
-        assert not excluded.contains(candidates.indices).any()
-        for row, mask in zip(candidates.indices, candidates.mask, strict=True):
-            assert (row[mask] >= 0).all()
-            assert (row[~mask] == -1).all()
-            assert (np.diff(mask.astype(int)) <= 0).all()
-
-
 def test_queries_without_candidates_are_told(dataset, tmp_path):
     """Also where matches are kept from before, and nothing else is read."""
     pairs = tmp_path / "pairs.txt"
@@ -218,7 +190,7 @@ def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several,
     runtime = mfvpr.Runtime(log=lines.append)
     evaluate_parts(several, SIFT, whitened, SCORERS, candidates=5, cache=FeatureCache(tmp_path), runtime=runtime)
     assert fitted == [VLAD.describer.fitting, whitened.search]
-    assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[1:2]
+    assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[:1]
     assert sum("images to do" in line for line in lines) == 3
 
 

@@ -153,11 +153,3 @@ def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_c
     tuning = outcome.protocol.tuning(outcome.rows)[:, 1:, outcome.protocol.main].mean(axis=0)
     np.testing.assert_array_equal(values, tuning)
     assert (tuning != outcome.recall[1:, outcome.protocol.main]).all()  # of all queries, reported ones among them
-
-
-def test_neighbors_of_the_best_are_shown_where_not_all_settings_are(data, monkeypatch):
-    axes = Axes(SUM, {"clamp": [False, True], "c": [0, 1, 2]}, {"clamp": False, "c": 0})
-    outcome = sweeping.search_grid(axes, evaluation_protocol(TRUTH, TOLERANCES), *data)
-    assert "neighbors" not in sweeps.sweep_summary(outcome, "")
-    monkeypatch.setattr(sweeps, "TOP", 2)
-    assert "The best, and its neighbors in the grid:" in sweeps.sweep_summary(outcome, "")

@@ -15,7 +15,6 @@ from mfvpr.evaluation import rankings
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.matchers.match_set import shapes, slots
 from mfvpr.tuning import sweeps
-from mfvpr.tuning.sweeps import Axes
 from mfvpr.tuning.sweeps.setting_rankings import group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -241,18 +240,6 @@ def test_whole_numbers_and_keys_are_swept_and_kept(data, tmp_path):
     for _ in range(2):
         got = rank(sampled, settings, *data, folder=tmp_path)
         np.testing.assert_array_equal(got[0, 0, :, :CANDIDATES], one_by_one(sampled, settings[0], *data))
-
-
-def test_a_number_named_as_retrievals_share_is_refused():
-    @mfvpr.value
-    class Score:
-        c: float = 1.0
-
-        def __call__(self, matches):
-            return self.c * mfvpr.MatchCount()(matches)
-
-    with pytest.raises(ValueError, match=r"Score\.c: a grid means something else by c"):
-        Axes(Score(), {"c": [0.5]})
 
 
 def all_nan(matches):
