@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from mfvpr.cli import programs, schema
 from mfvpr.cli.programs import launch
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.assembly import CONF
 from mfvpr.utils.fields import from_values
 
 ROOT = Path(__file__).parent.parent

@@ -1,31 +1,21 @@
 """Checkpoints without torch: a writer of its files, byte by byte; random weights under the public names and shapes."""
 
+import io
 import math
 import pickle
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import chain, pairwise
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.io import savemat
 
-KINDS = {
-    "f4": "FloatStorage",
-    "f8": "DoubleStorage",
-    "f2": "HalfStorage",
-    "i8": "LongStorage",
-    "i4": "IntStorage",
-    "i2": "ShortStorage",
-    "i1": "CharStorage",
-    "u1": "ByteStorage",
-    "b1": "BoolStorage",
-    "c8": "ComplexFloatStorage",
-}
+KINDS = {"f4": "FloatStorage", "f8": "DoubleStorage", "f2": "HalfStorage", "i8": "LongStorage"}
 Shapes = dict[str, tuple[int, ...]]
 
 
@@ -36,83 +26,47 @@ class Global(NamedTuple):
     name: str
 
 
-class Call(NamedTuple):
-    """A call that a pickle asks for."""
+class _Pickler(pickle._Pickler):  # type: ignore
+    """Pickles as torch does; the arrays of tensors gather in `storages`."""
 
-    function: Any
-    arguments: Any
-
-
-@dataclass
-class View:
-    """A tensor, and what its file says of it; by default the whole array."""
-
-    array: np.ndarray
-    offset: Any = 0
-    shape: Any = None
-    strides: Any = None
-    kind: str | None = None
-    key: str | None = None
-    count: Any = None
-    module: str = "torch"
-
-
-class Writer:
-    """Pickles as torch does, protocol 2; the arrays of tensors gather in `storages`."""
-
-    def __init__(self, *, legacy: bool = False) -> None:
+    def __init__(self, file: io.BytesIO, *, legacy: bool = False) -> None:
+        super().__init__(file, protocol=2)
         self.storages: dict[str, np.ndarray] = {}
         self.legacy = legacy
 
-    def pickled(self, value: Any) -> bytes:
-        return b"\x80\x02" + self._put(value) + b"."
+    def save(self, obj: Any, save_persistent_id: bool = True) -> None:
+        if isinstance(obj, Global):
+            self.write(f"c{obj.module}\n{obj.name}\n".encode())
+        elif isinstance(obj, np.ndarray):
+            key, kind = str(len(self.storages)), Global("torch", KINDS[obj.dtype.str[1:]])
+            self.storages[key] = obj
+            self.save(Global("torch._utils", "_rebuild_tensor_v2"))
+            self.write(pickle.MARK)
+            self.save(("storage", kind, key, "cpu", obj.size, *[None] * self.legacy))
+            self.write(pickle.BINPERSID)
+            strides = tuple(step // obj.itemsize for step in obj.strides)
+            for part in (0, obj.shape, strides, False, OrderedDict()):
+                self.save(part)
+            self.write(pickle.TUPLE + pickle.REDUCE)
+        else:
+            super().save(obj, save_persistent_id)
 
-    def _put(self, value: Any) -> bytes:
-        match value:
-            case bytes():  # instructions
-                return value
-            case Global(module, name):
-                return f"c{module}\n{name}\n".encode()
-            case Call(function, arguments):
-                return self._put(function) + self._put(arguments) + b"R"
-            case np.ndarray():
-                return self._tensor(View(value))
-            case View():
-                return self._tensor(value)
-            case dict():
-                return b"}(" + self._put_all(chain.from_iterable(value.items())) + b"u"
-            case tuple():
-                return b"(" + self._put_all(value) + b"t"
-            case list():
-                return b"](" + self._put_all(value) + b"e"
-            case str():
-                return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
-        return pickle.dumps(value, protocol=2)[2:-1]  # None, True, False, numbers
 
-    def _put_all(self, values: Iterable[Any]) -> bytes:
-        return b"".join(map(self._put, values))
-
-    def _tensor(self, view: View) -> bytes:
-        array = view.array
-        key = str(len(self.storages)) if view.key is None else view.key
-        self.storages[key] = array
-        kind = view.kind or KINDS[array.dtype.str[1:]]
-        count = array.size if view.count is None else view.count
-        identity = ("storage", Global(view.module, kind), key, "cpu", count) + ((None,) if self.legacy else ())
-        shape = array.shape if view.shape is None else view.shape
-        strides = tuple(step // array.itemsize for step in array.strides) if view.strides is None else view.strides
-        hooks = Call(Global("collections", "OrderedDict"), ())
-        arguments = (self._put(identity) + b"Q", view.offset, shape, strides, False, hooks)
-        return self._put(Call(Global("torch._utils", "_rebuild_tensor_v2"), arguments))
+def pickled(content: Any, *, legacy: bool = False) -> tuple[bytes, dict[str, np.ndarray]]:
+    """A pickle, and the arrays of its tensors by key."""
+    file = io.BytesIO()
+    pickler = _Pickler(file, legacy=legacy)
+    pickler.dump(content)
+    return file.getvalue(), pickler.storages
 
 
 def write_zip(path: Path, content: Any, *, order: str = "little", compression: int = zipfile.ZIP_STORED) -> Path:
     """A checkpoint as torch has written them since 1.6."""
-    writer = Writer()
+    data, storages = pickled(content)
     with zipfile.ZipFile(path, "w", compression) as archive:
-        archive.writestr(f"{path.stem}/data.pkl", writer.pickled(content))
+        archive.writestr(f"{path.stem}/data.pkl", data)
         archive.writestr(f"{path.stem}/byteorder", order)
-        for key, array in writer.storages.items():
+        for key, array in storages.items():
             archive.writestr(f"{path.stem}/data/{key}", array.astype(array.dtype.newbyteorder(order)).tobytes("A"))
         archive.writestr(f"{path.stem}/version", "3\n")
     return path
@@ -120,12 +74,10 @@ def write_zip(path: Path, content: Any, *, order: str = "little", compression: i
 
 def write_legacy(path: Path, content: Any) -> Path:
     """A checkpoint as torch wrote them before."""
-    writer = Writer(legacy=True)
     system = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"int": 4}}
-    parts = [writer.pickled(value) for value in (0x1950A86A20F9469CFC6C, 1001, system, content)]
-    parts.append(writer.pickled(sorted(writer.storages)))
-    for _, array in sorted(writer.storages.items()):
-        parts.append(struct.pack("<q", array.size) + array.tobytes("A"))
+    data, storages = pickled(content, legacy=True)
+    parts = [pickled(0x1950A86A20F9469CFC6C)[0], pickled(1001)[0], pickled(system)[0], data, pickled([*storages])[0]]
+    parts += [struct.pack("<q", array.size) + array.tobytes("A") for array in storages.values()]
     path.write_bytes(b"".join(parts))
     return path
 
@@ -198,21 +150,9 @@ def with_biases(weights: Shapes) -> Shapes:
     }
 
 
-_VGG16 = {
-    0: (3, 64),
-    2: (64, 64),
-    5: (64, 128),
-    7: (128, 128),
-    10: (128, 256),
-    12: (256, 256),
-    14: (256, 256),
-    17: (256, 512),
-    19: (512, 512),
-    21: (512, 512),
-    24: (512, 512),
-    26: (512, 512),
-    28: (512, 512),
-}
+_POSITIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # of VGG16's convolutions in torch's networks
+_WIDTHS = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+_VGG16 = dict(zip(_POSITIONS, pairwise(_WIDTHS), strict=True))
 
 
 def _vgg16(prefix: str, last: int = 28) -> Shapes:
@@ -225,15 +165,15 @@ def d2net_shapes() -> Shapes:
     return _vgg16("dense_feature_extraction.model", last=21)
 
 
-def places365_shapes(weights: str = "weights", *, full: bool = True) -> Shapes:
-    """The tensors of vgg16_places365.npy, and of other files with Caffe's names; those SSM-VPR needs unless `full`."""
+def places365_shapes(*, full: bool = True) -> Shapes:
+    """The tensors of vgg16_places365.npy; those SSM-VPR needs unless `full`."""
     names = (f"conv{block}_{place}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for place in range(1, count + 1))
     shapes = {name: (*widths[::-1], 3, 3) for name, widths in zip(names, _VGG16.values(), strict=True)}
     if full:
         shapes |= {"fc6_1": (4096, 25_088), "fc7_1": (4096, 4096), "fc8a_1": (365, 4096)}
     else:
         del shapes["conv5_3"]
-    return {name.replace("weight", weights): shape for name, shape in with_biases(shapes).items()}
+    return {name.replace("weight", "weights"): shape for name, shape in with_biases(shapes).items()}
 
 
 def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> Shapes:

@@ -11,7 +11,7 @@ import pytest
 from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
-from mfvpr.systems.choices import CONF, GROUPS, choices_of
+from mfvpr.systems.assembly import CONF, GROUPS, choices_of
 from mfvpr.utils.fields import settings_of
 from notebooks.draw_results import candidate_times, draw, query_times, real_recall
 from tests import programs

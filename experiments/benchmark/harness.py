@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mfvpr.cli.console import Progress
+from mfvpr.cli.console import progress
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import versions
@@ -51,9 +51,9 @@ def take_turns(entries: list[Entry], rounds: int) -> tuple[Seconds, Results]:
     Calls of a few milliseconds are repeated untimed before each timed one: other implementations have just emptied the
     caches, and their idle threads may still be spinning.
     """
-    results = {(step, name): call() for step, name, call in Progress("warm-up", len(entries), entries)}
+    results = {(step, name): call() for step, name, call in progress("warm-up", len(entries), entries)}
     seconds: dict[tuple[str, str], list[float]] = {name: [] for name in results}
-    for _ in Progress("rounds", rounds, range(rounds)):
+    for _ in progress("rounds", rounds, range(rounds)):
         for step, name, call in entries:
             times = seconds[step, name]
             is_quick = bool(times) and times[-1] < QUICK

@@ -27,9 +27,10 @@ def torch_weights(arrays: Mapping[str, np.ndarray], table: Table, device: str, l
     @cache
     def weight(key: str) -> Tensor:
         rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
-        array, axes = arrays[match.expand(rule.target)], rule.layout.value.axes
-        array = array.squeeze() if rule.layout.value.squeezed else array
-        tensor = torch.from_numpy(np.array(array if axes is None else array.transpose(np.argsort(axes)))).to(device)
+        array = arrays[match.expand(rule.target)]
+        if rule.axes:
+            array = array.reshape(array.shape[-len(rule.axes) :]).transpose(np.argsort(rule.axes))
+        tensor = torch.from_numpy(np.array(array)).to(device)
         return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
 
     return weight

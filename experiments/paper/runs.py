@@ -82,7 +82,7 @@ def input_fingerprints(settings: Evaluate, images: Mapping[str, str], truth: str
     fixed["dataset"] = {name: value for name, value in settings.dataset.items() if name not in ("root", "cache")}
     fixed["dataset"] |= {name: None for name in ("database", "queries") if name in fixed["dataset"]}  # folders
     names = [group.get("weights") for group in (settings.features, settings.retrieval, settings.matching)]
-    weights = {name: files.read_manifest(name).sha256 for name in names if name in REGISTRY}
+    weights = {name: files.read_provenance(name)["sha256"] for name in names if name in REGISTRY}
     return {
         "settings": fingerprint(fixed),
         "images": fingerprint(dict(images)),

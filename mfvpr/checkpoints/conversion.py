@@ -5,9 +5,8 @@ shapes are checked.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import partial
 from itertools import chain
 from typing import NamedTuple
@@ -17,35 +16,22 @@ import numpy as np
 from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 
-_MOST_EXAMPLES = 3  # of problems in a message
-
-
-class _Change(NamedTuple):
-    axes: tuple[int, ...] | None = None  # of the source, in our order
-    squeezed: bool = False  # whether to ignore axes of length 1 in both shapes
-    sign: int = 1
-    first_pixel: bool = False  # of an image with equal pixels
-
-
-class Layout(Enum):
-    """Change of an array from its file's convention to ours."""
-
-    COPY = _Change()
-    CONV = _Change((2, 3, 1, 0))  # OIHW -> HWIO
-    UPSAMPLING = _Change((2, 3, 0, 1))  # a transposed convolution's IOHW -> HWIO
-    LINEAR = _Change((1, 0))  # (out, in) -> (in, out)
-    POINTWISE = _Change((1, 0), squeezed=True)  # (out, in, 1, 1) -> (in, out), or (1, 1, in, out)
-    SQUEEZED = _Change(squeezed=True)  # (1, O, 1, 1) and the like -> (O,)
-    OPPOSITE = _Change((1, 0), squeezed=True, sign=-1)  # (in, out) of the other sign -> (out, in)
-    PIXEL = _Change(first_pixel=True)  # (H, W, C) -> (C,)
+# Axes of the source in our order.
+CONV = (2, 3, 1, 0)  # OIHW -> HWIO
+UPSAMPLING = (2, 3, 0, 1)  # a transposed convolution's IOHW -> HWIO
+LINEAR = (1, 0)  # (out, in) -> (in, out), also of 1 x 1 convolutions
 
 
 class Rule(NamedTuple):
-    """Assign keys that fully match `source`, a regular expression, to `target`, a dotted path with its groups."""
+    """Assign keys that fully match `source`, a regular expression, to `target`, a dotted path with its groups.
+
+    `change` is applied first, then the order of `axes`. Axes of length 1 do not count.
+    """
 
     source: str
     target: str
-    layout: Layout = Layout.COPY
+    axes: tuple[int, ...] = ()
+    change: Callable[[np.ndarray], np.ndarray] = np.asarray
 
 
 @dataclass(frozen=True)
@@ -81,41 +67,37 @@ def convert(
         if target not in shapes or target in parameters:
             problems.append(f"{shorten(key)} {'twice' if target in parameters else 'unknown'}")
             continue
-        parameters[target], problem = _convert_tensor(value, rules[0][1].layout, shapes[target])
+        parameters[target], problem = _convert_tensor(value, rules[0][1], shapes[target])
         problems += [f"{key} {problem}"] if problem else []
     problems += [f"{target} missing" for target in shapes if target not in parameters]
     if problems:
-        examples = "; ".join(problems[:_MOST_EXAMPLES])
-        raise InputError(f"keys do not fit the network in {len(problems)} places: {examples}")
+        raise InputError(f"keys do not fit the network in {len(problems)} places: {'; '.join(problems[:3])}")
     return parameters
 
 
-def _convert_tensor(value: np.ndarray, layout: Layout, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+def _convert_tensor(value: np.ndarray, rule: Rule, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     """The parameter of this shape, and what does not fit in a tensor."""
-    change = layout.value
-    if change.first_pixel and value.ndim:
-        value = value[(0,) * (value.ndim - 1)]
-    significant, got = (
-        tuple(side for side in each if side != 1 or not change.squeezed) for each in (shape, value.shape)
-    )
-    axes = change.axes or tuple(range(len(significant)))
-    expected = tuple(significant[axes.index(axis)] for axis in range(len(significant)))
-    if got != expected:
-        return value, f"of another shape: expected {expected}, got {value.shape}"
     if value.dtype not in (np.float32, np.float64):
         return value, f"of another type: expected float32 or float64, got {value.dtype}"
-    ordered = value.reshape(expected).transpose(axes)
-    return (change.sign * np.array(ordered, np.float32, order="C")).reshape(shape), ""
+    try:
+        ordered = rule.change(value)
+        if rule.axes:
+            ordered = ordered.reshape(ordered.shape[: len(rule.axes)]).transpose(rule.axes)
+        if [side for side in ordered.shape if side != 1] == [side for side in shape if side != 1]:
+            return np.array(ordered, np.float32, order="C").reshape(shape), ""
+    except (ValueError, IndexError):  # another number of axes
+        pass
+    return value, f"of another shape: {value.shape} does not give {shape}"
 
 
 _COUNTERS = r".*\.num_batches_tracked"
 
 
-def _linear(source: str, target: str, layout: Layout = Layout.LINEAR) -> tuple[Rule, ...]:
-    return Rule(rf"{source}\.weight", f"{target}.kernel", layout), Rule(rf"{source}\.bias", f"{target}.bias")
+def _linear(source: str, target: str, axes: tuple[int, ...] = LINEAR) -> tuple[Rule, ...]:
+    return Rule(rf"{source}\.weight", f"{target}.kernel", axes), Rule(rf"{source}\.bias", f"{target}.bias")
 
 
-_convolution = partial(_linear, layout=Layout.CONV)
+_convolution = partial(_linear, axes=CONV)
 
 
 def _norm(source: str, target: str) -> tuple[Rule, ...]:
@@ -140,30 +122,22 @@ def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
 
 D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
 
-# SSM-VPR's file, and torch files of the same Caffe model with the names of Caffe or torchvision.
 SSM = Table(
-    (
-        Rule(r"(conv\d_\d)\.weights?", r"vgg.\1.kernel", Layout.CONV),
-        Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias", Layout.SQUEEZED),
-        *_vgg("features"),
-    ),
-    ignored=(  # layers behind the last map
-        r"(conv5_3|fc[678]\w*)\.(weights?|bias)",
-        r"(features\.28|classifier\.\d)\.(weight|bias)",
-    ),
-    expected={r"fc8\w*\.weights?|classifier\.6\.weight": (365, 4096)},  # ImageNet's networks have 1000 classes
+    (Rule(r"(conv\d_\d)\.weights", r"vgg.\1.kernel", CONV), Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias")),
+    ignored=(r"(conv5_3|fc[678]\w*)\.(weights|bias)",),  # layers behind the last map
+    expected={r"fc8\w*\.weights": (365, 4096)},  # ImageNet's networks have 1000 classes
 )
 
 
 def _resnet(conv1: str, bn1: str, layers: Mapping[str, str]) -> tuple[Rule, ...]:
     """Rules of a backbone; `layers` maps the file's names of layers to ours."""
-    rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", Layout.CONV), *_batch_norm(bn1, "backbone.bn1")]
+    rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", CONV), *_batch_norm(bn1, "backbone.bn1")]
     for source, layer in layers.items():
         block, ours = rf"{source}\.(\d)", rf"backbone.{layer}.\1"
         rules += [
-            Rule(rf"{block}\.(conv\d)\.weight", rf"{ours}.\2.kernel", Layout.CONV),
+            Rule(rf"{block}\.(conv\d)\.weight", rf"{ours}.\2.kernel", CONV),
             *_batch_norm(rf"{block}\.(bn\d)", rf"{ours}.\2"),
-            Rule(rf"{block}\.downsample\.0\.weight", f"{ours}.shortcut.kernel", Layout.CONV),
+            Rule(rf"{block}\.downsample\.0\.weight", f"{ours}.shortcut.kernel", CONV),
             *_batch_norm(rf"{block}\.downsample\.1", f"{ours}.shortcut_bn"),
         ]
     return tuple(rules)
@@ -189,19 +163,19 @@ _CONV = r"(block\d\.conv\d|conv\d)"
 
 ALIKED = Table(
     (
-        Rule(rf"{_CONV}\.weight", r"\1.kernel", Layout.CONV),
-        Rule(r"(block\d\.conv\d)\.regular_conv\.weight", r"\1.kernel", Layout.CONV),  # the deformable convolution's
+        Rule(rf"{_CONV}\.weight", r"\1.kernel", CONV),
+        Rule(r"(block\d\.conv\d)\.regular_conv\.weight", r"\1.kernel", CONV),  # the deformable convolution's
         *_convolution(r"(block\d\.conv\d)\.offset_conv", r"\1.offset"),
         *_batch_norm(r"(block\d\.bn\d)", r"\1"),
         *_convolution(r"(block\d)\.downsample", r"\1.shortcut"),
         *(
-            Rule(rf"score_head\.{position}\.weight", f"score_head.{place}.kernel", Layout.CONV)
+            Rule(rf"score_head\.{position}\.weight", f"score_head.{place}.kernel", CONV)
             for place, position in enumerate((0, 2, 4, 6))
         ),
         Rule(r"desc_head\.agg_weights", "desc_head.agg_weights"),
         *_convolution(r"desc_head\.offset_conv\.0", "desc_head.offset1"),
         *_convolution(r"desc_head\.offset_conv\.2", "desc_head.offset2"),
-        Rule(r"desc_head\.sf_conv\.weight", "desc_head.sample.kernel", Layout.CONV),
+        Rule(r"desc_head\.sf_conv\.weight", "desc_head.sample.kernel", CONV),
     ),
     ignored=(_COUNTERS,),
 )
@@ -219,7 +193,7 @@ def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, .
 LIGHTGLUE = Table(
     (
         *_linear("input_proj", "input"),
-        Rule(r"posenc\.Wr\.weight", "position.kernel", Layout.LINEAR),
+        Rule(r"posenc\.Wr\.weight", "position.kernel", LINEAR),
         *_attention("self", "within", {"Wqkv": "inputs.0", "out_proj": "message"}),
         *_attention("cross", "across", {"to_qk": "inputs.0", "to_v": "inputs.1", "to_out": "message"}),
         *_linear(r"log_assignment\.(\d)\.final_proj", r"layers.\1.projection"),
@@ -233,9 +207,9 @@ LIGHTGLUE = Table(
 NETVLAD = Table(
     (
         *_vgg(r"encoder(?:\.module)?"),
-        Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", Layout.POINTWISE),
+        Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", LINEAR),
         Rule(r"pool(?:\.module)?\.centroids", "pool.centers"),
-        *_linear(r"WPCA\.0", "projection", Layout.POINTWISE),
+        *_linear(r"WPCA\.0", "projection"),
     )
 )
 
@@ -243,15 +217,15 @@ NETVLAD = Table(
 NETVLAD_MATLAB = Table(
     (
         *(
-            Rule(rf"net\.layers\.{position}\.weights\.{place}", f"vgg.{name}.{part}", Layout.SQUEEZED)
+            Rule(rf"net\.layers\.{position}\.weights\.{place}", f"vgg.{name}.{part}")
             for position, name in _VGG.items()
             for place, part in enumerate(("kernel", "bias"))
         ),
-        Rule(r"net\.layers\.30\.weights\.0", "pool.assignment.kernel", Layout.SQUEEZED),
-        Rule(r"net\.layers\.30\.weights\.1", "pool.centers", Layout.OPPOSITE),
-        Rule(r"net\.layers\.33\.weights\.0", "projection.kernel", Layout.SQUEEZED),
-        Rule(r"net\.layers\.33\.weights\.1", "projection.bias", Layout.SQUEEZED),
-        Rule(r"net\.meta\.normalization\.averageImage", "average", Layout.PIXEL),
+        Rule(r"net\.layers\.30\.weights\.0", "pool.assignment.kernel"),
+        Rule(r"net\.layers\.30\.weights\.1", "pool.centers", LINEAR, np.negative),
+        Rule(r"net\.layers\.33\.weights\.0", "projection.kernel"),
+        Rule(r"net\.layers\.33\.weights\.1", "projection.bias"),
+        Rule(r"net\.meta\.normalization\.averageImage", "average", change=lambda image: image[0, 0]),
     ),
     ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # settings of the training
 )
@@ -272,9 +246,9 @@ GEM_RESNET50 = Table(
 def _transformer(source: str, target: str) -> tuple[Rule, ...]:
     block, ours = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
     return (
-        Rule(rf"{source}cls_token", f"{target}first", Layout.SQUEEZED),
-        Rule(rf"{source}pos_embed", f"{target}positions", Layout.SQUEEZED),
-        Rule(rf"{source}register_tokens", f"{target}registers", Layout.SQUEEZED),
+        Rule(rf"{source}cls_token", f"{target}first"),
+        Rule(rf"{source}pos_embed", f"{target}positions"),
+        Rule(rf"{source}register_tokens", f"{target}registers"),
         *_convolution(rf"{source}patch_embed\.proj", f"{target}patches"),
         *_linear(rf"{block}\.attn\.qkv", f"{ours}.attention.qkv"),
         *_linear(rf"{block}\.attn\.proj", f"{ours}.attention.output"),
@@ -300,7 +274,7 @@ SELAVPR = Table(
         *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc1", r"backbone.blocks.\1.parallel.hidden"),
         *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc2", r"backbone.blocks.\1.parallel.output"),
         Rule(rf"{_SELA}aggregation\.1\.p", "pool.power"),
-        *_linear(rf"{_SELA}LocalAdapt\.upconv(\d)", r"upsampling\1", Layout.UPSAMPLING),
+        *_linear(rf"{_SELA}LocalAdapt\.upconv(\d)", r"upsampling\1", UPSAMPLING),
     ),
     ignored=(rf"{_SELA}backbone\.{_MASK}",),
 )

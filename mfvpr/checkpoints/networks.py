@@ -45,7 +45,7 @@ class Entry:
 class Network(NamedTuple):
     """A network of the package, and the table of its published checkpoints."""
 
-    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, returns its constructor
+    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, untraced; returns its constructor
     table: Table
 
 
@@ -65,51 +65,44 @@ _LICENSES = {  # network -> of the code and of the weights
 }
 
 
-class _Model(NamedTuple):
-    """A class of `mfvpr.networks` with arguments, and the table of its checkpoints."""
-
-    table: Table
-    name: str
-    arguments: tuple[Any, ...] = ()
-    options: Mapping[str, Any] = {}
-
-    def builder(self) -> Callable[..., "nnx.Module"]:
-        from mfvpr import networks
-
-        return partial(getattr(networks, self.name), *self.arguments, **self.options)
-
-
 def _publish(
     network: str,
     name: str,
     source: str,
-    model: _Model,
+    table: Table,
+    model: str,
+    *arguments: Any,
     file: str = "",
     size: int | None = None,
     sha256: str | None = None,
     licenses: tuple[str, str] | None = None,
+    **options: Any,
 ) -> None:
-    """Register a file and its network; the source ends with the file by default."""
+    """Register a file, and the class of `mfvpr.networks` with these arguments; the source ends with the file."""
+
+    def builder() -> Callable[..., "nnx.Module"]:
+        from mfvpr import networks
+
+        return partial(getattr(networks, model), *arguments, **options)
+
     file, licenses = file or source.rpartition("/")[2], licenses or _LICENSES[network]
     REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses)
-    NETWORKS[name] = Network(model.builder, model.table)
-
-
-def _drive(file_id: str) -> str:
-    return f"https://drive.google.com/file/d/{file_id}/view"
+    NETWORKS[name] = Network(builder, table)
 
 
 for _name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism"):
-    _publish("d2net", _name, f"https://dusmanu.com/files/d2-net/{_name}.pth", _Model(conversion.D2NET, "D2Net"))
+    _publish("d2net", _name, f"https://dusmanu.com/files/d2-net/{_name}.pth", conversion.D2NET, "D2Net")
+
+_DRIVE = "https://drive.google.com/file/d/{}/view"
 
 for _channels, _rows, _id in (
     (1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L"),
     (256, 2, "1khiTUNzZhfV2UUupZoIsPIbsMRBYVDqj"),
     (64, 2, "1DQnefjk1hVICOEYPwE4-CZAZOvi1NSJz"),
 ):
-    _name, _model = f"mixvpr_{_channels * _rows}", _Model(conversion.MIXVPR, "MixVPR", (_channels, _rows))
+    _name = f"mixvpr_{_channels * _rows}"
     _file = f"resnet50_MixVPR_{_channels * _rows}_channels({_channels})_rows({_rows}).ckpt"
-    _publish("mixvpr", _name, _drive(_id), _model, _file)
+    _publish("mixvpr", _name, _DRIVE.format(_id), conversion.MIXVPR, "MixVPR", _channels, _rows, file=_file)
 
 for _name, _size, _sha256 in (
     ("aliked-t16", 794_859, "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085"),
@@ -118,34 +111,38 @@ for _name, _size, _sha256 in (
     ("aliked-n32", 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
 ):
     _source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{_name}.pth"
-    _publish("aliked", _name, _source, _Model(conversion.ALIKED, "Aliked", (_name,)), size=_size, sha256=_sha256)
+    _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, size=_size, sha256=_sha256)
 
 _publish(
     "lightglue",
     "aliked_lightglue",
     "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
-    _Model(conversion.LIGHTGLUE, "LightGlue"),
+    conversion.LIGHTGLUE,
+    "LightGlue",
     size=47_632_827,
     sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
 )
 _publish(
     "ssm",
     "vgg16_places365",
-    "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip, or the Caffe model it was made from, "
-    "http://places2.csail.mit.edu/models_places365/vgg16_places365.caffemodel",
-    _Model(conversion.SSM, "SsmVgg"),
-    "vgg16_places365.npy",
+    "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip",
+    conversion.SSM,
+    "SsmVgg",
+    file="vgg16_places365.npy",
 )
 
 for _name, _file in (("netvlad_pitts30k", "Pitts30K_struct.mat"), ("netvlad_tokyotm", "TokyoTM_struct.mat")):
-    _model = _Model(conversion.NETVLAD_MATLAB, "VggNetVlad", (64, 4096), {"original": True})
-    _publish("netvlad", _name, f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}", _model)
+    _source = f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}"
+    _publish("netvlad", _name, _source, conversion.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True)
 _publish(
     "netvlad",
     "netvlad_pytorch",
     "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
-    _Model(conversion.NETVLAD, "VggNetVlad", (64, None)),
-    "checkpoint.pth.tar",
+    conversion.NETVLAD,
+    "VggNetVlad",
+    64,
+    None,
+    file="checkpoint.pth.tar",
     licenses=("none stated", "none stated"),
 )
 
@@ -154,11 +151,11 @@ for _backbone, _outputs, _table in (
     ("ResNet50", 512, conversion.GEM_RESNET50),
     ("ResNet50", 2048, conversion.GEM_RESNET50),
 ):
+    _name = f"cosplace_{_backbone.lower()}_{_outputs}"
     _source = f"https://github.com/gmberton/CosPlace/releases/download/v1.0/{_backbone}_{_outputs}_cosplace.pth"
-    _model = _Model(_table, "Gem", (_backbone.lower(), _outputs))
-    _publish("gem", f"cosplace_{_backbone.lower()}_{_outputs}", _source, _model)
+    _publish("gem", _name, _source, _table, "Gem", _backbone.lower(), _outputs)
 
-for _training, _clusters, _outputs, _size, _sha256 in (
+for _name, _clusters, _outputs, _size, _sha256 in (
     ("mapillary", 16, 128, 67_319_611, "5b6de8a5537061bbe7a477b62bb687b042d92d472e5231e2072026ecc59ec4b1"),
     ("mapillary", 16, 512, 92_488_008, "acbe2597c1c23c95482883c05969006a74bf7e68c4151dbb4ab5d67b69e8e346"),
     ("mapillary", 16, 4096, 327_398_210, "4b22ad1619bb7f085a5229d35f0f865740f2cdad2bced2ddbc7b28791c5b1542"),
@@ -167,22 +164,21 @@ for _training, _clusters, _outputs, _size, _sha256 in (
     ("pitts", 64, 4096, 1_132_901_186, "2c3cf17de91974156cb6aee40a6f7a229825095273d7de87c0792084ae1bf4aa"),
     ("landmarks", 64, 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
 ):
-    _name, _model = f"{_training}_{_outputs}", _Model(conversion.NETVLAD, "VggNetVlad", (_clusters, _outputs))
-    _source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{_training}_WPCA{_outputs}.pth.tar"
-    _publish("patch_netvlad", f"patchnetvlad_{_name}", _source, _model, size=_size, sha256=_sha256)
+    _source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{_name}_WPCA{_outputs}.pth.tar"
+    _model, _file = ("VggNetVlad", _clusters, _outputs), {"size": _size, "sha256": _sha256}
+    _publish("patch_netvlad", f"patchnetvlad_{_name}_{_outputs}", _source, conversion.NETVLAD, *_model, **_file)
 
 for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14", 1024, 24, 16)):
     _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
-    _model = _Model(conversion.DINOV2, "VisionTransformer", tuple(_sizes))
-    _publish("dinov2", f"dinov2_{_name}", _source, _model)
+    _publish("dinov2", f"dinov2_{_name}", _source, conversion.DINOV2, "VisionTransformer", *_sizes)
 
 for _name, _id, _file, _registers in (
     ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),
     ("selavpr_msls", "1vy05l0JTEgr6n8iSoz_P_yjWfEzFPAkV", "SelaVPR_msls.pth", 0),
     ("selavpr_msls_registers", "16Qkr6MGe3k0kYtFfw3YLQXZFn4c9YvJk", "SelaVPR_reg4_msls.pth", 4),
 ):
-    _model = _Model(conversion.SELAVPR, "SelaVpr", (), {"registers": _registers})
-    _publish("selavpr", _name, _drive(_id), _model, _file)
+    _source = _DRIVE.format(_id)
+    _publish("selavpr", _name, _source, conversion.SELAVPR, "SelaVpr", registers=_registers, file=_file)
 
 
 def own_entry(name: str, like: str) -> Entry:
@@ -202,15 +198,11 @@ def how_to_install(entry: Entry) -> str:
 
 
 def entry_of(name: str) -> Entry:
-    """The entry called `name`.
-
-    Raises:
-        InputError: the name is unknown; the message suggests the nearest name, or lists all.
-    """
+    """The entry called `name`; an InputError that suggests the nearest name if there is none."""
     if name in REGISTRY:
         return REGISTRY[name]
     nearest = difflib.get_close_matches(name, REGISTRY, n=1)
-    hint = f"the nearest is {nearest[0]}" if nearest else f"expected one of {', '.join(REGISTRY)}"
+    hint = f"the nearest is {nearest[0]}" if nearest else "see mfvpr weights list"
     raise InputError(f"{name}: no weights of this name; {hint}")
 
 
@@ -220,8 +212,7 @@ class Blueprint:
 
     shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
     parameters: int  # without running statistics
-    _graph: Any
-    _state: Any
+    _module: "nnx.Module"
 
     def build(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
         """Build the network with these values, in evaluation mode; InputError if paths or shapes differ."""
@@ -229,16 +220,16 @@ class Blueprint:
         from flax import nnx
 
         arrays = jax.device_put(convert(arrays, RUNTIME, self.shapes))
-        leaves = [(keys, leaf.replace(arrays[_path(keys)])) for keys, leaf in nnx.to_flat_state(self._state)]
-        module = nnx.merge(self._graph, nnx.from_flat_state(leaves))
+        graph, state = nnx.split(self._module)
+        leaves = [(keys, leaf.replace(arrays[_path(keys)])) for keys, leaf in nnx.to_flat_state(state)]
+        module = nnx.merge(graph, nnx.from_flat_state(leaves))
         module.eval()
         return module
 
 
 def blueprint(entry: Entry) -> Blueprint:
     """Blueprint of the entry's network."""
-    build = NETWORKS[entry.like or entry.name].builder()  # imports first: tracing would trace the module's constants
-    return plan_network(build)
+    return plan_network(NETWORKS[entry.like or entry.name].builder())
 
 
 def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
@@ -248,10 +239,9 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
 
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
         module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
-    graph, state = nnx.split(module)
-    shapes = {_path(keys): leaf.shape for keys, leaf in nnx.to_flat_state(state)}
+    shapes = {_path(keys): leaf.shape for keys, leaf in nnx.to_flat_state(nnx.state(module))}
     parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
-    return Blueprint(shapes, parameters, graph, state)
+    return Blueprint(shapes, parameters, module)
 
 
 def _path(keys: Sequence[Any]) -> str:

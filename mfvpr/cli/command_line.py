@@ -25,7 +25,7 @@ from mfvpr.cli import schema
 from mfvpr.cli.console import explain, one_line, tell, warn
 from mfvpr.evaluation import System
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import CONF, without
+from mfvpr.systems.assembly import CONF, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values

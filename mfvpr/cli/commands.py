@@ -13,10 +13,10 @@ import numpy as np
 import yaml
 
 from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
-from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_manifest
-from mfvpr.checkpoints.networks import blueprint, how_to_install
+from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_provenance
+from mfvpr.checkpoints.networks import how_to_install
 from mfvpr.cli.command_line import compose_data_sets
-from mfvpr.cli.console import Progress, refuse, track
+from mfvpr.cli.console import progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
 from mfvpr.datasets import Dataset, QuerySequence, image_folder
 from mfvpr.datasets.contents import own_rows
@@ -71,30 +71,25 @@ def add_weights(file: Path, *, as_: str | None = None, own: str | None = None) -
         raise InputError(f"{file}: expected {expected}" if file.exists() else f"{file}: no such file")
     entry = entry_of(as_ or official[file.name])
     path = install(file, entry.name, own=own)
-    manifest = read_manifest(entry.name if own is None else f"own/{own}")
-    origin = "" if entry.sha256 else f", from a file of sha256 {manifest.source_sha256[:12]}..., which nobody published"
-    origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={manifest.name}"
-    print(f"{path}: {manifest.name}, {manifest.parameters:,} parameters{origin}")
+    about = read_provenance(entry.name if own is None else f"own/{own}")
+    origin = "" if entry.sha256 else f", from a file of sha256 {about['source_sha256'][:12]}..., which nobody published"
+    origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={about['name']}"
+    print(f"{path}: {about['name']}, {about['parameters']:,} parameters{origin}")
 
 
 def verify_weights(names: Sequence[str] = ()) -> None:
-    """Check what is installed, byte by byte, against its manifests; by default all that is there."""
-    folder, known = weights_folder(), (*REGISTRY.values(), *own_entries())
-    present = [
-        entry for entry in known if any((folder / f"{entry.name}.{end}").exists() for end in ("safetensors", "json"))
-    ]
-    entries = [installed_entry(name) for name in names] or present
+    """Check the hashes of installed files, and that they fit their networks; by default all that is there."""
+    known = filter(is_installed, (*REGISTRY.values(), *own_entries()))
+    entries = [installed_entry(name) for name in names] or [*known]
     if not entries:
-        print(f"nothing is installed in {folder}")
+        print(f"nothing is installed in {weights_folder()}")
     bad = 0
     for entry in entries:
         try:
             load_model(entry.name)
-            manifest, expected = read_manifest(entry.name), blueprint(entry).parameters
-            if manifest.parameters != expected:
-                raise InputError(f"{entry.name}: expected {expected:,} parameters, got {manifest.parameters:,}")
-            origin = f", from {manifest.source_file} of sha256 {manifest.source_sha256[:12]}..." * (not entry.sha256)
-            print(f"{entry.name}: good, {manifest.parameters:,} parameters as converted{origin}")
+            about = read_provenance(entry.name)
+            origin = f", from {about['source_file']} of sha256 {about['source_sha256'][:12]}..." * (not entry.sha256)
+            print(f"{entry.name}: good, {about['parameters']:,} parameters as converted{origin}")
         except InputError as error:
             print(f"{entry.name}: BAD, {str(error).removeprefix(f'{entry.name}: ')}")
             bad += 1
@@ -116,10 +111,10 @@ def download_weights(name: str) -> None:
     else:
         try:
             with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
-                with temporary.open("wb") as file, Progress(entry.file, entry.size or 0) as progress:
-                    while (chunk := response.read(_CHUNK)) and not (entry.size and progress.n > entry.size):
-                        progress.reach(progress.n + file.write(chunk), entry.size or 0)
-                check_sha256(file_sha256(temporary), entry, entry.source)
+                with temporary.open("wb") as file, progress(entry.file, entry.size or 0) as bar:
+                    while (chunk := response.read(_CHUNK)) and not (entry.size and bar.n > entry.size):
+                        bar.update(file.write(chunk))
+                check_sha256(temporary, entry, entry.source)
         except (OSError, HTTPException) as error:
             if isinstance(error, HTTPError):
                 error.close()  # it is the server's response

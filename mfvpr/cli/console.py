@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:  # or the command line would wait for JAX
+    from tqdm import tqdm
+
     from mfvpr.utils.runtime import Track
 
-_QUIET = 2.0  # seconds before anything is shown
-_INTERVALS = {True: 0.1, False: 10.0}  # seconds between two lines in a terminal, and in a file
 _ERASE = "\r\x1b[K"
 _OTHER_NAMES = {"store": "cache", "fusion.filter_score": "fusion.retrieval_score"}  # of version 0.2.0
 
@@ -73,50 +72,17 @@ def refuse(reason: str) -> NoReturn:
 
 
 def track(label: str) -> "Track":
-    """Progress with the time left."""
-    return lambda items, total: Progress(label, total, items)
+    """Progress of a loop with the time left."""
+    return lambda items, total: progress(label, total, items)
 
 
-class Progress:
-    """Progress of a loop with the time left: one line that a terminal overwrites, elsewhere a line per 10 s.
+def progress(label: str, total: int, items: Iterable[Any] | None = None) -> "tqdm[Any]":
+    """Progress with the time left, of loops of more than two seconds: a line that is overwritten in a terminal.
 
-    Loops of less than 2 s show nothing.
+    `total` is 0 if it is not known.
     """
+    from tqdm import tqdm
 
-    def __init__(self, label: str, total: int, items: Iterable[Any] = ()) -> None:
-        """`total` is 0 if it is not known."""
-        self._label, self._total, self._items, self.n = label, total, items, 0
-        self._is_terminal, self._start = sys.stderr.isatty(), time.monotonic()
-        self._next = self._start + _QUIET
-
-    def __iter__(self) -> Iterator[Any]:
-        with self:
-            for item in self._items:
-                yield item
-                self.reach(self.n + 1, self._total)
-
-    def __enter__(self) -> "Progress":
-        return self
-
-    def __exit__(self, error: object, *_: object) -> None:
-        """Erase the line, or write the last one unless the loop was interrupted."""
-        if self._is_terminal:
-            sys.stderr.write(_ERASE)
-        elif error is None and self.n and time.monotonic() - self._start >= _QUIET:
-            tell(self._line())
-
-    def reach(self, number: int, total: int) -> None:
-        """Show that `number` of `total` items are done, if it is time."""
-        self.n, self._total = number, total
-        if (now := time.monotonic()) >= self._next and number != total:
-            self._next = now + _INTERVALS[self._is_terminal]
-            start, end = (_ERASE, "") if self._is_terminal else ("", "\n")
-            print(start + self._line(), end=end, file=sys.stderr, flush=True)
-
-    def _line(self) -> str:
-        elapsed = time.monotonic() - self._start
-        if not self._total:
-            return f"{self._label:<20}        {self.n:,}  {elapsed:.0f} s"
-        left = elapsed * (self._total - self.n) / max(self.n, 1)
-        share = f"{100 * self.n // self._total:3d} %  {self.n:,} of {self._total:,}"
-        return f"{self._label:<20} {share}  {elapsed:.0f} s" + f", about {left:.0f} s left" * (self.n < self._total)
+    is_terminal = sys.stderr.isatty()
+    interval = 0.1 if is_terminal else 10  # seconds between two lines
+    return tqdm(items, label, total or None, leave=not is_terminal, mininterval=interval, miniters=1, delay=2)

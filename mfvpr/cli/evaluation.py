@@ -19,7 +19,6 @@ from mfvpr.report.figures import query_figures, reliability_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import by_scorer
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
@@ -154,6 +153,6 @@ class ConfidenceFile:
 
 def _settings_of(names: Collection[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that scores depend on; files of match weights are compared by content, not by name."""
-    parts = {name: values for name, values in by_scorer(settings.get("scorer", {})).items() if name in names}
+    parts = {name: values for name, values in assembly.by_scorer(settings.get("scorer", {})).items() if name in names}
     no_name = {name: {**values, "weight": None} for name, values in parts.items() if "weight_content" in values}
     return {**settings, "scorer": {**parts, **no_name}}

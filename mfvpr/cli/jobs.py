@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from mfvpr import datasets
 from mfvpr.baselines.learned_weight import provenance
-from mfvpr.cli.console import Progress, tell, track, warn
+from mfvpr.cli.console import progress, tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles, QuerySequence
@@ -129,8 +129,13 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
     """The data set; the synthetic street is drawn first if the cache does not have it."""
     if "cache" in settings:
         seasons, root = settings["name"] == "streets_seasons", expand_user(settings["cache"])
-        with Progress("drawing streets", 0) as progress:
-            root = streets_folder(root, seasons=seasons, seed=settings["seed"], progress=progress.reach)
+        with progress("drawing streets", 0) as bar:
+
+            def reach(number: int, total: int) -> None:
+                bar.total = total
+                bar.update(number - bar.n)
+
+            root = streets_folder(root, seasons=seasons, seed=settings["seed"], progress=reach)
         queries = [root / name for name in CONDITIONS] if seasons else root / "queries"
         truth = IndexFile(TRUTH if seasons else root / TRUTH, is_widened=True)
         return datasets.folder(root / "database", queries, ground_truth=truth, name=settings["name"])

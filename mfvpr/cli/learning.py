@@ -19,7 +19,7 @@ from mfvpr.evaluation.protocol import Split
 from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.report.run_files import matched_content
-from mfvpr.systems.choices import without
+from mfvpr.systems.assembly import without
 from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.models import LOSSES, Options
 from mfvpr.tuning.learning.splits import Part, join_data_sets

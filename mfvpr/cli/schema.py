@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from mfvpr.evaluation.drives import Method
 from mfvpr.evaluation.protocol import Split
-from mfvpr.systems.choices import GROUPS, KEYS, SystemSettings, choices_of, without
+from mfvpr.systems.assembly import GROUPS, KEYS, SystemSettings, choices_of, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (

@@ -26,7 +26,7 @@ from mfvpr.report.sweeps import Sweep, axes_json
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import choices_of
+from mfvpr.systems.assembly import choices_of
 from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions, search_grid, search_optuna
 from mfvpr.tuning.sweeps.setting_rankings import forget_rankings
 from mfvpr.tuning.sweeps.setting_search import require_optuna

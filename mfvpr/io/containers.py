@@ -1,6 +1,5 @@
 """Files with arrays by image: hloc's HDF5, NumPy's archives, folders of archives; their numbers, and messages."""
 
-import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +15,6 @@ from mfvpr.utils.files import printable, replacing, require_file, require_replac
 
 MAX_INFLATED = 1 << 30  # bytes of an array that a file stores compressed
 SUFFIXES = (".npz", ".d2-net")  # of files in a folder; D2-Net's code writes `.d2-net`
-Shapes = Mapping[str, tuple[int, ...]]  # by the name of the array
 
 
 class FileEntry(NamedTuple):
@@ -26,39 +24,19 @@ class FileEntry(NamedTuple):
     name: str  # of the image in the file; "" = the file holds one image
 
 
-class Container:
-    """Base class of readers of several images, which read only the requested arrays.
+class H5File:
+    """An hloc file: images are the groups that hold datasets, named by their relative paths.
 
     Attributes:
-        path: file or folder, for messages.
+        path: of the file, for messages.
         entries: place of each image's arrays, by its name in the file.
         transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
-    """
-
-    path: Path
-    entries: Mapping[str, FileEntry]
-    transposed = False
-
-    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
-        """For each image, the shapes of its arrays among `parts`, and () for those among `others`; reads no values."""
-        raise NotImplementedError
-
-    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        """For each image, its arrays among `parts`."""
-        raise NotImplementedError
-
-
-class H5File(Container):
-    """Reader of an hloc file, which is open only during a call.
-
-    Images are the groups that hold datasets, named by their relative paths.
     """
 
     transposed = True
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        names: list[str] = []
+        self.path, names = path, list[str]()
         with self._open() as file:
             file.visit(names.append)  # follows no links
         groups = {name.rpartition("/")[0] for name in names}
@@ -67,25 +45,20 @@ class H5File(Container):
         if not self.entries:
             raise InputError(f"{path}: expected a group for every image, as hloc writes them, got no datasets")
 
-    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
+    def read(self, images: Iterable[str], parts: Sequence[str], *, shapes: bool = False) -> Iterator[dict[str, Any]]:
+        """For each image, its arrays among `parts`; their shapes alone, without reading values, if `shapes`."""
         with self._open() as file:
             for image in images:
-                shapes = {part: self._dataset(file, image, part).shape for part in parts if part in file[image]}
-                yield shapes | {part: () for part in others if part in file[image]}
-
-    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        with self._open() as file:
-            for image in images:
-                yield {part: self._dataset(file, image, part)[()] for part in parts if part in file[image]}
+                datasets = {part: self._dataset(file, image, part) for part in parts if part in file[image]}
+                yield {part: dataset.shape if shapes else dataset[()] for part, dataset in datasets.items()}
 
     def _dataset(self, file: Any, image: str, part: str) -> Any:
         dataset, where = file[image][part], f"{self.path}: {shorten(image)}/{part}"
         has_values = getattr(dataset, "shape", None) is not None and not dataset.external and not dataset.is_virtual
-        if not has_values or dataset.file.filename != file.filename:
-            raise InputError(f"{where}: expected data in this file, got a group or a link; copy the data")
-        stored = dataset.id.get_storage_size()
-        if dataset.size and not stored:  # HDF5 would read zeros
-            raise InputError(f"{where}: expected data, got a dataset that was not written; extract this image again")
+        is_here = has_values and dataset.file.filename == file.filename
+        stored = dataset.id.get_storage_size() if is_here else 0
+        if not is_here or (dataset.size and not stored):  # HDF5 would read zeros
+            raise InputError(f"{where}: expected data in this file, got none, a group or a link; extract it again")
         if dataset.nbytes > max(MAX_INFLATED, stored):
             raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset; write it uncompressed")
         return dataset
@@ -96,55 +69,43 @@ class H5File(Container):
             yield file
 
 
-class NpzFiles(Container):
-    """Reader of one archive for all images, or of a folder with an archive for each image.
+class NpzFiles:
+    """One archive for all images, or a folder with an archive for each image; attributes as of `H5File`.
 
     In one archive, arrays are named `image/part`: `a/1.jpg/keypoints`. Every call reads its directory, which takes half
     a second for 10,000 images: request many images at once. In a folder, files are `a/1.jpg.npz` or `a/1.jpg.d2-net`;
     hidden files and folders are skipped, and links to folders are not followed.
     """
 
+    transposed = False
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: dict[str, FileEntry] = {}
-        if not path.is_dir():
-            with _open_npz(path) as archive:
-                names = archive.files
-            self.entries = {image: FileEntry(path, image) for name in names if (image := name.rpartition("/")[0])}
-            if not self.entries:
-                got = f"{shorten(', '.join(names)) or 'none'}; if every image has its own file, give their folder"
-                raise InputError(f"{path}: expected arrays named by images (a.jpg/keypoints), got {got}")
-            return
-        for folder, folders, files in os.walk(path):
-            folders[:] = sorted(name for name in folders if not name.startswith("."))
-            for file in (Path(folder, name) for name in sorted(files) if name.endswith(SUFFIXES) and name[0] != "."):
-                image = file.relative_to(path).as_posix().removesuffix(file.suffix)
-                other = self.entries.setdefault(image, FileEntry(file, "")).file
+        if path.is_dir():
+            for file in sorted(path.rglob("*")):
+                inside = file.relative_to(path)
+                if file.suffix not in SUFFIXES or any(part.startswith(".") for part in inside.parts):
+                    continue
+                other = self.entries.setdefault(inside.as_posix().removesuffix(file.suffix), FileEntry(file, "")).file
                 if other != file:
                     raise InputError(f"{file}: {other.name} beside it is of the same image; remove either")
+        else:
+            with _open_npz(path) as archive:
+                images = (name.rpartition("/")[0] for name in archive.files)
+                self.entries = {image: FileEntry(path, image) for image in images if image}
         if not self.entries:
-            raise InputError(f"{path}: expected files named {' or '.join(SUFFIXES)}, got none; check the path")
+            expected = f"arrays named by images (a.jpg/keypoints), or a folder of files {' or '.join(SUFFIXES)}"
+            raise InputError(f"{path}: expected {expected}, got none")
 
-    def shapes(self, images: Iterable[str], parts: Sequence[str], others: Sequence[str] = ()) -> Iterator[Shapes]:
-        def read_shape(archive: Any, name: str) -> tuple[int, ...]:
-            if name.rpartition("/")[2] not in parts:
-                return ()
-            with archive.zip.open(f"{name}.npy") as file:
-                return read_npy_header(file)[0]
-
-        return self._read_each(images, (*parts, *others), read_shape)
-
-    def arrays(self, images: Iterable[str], parts: Sequence[str]) -> Iterator[Mapping[str, np.ndarray]]:
-        return self._read_each(images, parts, _read)
-
-    def _read_each(self, images: Iterable[str], parts: Sequence[str], read: Callable) -> Iterator[dict[str, Any]]:
-        """For each image, `read(archive, name)` of its arrays among `parts`."""
+    def read(self, images: Iterable[str], parts: Sequence[str], *, shapes: bool = False) -> Iterator[dict[str, Any]]:
+        """As `H5File.read`."""
         for file, entries in groupby((self.entries[image] for image in images), key=lambda entry: entry.file):
             with _open_npz(file) as archive:
                 known = {*archive.files}
                 for entry in entries:
                     names = {part: f"{entry.name}/{part}" if entry.name else part for part in parts}
-                    yield {part: read(archive, name) for part, name in names.items() if name in known}
+                    yield {part: _read(archive, name, shapes) for part, name in names.items() if name in known}
 
 
 def read_npz(path: Path, parts: Iterable[str]) -> dict[str, np.ndarray]:
@@ -215,13 +176,11 @@ def parse_number(text: str) -> float:
 
 def as_float32(where: str, array: Shaped[np.ndarray, "..."], kinds: str = "f") -> Float32[np.ndarray, "..."]:
     """Convert an array of these kinds of numbers (`numpy.dtype.kind`) to float32; InputError for others."""
-    if array.dtype.kind not in kinds:
-        raise InputError(f"{where}: expected {'floating-point ' if kinds == 'f' else ''}numbers, got {array.dtype}")
     with np.errstate(over="ignore", invalid="ignore"):
-        values = np.ascontiguousarray(array, np.float32)
-    if not np.isfinite(values).all():
-        first = np.argwhere(~np.isfinite(values))[0].tolist()
-        raise InputError(f"{where}: expected finite float32, got {array[tuple(first)]} at {first}; extract it again")
+        values = np.ascontiguousarray(array, np.float32) if array.dtype.kind in kinds else None
+    if values is None or not np.isfinite(values).all():
+        got = array.dtype if values is None else f"{array[~np.isfinite(values)][0]}; extract it again"
+        raise InputError(f"{where}: expected finite {'floating-point ' * (kinds == 'f')}numbers of float32, got {got}")
     return values
 
 
@@ -235,8 +194,11 @@ def _open_npz(path: Path) -> Iterator[Any]:
             yield archive
 
 
-def _read(archive: Any, name: str) -> np.ndarray:
+def _read(archive: Any, name: str, shape: bool = False) -> Any:
     entry = archive.zip.getinfo(f"{name}.npy")
+    if shape:
+        with archive.zip.open(entry) as file:
+            return read_npy_header(file)[0]
     if entry.file_size > max(MAX_INFLATED, entry.compress_size):
         raise InputError(f"{shorten(name)}: expected at most 1 GiB in a compressed array; write it uncompressed")
     return np.asarray(archive[name])

@@ -12,7 +12,7 @@ Parts of an image in a file:
 - `image_size` `[2]` (width, height), px, of the image that the keypoints are in.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -21,20 +21,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped
 
 from mfvpr.core.types import Array, Features
-from mfvpr.io.containers import (
-    Container,
-    FileEntry,
-    H5File,
-    NpzFiles,
-    Shapes,
-    as_float32,
-    choose_reader,
-    read_npz,
-    reading,
-    shorten,
-    write_h5,
-    write_npz,
-)
+from mfvpr.io import containers
+from mfvpr.io.containers import FileEntry, H5File, NpzFiles, as_float32, read_npz, shorten, write_h5, write_npz
 from mfvpr.io.names import match_names, match_paths, require_all, require_different
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
@@ -44,7 +32,7 @@ TOLERANCE = 0.01  # of unit length, relative; the error of float16 is 5e-4
 EXACT = 1e-6  # the error of float32
 GLOBAL = "global_descriptor"  # hloc's name
 SCORES = ("scores", "keypoint_scores")
-PARTS, OTHERS = ("keypoints", "descriptors"), (*SCORES, "image_size")
+PARTS = ("keypoints", "descriptors", *SCORES, "image_size")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +43,13 @@ class ImportedFeatures:
         path: file or folder.
         counts: keypoints of each image, -1 = missing image.
         dimension: D; 0 if no image has a keypoint.
-        scored: whether the files have scores; if not, all are 1.
     """
 
     path: Path
     counts: Int32[np.ndarray, " images"]
     dimension: int
-    scored: bool
-    _container: Container
-    _images: tuple[str | None, ...]
+    _container: H5File | NpzFiles
+    _images: Sequence[str | None]
     _transposed: bool
     _sizes: Float32[np.ndarray, "images 2"] | None
     _lengths: Lengths
@@ -89,35 +75,35 @@ class ImportedFeatures:
         images = {row: image for row in rows if 0 <= row < len(self) and (image := self._images[row]) is not None}
         if missing := [row for row in rows if row not in images]:
             raise InputError(f"{self.path}: expected features of image {missing[0]}, got none; see counts")
-        arrays = self._container.arrays([images[row] for row in rows], (*PARTS, *OTHERS))
-        for row, parts in zip(rows, arrays, strict=True):
-            yield row, self._features(row, f"{self.path}: {shorten(images[row])}", parts)
-
-    def _features(self, row: int, where: str, parts: Mapping[str, np.ndarray]) -> Features:
-        count, score = int(self.counts[row]), next((part for part in SCORES if part in parts), None)
-        keypoints = as_float32(f"{where}: keypoints", parts["keypoints"], "fiu")[:, :2]
-        descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
-        descriptors = descriptors.T if self._transposed else descriptors
-        scores = as_float32(f"{where}: {score}", parts[score]).reshape(-1) if score else np.zeros(count, np.float32)
-        if not count and not descriptors.size:  # [D, 0], [0, D] or [0]
-            descriptors = np.zeros((0, self.dimension), np.float32)
-        if not len(keypoints) == len(scores) == count or descriptors.shape != (count, self.dimension):
-            expected = f"{count} keypoints with scores and descriptors of {self.dimension} numbers"
-            got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
-            raise InputError(f"{where}: expected {expected}, got {got}")
-        argument = None if self._sizes is None else self._sizes[row]
-        size = as_float32(f"{where}: image_size", np.asarray(parts.get("image_size", argument)), "fiu").reshape(-1)
-        if size.shape != (2,) or not (size > 0).all() or (argument is not None and (size != argument).any()):
-            expected = "(width, height) in pixels" if argument is None else f"the argument {argument.tolist()}"
-            raise InputError(f"{where}: image_size: expected {expected}, got {size.tolist()}")
-        require_inside(where, keypoints, size)
-        return Features(
-            keypoints=np.ascontiguousarray(keypoints),
-            descriptors=np.ascontiguousarray(_scaled(f"{where}: descriptors", descriptors, self._lengths)),
-            scores=scores if scores.any() else np.ones(count, np.float32),
-            mask=np.ones(count, bool),
-            image_size=size,
-        )
+        for row, parts in zip(rows, self._container.read([images[row] for row in rows], PARTS), strict=True):
+            where, count = f"{self.path}: {shorten(images[row])}", int(self.counts[row])
+            score = next((part for part in SCORES if part in parts), None)
+            keypoints = as_float32(f"{where}: keypoints", parts["keypoints"], "fiu")[:, :2]
+            descriptors = as_float32(f"{where}: descriptors", parts["descriptors"])
+            descriptors = descriptors.T if self._transposed else descriptors
+            scores = as_float32(f"{where}: {score}", parts[score]).reshape(-1) if score else np.zeros(count, np.float32)
+            if not count and not descriptors.size:  # [D, 0], [0, D] or [0]
+                descriptors = np.zeros((0, self.dimension), np.float32)
+            if not len(keypoints) == len(scores) == count or descriptors.shape != (count, self.dimension):
+                expected = f"{count} keypoints with scores and descriptors of {self.dimension} numbers"
+                got = f"{len(keypoints)}, {len(scores)} and {list(descriptors.shape)}"
+                raise InputError(f"{where}: expected {expected}, got {got}")
+            argument = None if self._sizes is None else self._sizes[row]
+            size = as_float32(f"{where}: image_size", np.asarray(parts.get("image_size", argument)), "fiu").reshape(-1)
+            if size.shape != (2,) or not (size > 0).all() or (argument is not None and (size != argument).any()):
+                expected = "(width, height) in pixels" if argument is None else f"the argument {argument.tolist()}"
+                raise InputError(f"{where}: image_size: expected {expected}, got {size.tolist()}")
+            require_inside(where, keypoints, size)
+            yield (
+                row,
+                Features(
+                    keypoints=np.ascontiguousarray(keypoints),
+                    descriptors=np.ascontiguousarray(_scaled(f"{where}: descriptors", descriptors, self._lengths)),
+                    scores=scores if scores.any() else np.ones(count, np.float32),
+                    mask=np.ones(count, bool),
+                    image_size=size,
+                ),
+            )
 
 
 def open_features(
@@ -154,29 +140,35 @@ def open_features(
             raise InputError(f"image_size: expected (width, height) in pixels, or [M, 2] of them, got {image_size}")
         sizes = np.broadcast_to(sizes, (len(names), 2))
     readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFiles}
-    container: Container = NpzFiles(path) if path.is_dir() else choose_reader(path, readers)(path)
+    container: H5File | NpzFiles = (NpzFiles if path.is_dir() else containers.choose_reader(path, readers))(path)
     images = match_paths(path, names, paths, container.entries)
     if not partial or not any(images):
         require_all(path, names, images, "features")
     rows = {image: row for row, image in enumerate(images) if image is not None}
-    shapes = dict(zip(rows, container.shapes(rows, PARTS, OTHERS), strict=True))
-    counts = np.full(len(names), -1, np.int32)
-    for image, parts in shapes.items():
-        where = f"{path}: {shorten(image)}"
-        required = PARTS if sizes is not None else (*PARTS, "image_size")
-        if missing := [part for part in required if part not in parts]:
+    counts, has_scores = np.full(len(names), -1, np.int32), set[bool]()
+    layouts, dimensions = set[bool](), set[int]()  # whether descriptors are [D, N], and D
+    for (image, row), shapes in zip(rows.items(), container.read(rows, PARTS, shapes=True), strict=True):
+        required = {"keypoints", "descriptors"} if sizes is not None else {"keypoints", "descriptors", "image_size"}
+        if missing := sorted(required - shapes.keys()):
             mend = "; give it as image_size=" if missing == ["image_size"] else ""
-            raise InputError(f"{where}: expected {', '.join(required)}, got no {' and no '.join(missing)}{mend}")
-        shape = parts["keypoints"]
-        if len(shape) != 2 or not 2 <= shape[1] <= 4:
-            raise InputError(f"{where}: keypoints: expected [N, 2], or scale and angle as well, got {list(shape)}")
-        counts[rows[image]] = shape[0]
-    transposed, dimension = _layout(path, shapes, container.transposed)
-    without = [image for image, parts in shapes.items() if not {*SCORES} & parts.keys()]
-    if without and len(without) < len(shapes):  # a missing score would become 1
-        raise InputError(f"{path}: expected scores of all images or of none, got none of {shorten(without[0])}")
-    content = container, tuple(images), transposed, sizes, lengths
-    return ImportedFeatures(path, counts, dimension, not without, *content)
+            raise InputError(f"{path}: {shorten(image)}: expected {', '.join(missing)}, got none{mend}")
+        points, vectors = shapes["keypoints"], shapes["descriptors"]
+        count = counts[row] = points[0] if len(points) == 2 and 2 <= points[1] <= 4 else -1
+        if count < 0 or (count and not (len(vectors) == 2 and count in vectors)):
+            expected = "keypoints [N, 2] (or with scale and angle), and descriptors [N, D] or [D, N]"
+            raise InputError(f"{path}: {shorten(image)}: expected {expected}, got {[*points]} and {[*vectors]}")
+        has_scores.add(not {*SCORES}.isdisjoint(shapes))
+        if count:
+            dimensions.add(vectors[0] if vectors[1] == count else vectors[1])
+        if count and vectors[0] != vectors[1]:  # the other images tell the layout, or the program's usual one counts
+            layouts.add(vectors[1] == count)
+    if len(layouts) > 1 or len(dimensions) > 1:
+        got = f"lengths {sorted(dimensions)}"
+        raise InputError(f"{path}: expected descriptors of one layout, [D, N] or [N, D], and of one length, got {got}")
+    if len(has_scores) > 1:  # a missing score would become 1
+        raise InputError(f"{path}: expected scores of all images or of none, got some without")
+    layout, dimension = next(iter(layouts), container.transposed), next(iter(dimensions), 0)
+    return ImportedFeatures(path, counts, dimension, container, images, layout, sizes, lengths)
 
 
 def write_features(
@@ -217,31 +209,6 @@ def write_features(
             if not inside.parts or inside.is_absolute() or ".." in inside.parts:
                 raise InputError(f"{shorten(name)}: expected a path below the folder of images; rename it")
             write_npz(path / f"{name}.npz", arrays.items())
-
-
-def _layout(path: Path, shapes: Mapping[str, Shapes], default: bool) -> tuple[bool, int]:
-    """Whether descriptors are `[D, N]`, and D, both the same for all images.
-
-    An image with N = D fits both layouts: other images of the file decide, or the program's usual layout `default`.
-    """
-    layouts: set[bool] = set()
-    dimensions: set[int] = set()
-    for image, parts in shapes.items():
-        count, shape = parts["keypoints"][0], parts["descriptors"]
-        if not count:
-            continue
-        if len(shape) != 2 or count not in shape:
-            expected = f"[{count}, D] or [D, {count}] like the keypoints"
-            raise InputError(f"{path}: {shorten(image)}: descriptors: expected {expected}, got {list(shape)}")
-        dimensions.add(shape[0] if shape[1] == count else shape[1])
-        if shape[0] != shape[1]:
-            layouts.add(shape[1] == count)
-    if len(layouts) > 1 or len(dimensions) > 1:
-        raise InputError(
-            f"{path}: expected descriptors of one layout, [D, N] or [N, D], and of one length for all images, got "
-            f"lengths {sorted(dimensions)}"
-        )
-    return next(iter(layouts), default), next(iter(dimensions), 0)
 
 
 def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
@@ -285,39 +252,35 @@ def read_descriptors_with_entries(
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_word("lengths", lengths, Lengths)
-    choose_reader(path, dict.fromkeys((".npy", ".npz", ".h5", ".hdf5"), Path))
-    suffix, arrays = path.suffix.lower(), {}
-    if suffix == ".npz":
-        arrays = read_npz(path, ("descriptors", "names"))
-    elif suffix == ".npy":
-        with reading(path):
-            arrays = {"descriptors": np.load(path, allow_pickle=False)}
-    else:
-        file = H5File(path)
-        entries = require_all(path, names, match_names(path, names, file.entries), "descriptors")
-        vectors = [parts.get(GLOBAL, np.zeros((0, 0))) for parts in file.arrays(entries, (GLOBAL,))]
-        for image, vector in zip(entries, vectors, strict=True):
-            if vector.ndim != 1 or vector.shape != vectors[0].shape:
-                expected = f"{shorten(image)}: expected {GLOBAL} [D], the same D for all"
-                raise InputError(f"{path}: {expected}, got {list(vector.shape)}")
-        values = np.stack(vectors) if vectors else np.zeros((0, 0), np.float32)
+    containers.choose_reader(path, dict.fromkeys((".npy", ".npz", ".h5", ".hdf5"), Path))
+    suffix = path.suffix.lower()
     if suffix in (".npy", ".npz"):
-        if "descriptors" not in arrays:
-            raise InputError(f"{path}: expected an array descriptors [M, D], and names [M]; got no descriptors")
-        values, file_names = arrays["descriptors"], arrays.get("names")
-        if file_names is None:  # in the order of the sorted names
+        if suffix == ".npz":
+            arrays = read_npz(path, ("descriptors", "names"))
+        else:
+            with containers.reading(path):
+                arrays = {"descriptors": np.load(path, allow_pickle=False)}
+        values, known = arrays.get("descriptors", np.zeros(0)), arrays.get("names")
+        if known is None:  # in the order of the sorted names
             _require_rows(path, values, names)
             rows = np.argsort(np.argsort(np.array(names, object))).tolist()
             entries = [f"row {row}" for row in rows]
         else:
-            if file_names.dtype.kind != "U" or file_names.shape != values.shape[:1]:
-                got = f"{file_names.dtype}{list(file_names.shape)} and {list(values.shape)}"
+            if known.dtype.kind != "U" or known.shape != values.shape[:1]:
+                got = f"{known.dtype}{list(known.shape)} and {list(values.shape)}"
                 raise InputError(f"{path}: expected names as text [M] and descriptors [M, D], got {got}")
-            require_different(path, file_names.tolist())
-            places = {name: row for row, name in enumerate(file_names.tolist())}
+            require_different(path, known.tolist())
+            places = {name: row for row, name in enumerate(known.tolist())}
             entries = require_all(path, names, match_names(path, names, places), "descriptors")
             rows = [places[entry] for entry in entries]
         values = values[rows]
+    else:
+        file = H5File(path)
+        entries = require_all(path, names, match_names(path, names, file.entries), "descriptors")
+        vectors = [parts.get(GLOBAL, np.zeros((0, 0))) for parts in file.read(entries, (GLOBAL,))]
+        if len(shapes := {vector.shape for vector in vectors}) > 1:
+            raise InputError(f"{path}: expected {GLOBAL} [D] of all images, with one D, got {sorted(shapes)}")
+        values = np.stack(vectors) if vectors else np.zeros((0, 0), np.float32)
     _require_rows(path, values, names)
     values = _scaled(str(path), as_float32(str(path), values), lengths)
     return values, [FileEntry(path, entry) for entry in entries]

@@ -14,19 +14,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from mfvpr.core.types import Features, Matches, Shortlist
-from mfvpr.io.containers import FileEntry, as_float32, choose_reader, shorten
+from mfvpr.io.containers import FileEntry, as_float32, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
 from mfvpr.io.names import match_paths, require_one_image
-from mfvpr.io.pair_files import (
-    ColmapPairs,
-    FileMatches,
-    HlocPairs,
-    KapturePairs,
-    Pair,
-    PairReader,
-    Size,
-)
-from mfvpr.io.result_files import PredictionPairs, ResultFiles
+from mfvpr.io.pair_files import Pair, PairFiles, Size, open_pairs
 from mfvpr.utils.errors import InputError
 
 _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
@@ -59,30 +50,28 @@ class ImportedMatches:
     """
 
     def __init__(
-        self, reader: PairReader, sides: tuple[Images, Images], image_size: Size | None, confidences: bool
+        self, files: PairFiles, sides: tuple[Images, Images], image_size: Size | None, confidences: bool
     ) -> None:
-        self.path, self._reader, self._sides = reader.path, reader, sides
+        self.path, self.numbered, self._files, self._sides = files.path, files.by_number, files, sides
         self._image_size, self._use_confidences = image_size, confidences
         self._has_confidences: bool | None = None  # of the pairs that were read; None = no matches yet
-        self.numbered = reader.by_number
-        names, known = [], {}
+        names, known, images = [], {}, files.images
         for side, word in zip(sides, ("queries", "database images"), strict=True):
-            paths = [] if side.has_prefix else [*map(reader.spelling, side.paths)]
-            matched = match_paths(reader.path, [*map(reader.spelling, side.names)], paths, reader.images)
-            if not reader.sided and side.paths:
-                entries = [None if name is None else FileEntry(reader.path, name) for name in matched]
-                require_one_image(reader.path, [*map(Path, side.paths)], entries, known)
+            paths = [] if side.has_prefix else [*map(files.spelling, side.paths)]
+            matched = match_paths(self.path, [*map(files.spelling, side.names)], paths, images)
+            if not files.sided and side.paths:
+                entries = [None if name is None else FileEntry(self.path, name) for name in matched]
+                require_one_image(self.path, [*map(Path, side.paths)], entries, known)
             if not any(matched):
-                raise InputError(
-                    f"{reader.path}: expected matches of the {len(matched)} {word}, got none of their names, such as "
-                    f"{shorten(next(iter(reader.images), 'none'))}; give the prefix of their folder"
-                )
+                got = f"none of their names, such as {shorten(next(iter(images), 'none'))}"
+                expected = f"matches of the {len(matched)} {word}"
+                raise InputError(f"{self.path}: expected {expected}, got {got}; give the prefix of their folder")
             names.append(matched)
         self.names: tuple[list[str | None], list[str | None]] = (names[0], names[1])
 
     def contains(self, query: int, candidate: int) -> bool:
         """Whether the file has matches of a pair, in either order; they may be none."""
-        return self._stored(query, candidate) is not None
+        return self._pair(query, candidate) is not None
 
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
         """Matches `[n]` of a query with each candidate, NumPy, without padding; None = the file lacks the pair.
@@ -90,38 +79,29 @@ class ImportedMatches:
         Raises:
             InputError: matches are damaged, beyond the keypoints or the images, or confidences beyond 0 to 1.
         """
-        stored = {row: pair for row in candidates if (pair := self._stored(query, row)) is not None}
-        contents = self._reader.read([pair for pair, _ in stored.values()])
-        features = self._features(0, [query]) | self._features(1, [*stored]) if self.numbered and stored else {}
+        pairs = {row: pair for row in candidates if (pair := self._pair(query, row)) is not None}
+        contents = self._files.read([self._files.places[pair] for pair in pairs.values()])
+        features = self._features(0, [query]) | self._features(1, [*pairs]) if self.numbered and pairs else {}
         matches = {}
-        for (row, (_, is_exchanged)), content in zip(stored.items(), contents, strict=True):
-            raw = content
-            if is_exchanged:
-                raw = FileMatches(raw.second, raw.first, raw.confidence, raw.sizes and (raw.sizes[1], raw.sizes[0]))
+        for (row, pair), content in zip(pairs.items(), contents, strict=True):
+            first, second, confidence, sizes = content
+            if pair != (self.names[0][query], self.names[1][row]):  # in the other order
+                first, second, sizes = second, first, sizes and sizes[::-1]
             where = f"{self.path}: {shorten(str(self.names[0][query]))} and {shorten(str(self.names[1][row]))}"
-            uses_confidence = self._use_confidences and raw.first.size > 0
-            confidence = raw.confidence if uses_confidence else None
-            if uses_confidence:
-                if self._has_confidences not in (None, confidence is not None):
-                    raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
+            if not self._use_confidences or not first.size:
+                confidence = None
+            elif self._has_confidences not in (None, confidence is not None):
+                raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
+            else:
                 self._has_confidences = confidence is not None
             if self.numbered:
                 sides: Any = features[0, query], features[1, row]
-                matches[row] = numbered_matches(where, raw.first, raw.second, confidence, *sides)
+                matches[row] = numbered_matches(where, first, second, confidence, *sides)
             else:
-                sizes = raw.sizes or (None, None)
-                sides = self._size(0, query, sizes[0]), self._size(1, row, sizes[1])
-                matches[row] = point_matches(where, raw.first, raw.second, confidence, *sides)
+                size0, size1 = sizes or (None, None)
+                sides = self._size(0, query, size0), self._size(1, row, size1)
+                matches[row] = point_matches(where, first, second, confidence, *sides)
         return list(map(matches.get, candidates))
-
-    def _stored(self, query: int, candidate: int) -> tuple[Pair, bool] | None:
-        """Names of a pair in the file's order, and whether that is candidate, query."""
-        first, second = self.names[0][query], self.names[1][candidate]
-        if first is None or second is None:
-            return None
-        if (first, second) in self._reader.places:
-            return (first, second), False
-        return ((second, first), True) if not self._reader.sided and (second, first) in self._reader.places else None
 
     def warnings(self, shortlist: Shortlist) -> list[str]:
         """Warn in one line if pairs of a shortlist are missing; raise an InputError if all are."""
@@ -136,17 +116,22 @@ class ImportedMatches:
             raise InputError(f"{self.path}: expected matches of {count}, got none; the first is {first}")
         return [f"{self.path}: no matches of {count}, the first {first}; they score 0"]
 
+    def _pair(self, query: int, candidate: int) -> Pair | None:
+        """Names of a pair in the file's order."""
+        first, second = self.names[0][query], self.names[1][candidate]
+        orders = () if first is None or second is None else ((first, second), (second, first))
+        return next((pair for pair in orders[: 1 if self._files.sided else 2] if pair in self._files.places), None)
+
     def _features(self, side: int, rows: list[int]) -> dict[tuple[int, int], Features]:
         """Features of images of a side, by side and row."""
-        images = self._sides[side]
-        if images.features is not None:
-            return {(side, row): features for row, features in images.features.read(rows)}
-        features = {}
+        if (given := self._sides[side].features) is not None:
+            return {(side, row): features for row, features in given.read(rows)}
+        features, files = {}, self._files
         for row in rows:
             name = str(self.names[side][row])
-            size = np.array(self._size(side, row, self._reader.image_size(name)), np.float32)
+            size = np.array(self._size(side, row, files.image_size and files.image_size(name)), np.float32)
             where = f"{self.path}: keypoints of {shorten(name)}"
-            points = as_float32(where, np.asarray(self._reader.keypoints(name)))
+            points = as_float32(where, np.asarray(files.keypoints(name) if files.keypoints else None))
             require_inside(where, points, size)
             features[side, row] = Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size)
         return features
@@ -156,7 +141,7 @@ class ImportedMatches:
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
             expected = f"the argument image_size={list(self._image_size)}"
             raise InputError(f"{self.path}: expected {expected}, got {list(stored)}")
-        size_of = self._sides[side].size if self._reader.in_image_files else None
+        size_of = self._sides[side].size if self._files.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
         if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):
             got = f"{size and list(size)}; set image_size=[W,H]"
@@ -188,30 +173,12 @@ def open_matches(
         InputError: the file is missing, damaged or has another format; names are ambiguous; there is no pair of a query
             and a database image; or features are missing.
     """
-    path = Path(path)
-    if not path.is_dir():
-        kind = choose_reader(path, {".h5": HlocPairs, ".hdf5": HlocPairs, ".db": ColmapPairs})
-        reader = ColmapPairs(path, verified) if kind is ColmapPairs else HlocPairs(path)
-    elif KapturePairs.fits(path):
-        reader = KapturePairs(path)
-    elif PredictionPairs.fits(path):
-        reader = PredictionPairs(path, verified)
-    else:
-        reader = ResultFiles(path, (queries.names, database.names), verified)
-    if verified and isinstance(reader, HlocPairs | KapturePairs):
-        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
-    if reader.by_number and not isinstance(reader, ColmapPairs | KapturePairs):
-        if queries.features is None or database.features is None:
-            raise InputError(f"{path}: expected the features that were matched, got none; give hloc's feats*.h5")
-    elif queries.features is not None or database.features is not None:
-        raise InputError(f"{path}: expected no features, since the file has its points; leave them out")
-    return ImportedMatches(reader, (queries, database), image_size, confidences)
-
-
-def content_paths(path: Path) -> list[Path]:
-    """Files and folders that decide the matches in `path`, without links."""
-    is_kapture = path.is_dir() and KapturePairs.fits(path)
-    return [each.resolve() for each in (KapturePairs.folders(path) if is_kapture else [path])]
+    files = open_pairs(Path(path), (queries.names, database.names), verified)
+    features = [side.features for side in (queries, database) if side.features is not None]
+    if len(features) != (2 if files.by_number and files.keypoints is None else 0):
+        expected = "features of both sides for hloc's matches of features, and otherwise none"
+        raise InputError(f"{path}: expected {expected}, got {len(features)}; give hloc's feats*.h5, or leave them out")
+    return ImportedMatches(files, (queries, database), image_size, confidences)
 
 
 def numbered_matches(
@@ -221,21 +188,17 @@ def numbered_matches(
 
     `confidence` is `[M]`, from 0 to 1; None = 1. Distances are 0 without descriptors. `where` is for messages.
     """
-    numbers = []
-    for values, features in ((first, features0), (second, features1)):
-        values = np.asarray(values) if np.size(values) else np.zeros(0, np.int32)
-        if values.ndim != 1 or values.dtype.kind not in "iu":
-            raise InputError(f"{where}: expected numbers of keypoints [M], got {values.dtype}{list(values.shape)}")
-        if values.size and not 0 <= values.min() <= values.max() < len(features.mask):
-            got = f"{values.min()} to {values.max()}; give the features that were matched"
-            raise InputError(f"{where}: expected numbers of {len(features.mask)} keypoints, got {got}")
-        numbers.append(values.astype(np.int32))
-    number0, number1 = numbers
-    if len(number0) != len(number1):
-        raise InputError(f"{where}: expected pairs of keypoints, got {len(number0)} and {len(number1)} numbers")
-    dimensions = [np.shape(features.descriptors)[1] for features in (features0, features1)]
-    if dimensions[0] != dimensions[1]:
-        raise InputError(f"{where}: expected descriptors of one length, got {dimensions[0]} and {dimensions[1]}")
+    sides, numbers = (features0, features1), [np.asarray(values) for values in (first, second)]
+    for values, features in zip(numbers, sides, strict=True):
+        is_number = not values.size or (values.ndim == 1 and values.dtype.kind in "iu")
+        if not is_number or (values < 0).any() or (values >= len(features.mask)).any():
+            got = f"{values.dtype} {shorten(str(values))}; give the features that were matched"
+            raise InputError(f"{where}: expected numbers of {len(features.mask)} keypoints [M], got {got}")
+    number0, number1 = (values.astype(np.int32).reshape(-1) for values in numbers)
+    dimensions = [np.shape(features.descriptors)[1] for features in sides]
+    if len(number0) != len(number1) or dimensions[0] != dimensions[1]:
+        got = f"{len(number0)} and {len(number1)} numbers, {dimensions[0]} and {dimensions[1]} dimensions"
+        raise InputError(f"{where}: expected pairs of keypoints with descriptors of one length, got {got}")
     differences = np.asarray(features0.descriptors)[number0] - np.asarray(features1.descriptors)[number1]
     return Matches(
         points0=features0.keypoints[number0],
@@ -259,13 +222,11 @@ def point_matches(where: str, first: Any, second: Any, confidence: Any, size0: S
     points, sizes = [], [np.array(size, np.float32) for size in (size0, size1)]
     for values, size in zip((first, second), sizes, strict=True):
         values = as_float32(f"{where}: points", np.asarray(values), "fiu")
-        values = values if values.size else np.zeros((0, 2), np.float32)
-        if values.ndim != 2 or values.shape[1] != 2:
-            raise InputError(f"{where}: expected points (x, y) [M, 2], got {list(values.shape)}")
-        require_inside(where, values, size)
-        points.append(values)
-    if len(points[0]) != len(points[1]):
-        raise InputError(f"{where}: expected as many points in both images, got {len(points[0])} and {len(points[1])}")
+        points.append(values if values.size else np.zeros((0, 2), np.float32))
+        if points[-1].shape[1:] != (2,) or len(points[-1]) != len(points[0]):
+            got = f"{[*np.shape(first)]} and {[*np.shape(second)]}"
+            raise InputError(f"{where}: expected as many points (x, y) [M, 2] in both images, got {got}")
+        require_inside(where, points[-1], size)
     ones = np.ones(len(points[0]), np.float32)
     return Matches(
         points0=points[0],
@@ -284,9 +245,7 @@ def _confidences(where: str, confidence: Any, count: int) -> Float32[np.ndarray,
     if confidence is None:
         return np.ones(count, np.float32)
     values = as_float32(f"{where}: confidences", np.asarray(confidence), "fiu")
-    if values.shape != (count,):
-        raise InputError(f"{where}: expected {count} confidences, got {list(values.shape)}")
-    if count and not -_ROUNDING <= values.min() <= values.max() <= 1 + _ROUNDING:
-        got = f"{values.min():g} to {values.max():g}; scale them, or leave them out (confidences=False for files)"
-        raise InputError(f"{where}: expected confidences from 0 to 1, got {got}")
+    if values.shape != (count,) or (np.abs(values - 0.5) > 0.5 + _ROUNDING).any():
+        got = f"{[*values.shape]} up to {values.max(initial=0):g}; scale them, or leave them out (confidences=False)"
+        raise InputError(f"{where}: expected {count} confidences from 0 to 1, got {got}")
     return np.clip(values, 0, 1)

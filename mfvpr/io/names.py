@@ -10,8 +10,6 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, printable
 
 Entry = TypeVar("Entry")
-Parts = tuple[str, ...]
-Prefix = tuple[Parts, Parts]  # folders only in the file's names, only in the images' names
 ImageOfEntry = dict[tuple[Path, str], Path]  # file and name of an entry -> image
 _FULL_NAMES = "give names with their folders as the file has them"
 
@@ -39,41 +37,31 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
     texts = {printable(name): name for name in foreign} | {printable(name): name for name in names if name in foreign}
     matched = [texts.get(printable(name)) for name in names]
     is_exact = any(matched)
-    prefix: Prefix | None = ((), ()) if is_exact else None
+    prefix = ((), ()) if is_exact else None  # folders only in the file's names, and only in the images' names
     for spellings in (lambda name: [name], _stems):
-        spelled = defaultdict(list)  # free names by the last part of each of their spellings
+        free = defaultdict(list)  # names by the last part of each of their spellings
         for name in foreign.keys() - set(matched):
             for spelling in spellings(printable(name)):
-                spelled[PurePosixPath(spelling).name].append((name, spelling))
-        pairs_by_prefix: dict[Prefix, list[tuple[int, str]]] = defaultdict(list)  # rows and names
-        contradictions: dict[int, str] = {}  # of another prefix than the names before
+                free[PurePosixPath(spelling).name].append((name, _parts(spelling)))
+        pairs = dict[tuple[int, str], tuple]()  # row and name -> prefix
         for row in (row for row, match in enumerate(matched) if match is None):
             ours = spellings(printable(names[row]))[0]
-            for name, theirs in spelled[PurePosixPath(ours).name]:
-                parts, other = _parts(ours), _parts(theirs)
-                shared = min(len(parts), len(other))
-                each = other[: len(other) - shared], parts[: len(parts) - shared]
-                if other[len(each[0]) :] != parts[len(each[1]) :]:
-                    continue  # neither path is the end of the other
-                if prefix in (None, each):
-                    pairs_by_prefix[each].append((row, name))
-                elif not is_exact:
-                    contradictions[row] = name
-        pairs = [pair for each in pairs_by_prefix.values() for pair in dict.fromkeys(each)]
-        contradictions = {row: name for row, name in contradictions.items() if row not in dict(pairs)}
-        for position in (0, 1):
-            counts = Counter(pair[position] for pair in pairs)
-            several = [pair for pair in sorted(pairs) if counts[pair[position]] > 1]
-            if several:
-                got = " and ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in several[:2])
-                raise InputError(f"{path}: expected one name for each image, got {got}; {_FULL_NAMES}")
-        if len(pairs_by_prefix) > 1 or contradictions:
-            firsts = [*contradictions.items(), *(each[0] for each in pairs_by_prefix.values())][:2]
-            got = " but ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in firsts)
-            raise InputError(f"{path}: expected names with one prefix for all images of a folder, got {got}; give it")
-        for row, name in pairs:
+            parts = _parts(ours)
+            for name, theirs in free[PurePosixPath(ours).name]:
+                shared = min(len(parts), len(theirs))
+                if parts[-shared:] == theirs[-shared:]:  # one path is the end of the other
+                    pairs[row, name] = theirs[:-shared], parts[:-shared]
+        is_known, prefix = prefix is not None, prefix or next(iter(pairs.values()), None)
+        chosen = [pair for pair in sorted(pairs) if pairs[pair] == prefix]
+        rows, images = Counter(row for row, _ in chosen), Counter(name for _, name in chosen)
+        for row, name in sorted(pairs):
+            has_other_prefix = pairs[row, name] != prefix and not is_exact and not (is_known and rows[row])
+            if has_other_prefix or rows[row] > 1 or images[name] > 1:
+                expected = "one name for each image, and one prefix for all images of a folder"
+                got = f"{shorten(name)} for {shorten(names[row])} beside another name"
+                raise InputError(f"{path}: expected {expected}, got {got}; {_FULL_NAMES}")
+        for row, name in chosen:
             matched[row] = name
-        prefix = next(iter(pairs_by_prefix), prefix)
     return matched
 
 
@@ -134,5 +122,5 @@ def _stems(name: str) -> list[str]:
     return [path.with_suffix("").as_posix(), name] if path.suffix.lower() in IMAGE_SUFFIXES else [name]
 
 
-def _parts(name: str) -> Parts:
+def _parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in name.split("/") if part not in ("", "."))

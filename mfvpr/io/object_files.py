@@ -8,9 +8,8 @@ import pickle
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
-from pathlib import PurePath, PurePosixPath, PureWindowsPath
-from typing import Any, BinaryIO, ClassVar, NamedTuple
+from pathlib import PurePosixPath, PureWindowsPath
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
@@ -22,7 +21,7 @@ NUMPY_MAGIC = b"\x93NUMPY"
 
 
 class Function:
-    """Stand-in of a function or class that a pickle may call; a pickle cannot change it."""
+    """Stand-in of a function or class that a pickle may call; a pickle cannot give it a state."""
 
     __slots__ = ("_function",)
 
@@ -54,10 +53,6 @@ class DataUnpickler(pickle.Unpickler):
         return self.names[full_name]
 
 
-def _path_text(kind: type[PurePath], *parts: str) -> str:
-    return kind(*parts).as_posix()
-
-
 class ArrayUnpickler(DataUnpickler):
     """Unpickler of NumPy's arrays among plain data; paths become text."""
 
@@ -71,12 +66,14 @@ class ArrayUnpickler(DataUnpickler):
         "_codecs.encode": Function(lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
         "__builtin__.bytes": Function(bytes),  # of an array without values
         "builtins.bytes": Function(bytes),
-        **{
-            f"{module}.{prefix}{kind.__name__.removeprefix('Pure')}": Function(partial(_path_text, kind))
-            for module in ("pathlib", "pathlib._local")
-            for prefix in ("", "Pure")
-            for kind in (PurePosixPath, PureWindowsPath)
-        },
+        **dict.fromkeys(
+            ("pathlib.PosixPath", "pathlib._local.PosixPath"),
+            Function(lambda *parts: PurePosixPath(*parts).as_posix()),
+        ),
+        **dict.fromkeys(
+            ("pathlib.WindowsPath", "pathlib._local.WindowsPath"),
+            Function(lambda *parts: PureWindowsPath(*parts).as_posix()),
+        ),
     }
 
 
@@ -93,17 +90,12 @@ def read_objects(file: BinaryIO, expected: str) -> list[Any]:
     return content.ravel().tolist()
 
 
-class TorchArchive(NamedTuple):
-    """An open zip file of `torch.save`: a pickle, and an entry for the values of each storage."""
-
-    archive: zipfile.ZipFile
-    folder: str  # of its entries, with a slash
-    pickle: BinaryIO
-
-
 @contextmanager
-def open_torch_archive(file: BinaryIO) -> Iterator[TorchArchive]:
-    """Check an uncompressed file and its checksums; an InputError if entries are compressed or damaged."""
+def open_torch_archive(file: BinaryIO) -> Iterator[tuple[zipfile.ZipFile, str, BinaryIO]]:
+    """The zip file of `torch.save`, the folder of its entries (with a slash), and its pickle.
+
+    Entries have the values of storages. An InputError if entries are compressed, or damaged by their checksums.
+    """
     with zipfile.ZipFile(file) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise InputError("expected uncompressed entries of the zip file; use the official file")
@@ -112,7 +104,7 @@ def open_torch_archive(file: BinaryIO) -> Iterator[TorchArchive]:
         pickles = [name for name in archive.namelist() if name.split("/")[1:] == ["data.pkl"]]
         if len(pickles) != 1:
             raise InputError("expected a file of torch.save, got another zip file")
-        yield TorchArchive(archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0])))
+        yield archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0]))
 
 
 def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:

@@ -6,14 +6,14 @@ a folder of predictions, a text file for each query. To-Match adds the results o
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from mfvpr.core.types import Ranking, Shortlist
 from mfvpr.io.containers import FileEntry, parse_number, read_npz, reading, shorten, write_npz
 from mfvpr.io.names import adds_folders, match_names, require_different
-from mfvpr.io.result_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
+from mfvpr.io.pair_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_replaceable, write_text
 
@@ -21,12 +21,7 @@ PairLayout = Literal["hloc", "kapture", "preds"]
 _SEPARATORS = {"hloc": " \t\n\r", "kapture": ",\n\r", "preds": "\n\r"}  # characters that names must not contain
 
 
-class Pair(NamedTuple):
-    """Names of an image pair, and its score if the line has one."""
-
-    query: str
-    database: str
-    score: float | None = None
+Pair = tuple[str, str, float | None]  # names of a query and a database image, and the score if the line has one
 
 
 def read_shortlist(
@@ -69,8 +64,8 @@ def read_with_entries(
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
         names = _read_predictions(path) if path.is_dir() else _read_pairs(path)
-        queries, query_entries = _rows(path, query_names, (pair.query for pair in names), "query")
-        database, database_entries = _rows(path, database_names, (pair.database for pair in names), "database")
+        queries, query_entries = _rows(path, query_names, (query for query, _, _ in names), "query")
+        database, database_entries = _rows(path, database_names, (image for _, image, _ in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
         entries = query_entries, database_entries
     candidates: list[dict[int, float | None]] = [{} for _ in query_names]  # database rows and scores, best first
@@ -140,19 +135,18 @@ def write_shortlist(
     require_replaceable(path)
     if layout == "preds":
         path.mkdir(parents=True)
-        for row, query in enumerate(query_names):
-            if mask[row].any():  # the number of a file is the query's row
-                parts = [[QUERY, query], [PREDICTIONS, *(database_names[each] for each in indices[row][mask[row]])]]
-                if positives is not None:
-                    parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
-                text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
-                write_text(path / f"{row:03d}.txt", text)
+        for row in np.flatnonzero(mask.any(axis=1)).tolist():  # the number of a file is the query's row
+            parts = [[QUERY, query_names[row]], [PREDICTIONS, *(database_names[i] for i in indices[row][mask[row]])]]
+            if positives is not None:
+                parts.append([POSITIVES, *(database_names[int(each)] for each in positives[row])])
+            text = "".join("\n".join(part) + "\n\n" for part in parts)  # To-Match needs the last empty line
+            write_text(path / f"{row:03d}.txt", text)
         return
     lines = ["# kapture format: 1.0", "# query_image, map_image, score"] if layout == "kapture" else []
     for query, position in np.argwhere(mask).tolist():
-        names = (query_names[query], database_names[int(indices[query, position])])
-        score = np.float32(scores[query, position])
-        lines.append(" ".join(names) if layout == "hloc" else ", ".join((*names, str(score))))
+        names = [query_names[query], database_names[int(indices[query, position])]]
+        score = str(np.float32(scores[query, position]))
+        lines.append(" ".join(names) if layout == "hloc" else ", ".join([*names, score]))
     write_text(path, "\n".join(lines) + "\n")
 
 
@@ -166,18 +160,16 @@ def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
 
 def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[tuple[int, int, float | None]]:
     arrays = read_npz(path, ("predictions", "scores"))
-    predictions, scores = arrays.get("predictions", np.zeros(0)), arrays.get("scores")
-    if predictions.ndim != 2 or predictions.dtype.kind not in "iu" or len(predictions) != num_queries:
-        got = f"{predictions.dtype}{list(predictions.shape)}"
-        raise InputError(f"{path}: expected predictions [{num_queries}, K], whole numbers, got {got}")
-    if (predictions >= num_database).any() or (predictions < -1).any():
-        got = f"{predictions.min()} to {predictions.max()}"
-        raise InputError(f"{path}: expected database rows from 0 to {num_database - 1}, or -1 for none, got {got}")
-    if scores is not None and (scores.shape != predictions.shape or scores.dtype.kind not in "fiu"):
-        raise InputError(f"{path}: expected scores as many as predictions, got {scores.dtype}{list(scores.shape)}")
-    values = [[None] * predictions.shape[1]] * num_queries if scores is None else scores.tolist()
-    for query, (rows, row_scores) in enumerate(zip(predictions.tolist(), values, strict=True)):
-        yield from ((query, row, score) for row, score in zip(rows, row_scores, strict=True) if row >= 0)
+    predictions = arrays.get("predictions", np.zeros(0))
+    scores = arrays.get("scores", np.full(predictions.shape, None))
+    is_valid = predictions.ndim == 2 and predictions.dtype.kind in "iu" and len(predictions) == num_queries
+    is_valid = is_valid and ((predictions >= -1) & (predictions < num_database)).all()
+    if not is_valid or scores.shape != predictions.shape or scores.dtype.kind not in "fiuO":
+        expected = f"predictions [{num_queries}, K], rows from 0 to {num_database - 1} or -1, and as many scores"
+        got = f"{predictions.dtype}{[*predictions.shape]} and {scores.dtype}{[*scores.shape]}"
+        raise InputError(f"{path}: expected {expected}, got {got}: {shorten(str(predictions))}")
+    for query, place in np.argwhere(predictions >= 0).tolist():
+        yield query, int(predictions[query, place]), scores[query, place]
 
 
 def _read_pairs(path: Path) -> list[Pair]:
@@ -191,12 +183,10 @@ def _read_pairs(path: Path) -> list[Pair]:
         words = [word.strip() for word in line.split(",")] if "," in line else line.split()
         try:
             query, database, score = words if len(words) == 3 and "," in line else (*words, None)
-            pairs.append(Pair(query, database, None if score is None else parse_number(score)))
+            pairs.append((query, database, None if score is None else parse_number(score)))
         except ValueError:  # another number of words, or no number
-            raise InputError(
-                f"{path}: line {number}: expected 'query database', or 'query, database' and a score, got "
-                f"{shorten(line)!r}"
-            ) from None
+            expected = "'query database', or 'query, database' and a score"
+            raise InputError(f"{path}: line {number}: expected {expected}, got {shorten(line)!r}") from None
     return pairs
 
 
@@ -207,11 +197,11 @@ def _read_predictions(folder: Path) -> list[Pair]:
         query, predictions = read_predictions(path)
         if (other := files.setdefault(query, path)) != path:
             raise InputError(f"{path}: expected another query than in {other.name}; remove the files of older runs")
-        results = path.with_suffix(".torch")
-        counts = read_num_inliers(results, len(predictions)) if results.exists() else [None] * len(predictions)
-        scored = list(zip(predictions, counts, strict=False))  # predictions that were not matched are no candidates
-        scored.sort(key=lambda pair: -(pair[1] or 0))  # equal ones keep their order
-        pairs += [Pair(query, *each) for each in scored]
+        counts: Any = [None] * len(predictions)
+        if (results := path.with_suffix(".torch")).exists():
+            counts = read_num_inliers(results, len(predictions))
+        scored = zip(predictions, counts, strict=False)  # predictions that were not matched are no candidates
+        pairs += [(query, *each) for each in sorted(scored, key=lambda pair: -(pair[1] or 0))]
     if not files:
         raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
     return pairs
@@ -223,11 +213,9 @@ def _rows(
     """Row of each foreign name, and the entry of each image; an InputError for unknown names."""
     foreign = dict.fromkeys(foreign)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}
-    for name in (name for name in foreign if name not in rows):
-        raise InputError(
-            f"{path}: expected the relative path of a {side} image, got {shorten(name)!r}, which none "
-            f"of the {len(names)} has, or one has by its full path"
-        )
+    if unknown := [name for name in foreign if name not in rows]:
+        got = f"{shorten(unknown[0])!r}, which none of the {len(names)} has, or one has by its full path"
+        raise InputError(f"{path}: expected the relative path of a {side} image, got {got}")
     entries = {row: FileEntry(path, name) for name, row in rows.items() if adds_folders(names[row], name)}
     return rows, [entries.get(row) for row in range(len(names))]
 
@@ -236,8 +224,7 @@ def _descending(where: str, scores: Any) -> np.ndarray:
     """Scores as float32; raises an InputError unless they are finite and descend, as distances do not."""
     with np.errstate(over="ignore"):
         values = np.array(scores, np.float32)
-    if not np.isfinite(values).all():
-        raise InputError(f"{where}: expected finite scores, got others")
-    if (np.diff(values) > 0).any():
-        raise InputError(f"{where}: expected scores that descend, got ascending ones; negate distances")
+    if not np.isfinite(values).all() or (np.diff(values) > 0).any():
+        got = shorten(str(values))
+        raise InputError(f"{where}: expected finite scores that descend, got {got}; negate distances")
     return values

@@ -86,24 +86,21 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
         image_stamps = stamps_in_names(names)
     poses, before = [], -1
     for row, (where, words) in enumerate(lines):
-        if len(words) != len(lines[0][1]) or len(words) not in (_TUM + 1, _KITTI):
-            raise InputError(f"{where}: expected 8 numbers (TUM) or 12 (KITTI) in all lines, got {len(words)}")
-        if len(words) != _KITTI:
-            stamp, words = parse_stamp(words[0], where), words[1:]
-            if stamp <= before:
-                got = f"{_seconds(stamp)} after {_seconds(before)}"
-                raise InputError(f"{where}: expected ascending timestamps, got {got}; sort the lines by time")
-            if image_stamps is not None and abs(stamp - image_stamps[row]) > _LARGEST_GAP:
-                expected = f"the pose of {shorten(names[row])}, within 10 ms"
-                raise InputError(f"{where}: expected {expected}, got one at {_seconds(stamp)}")
-            before = stamp
-        poses.append(" ".join(words))
         try:
             is_finite = all(math.isfinite(parse_number(word)) for word in words)
         except ValueError:
             is_finite = False
-        if not is_finite:
-            raise InputError(f"{where}: expected finite numbers, got {shorten(poses[-1])!r}")
+        if not is_finite or len(words) != len(lines[0][1]) or len(words) not in (1 + _TUM, _KITTI):
+            expected = "8 (TUM) or 12 (KITTI) finite numbers in all lines"
+            raise InputError(f"{where}: expected {expected}, got {shorten(' '.join(words))!r}")
+        if len(words) != _KITTI:
+            stamp, words = parse_stamp(words[0], where), words[1:]
+            is_image = image_stamps is None or abs(stamp - image_stamps[row]) <= _LARGEST_GAP
+            if stamp <= before or not is_image:
+                expected = f"ascending timestamps, within 10 ms of images named by times such as {shorten(names[row])}"
+                raise InputError(f"{where}: expected {expected}, got {_seconds(stamp)} after {_seconds(before)}")
+            before = stamp
+        poses.append(" ".join(words))
     return poses
 
 
@@ -124,15 +121,15 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
         InputError: the file exists; poses are missing or have other numbers; or two images have the same time.
     """
     path = Path(path)
-    if len({*(stamps or ())}) < len(stamps or ()):
-        raise InputError(f"{path}: expected different times, got one twice")
     places = [pose for pose in poses if pose is not None]
     if not places or (stamps is None and len(places) < len(poses)):
-        expected = "all images, since a line of KITTI is a frame; write TUM" if stamps is None else "at least one image"
-        raise InputError(f"{path}: expected a place of {expected}, got {len(places)} places of {len(poses)} images")
+        expected = "a place of all images, or for TUM of at least one"
+        raise InputError(f"{path}: expected {expected}, got {len(places)} places of {len(poses)} images")
     num_numbers = _KITTI if stamps is None else _TUM
     if any(len(pose.split()) != num_numbers for pose in places):
         raise InputError(f"{path}: expected poses of {num_numbers} numbers; TUM needs times, KITTI has none")
+    if stamps is not None and len({*stamps}) < len(stamps):
+        raise InputError(f"{path}: expected different times, got one twice")
     if stamps is None:
         lines = places
     else:

@@ -27,7 +27,7 @@ from mfvpr.evaluation.system import Note, System
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import SystemSettings
+from mfvpr.systems.assembly import SystemSettings
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values
 from mfvpr.utils.fingerprints import fingerprint, recipe_of

@@ -15,8 +15,9 @@ from mfvpr.datasets.image_reading import Interpolation, read_size
 from mfvpr.features.extractor import Scale
 from mfvpr.io.features import ImportedFeatures, Lengths, open_features
 from mfvpr.io.features import read_descriptors_with_entries as read_descriptors
-from mfvpr.io.matches import Images, ImportedMatches, content_paths, open_matches
+from mfvpr.io.matches import Images, ImportedMatches, open_matches
 from mfvpr.io.names import ImageOfEntry, require_one_image
+from mfvpr.io.pair_files import content_paths
 from mfvpr.io.shortlists import read_with_entries as read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, Search

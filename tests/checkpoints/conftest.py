@@ -1,11 +1,13 @@
 """A small network with one of everything, registered beside the published ones; runtime files go to a test's folder."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from flax import nnx
 
 from mfvpr.checkpoints import networks
-from mfvpr.checkpoints.conversion import Layout, Rule, Table
+from mfvpr.checkpoints.conversion import CONV, LINEAR, Rule, Table
 from tests.needs import skip_without
 
 
@@ -16,24 +18,22 @@ class Tiny(nnx.Module):
         self.mix = nnx.List([nnx.Linear(4, 5, rngs=rngs), nnx.Linear(5, 2, rngs=rngs)])
 
 
-_NORM = {"weight": "scale", "bias": "bias", "running_mean": "mean", "running_var": "var"}
 TABLE = Table(
     (
-        Rule(r"net\.conv\.weight", "conv.kernel", Layout.CONV),
-        Rule(r"net\.conv\.bias", "conv.bias"),
-        *(Rule(rf"net\.bn\.{theirs}", f"bn.{ours}") for theirs, ours in _NORM.items()),
-        Rule(r"net\.mix\.(\d)\.weight", r"mix.\1.kernel", Layout.LINEAR),
+        Rule(r"net\.conv\.weight", "conv.kernel", CONV),
+        Rule(r"net\.(conv|bn)\.bias", r"\1.bias"),
+        Rule(r"net\.bn\.weight", "bn.scale"),
+        Rule(r"net\.bn\.running_(mean|var)", r"bn.\1"),
+        Rule(r"net\.mix\.(\d)\.weight", r"mix.\1.kernel", LINEAR),
         Rule(r"net\.mix\.(\d)\.bias", r"mix.\1.bias"),
     ),
     ignored=(r".*\.num_batches_tracked",),
 )
+_BN = ("bias", "mean", "scale", "var")
 SOURCE_SHAPES = {
     "net.conv.weight": (4, 3, 3, 3),
     "net.conv.bias": (4,),
-    "net.bn.weight": (4,),
-    "net.bn.bias": (4,),
-    "net.bn.running_mean": (4,),
-    "net.bn.running_var": (4,),
+    **{f"net.bn.{name}": (4,) for name in ("weight", "bias", "running_mean", "running_var")},
     "net.bn.num_batches_tracked": (),
     "net.mix.0.weight": (5, 4),
     "net.mix.0.bias": (5,),
@@ -43,10 +43,7 @@ SOURCE_SHAPES = {
 SHAPES = {
     "conv.kernel": (3, 3, 3, 4),
     "conv.bias": (4,),
-    "bn.scale": (4,),
-    "bn.bias": (4,),
-    "bn.mean": (4,),
-    "bn.var": (4,),
+    **{f"bn.{name}": (4,) for name in _BN},
     "mix.0.kernel": (4, 5),
     "mix.0.bias": (5,),
     "mix.1.kernel": (5, 2),
@@ -56,17 +53,8 @@ PARAMETERS = 157
 
 
 def tiny_entry(name: str = "tiny", **changes: object) -> networks.Entry:
-    values = {
-        "name": name,
-        "network": "tiny",
-        "file": f"{name}.pth",
-        "source": f"https://example.org/{name}.pth",
-        "size": None,
-        "sha256": None,
-        "code_license": "MIT",
-        "weights_license": "none stated",
-    }
-    return networks.Entry(**(values | changes))
+    entry = networks.Entry(name, "tiny", "tiny.pth", "https://example.org/tiny.pth", None, None, "MIT", "none stated")
+    return replace(entry, **{"file": f"{name}.pth"} | changes)
 
 
 @pytest.fixture

@@ -14,17 +14,7 @@ from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.utils import InputError
 from tests.checkpoints.conftest import SOURCE_SHAPES
 from tests.needs import ALIKED, LIGHTGLUE, needs
-from tests.random_checkpoints import (
-    Call,
-    Global,
-    View,
-    Writer,
-    layered,
-    random_checkpoint,
-    write_legacy,
-    write_numpy,
-    write_zip,
-)
+from tests.random_checkpoints import Global, layered, random_checkpoint, write_legacy, write_numpy, write_zip
 
 WRITERS = pytest.mark.parametrize("write", [write_zip, write_legacy])
 REAL = (*(ALIKED / f"aliked-{name}.pth" for name in ("n16", "n16rot", "n32", "t16")), LIGHTGLUE)
@@ -48,12 +38,6 @@ def refused(path):
     assert "\n" not in message
     assert len(message) < len(str(path)) + 250
     return message
-
-
-def refused_content(path, content):
-    """Message for this content in a zip file; an old file is refused as well."""
-    refused(write_legacy(path, content))
-    return refused(write_zip(path, content))
 
 
 def assert_same(arrays, expected):
@@ -87,29 +71,8 @@ def test_layouts_of_checkpoints(path, arrays, wrap, write):
     assert_same(read_checkpoint(write(path, wrap(arrays))), arrays)
 
 
-@WRITERS
-def test_strided_views_of_storages(path, write):
-    values = np.arange(24, dtype=np.float32)
-    views = {
-        "part": View(values, 2, (2, 3), (6, 2)),
-        "transposed": np.arange(6.0).reshape(2, 3).T,
-        "last": View(values, 23, (), ()),
-        "none": View(values, 24, (0, 5), (5, 1)),
-    }
-    refused(write(path, views | {"ends": View(values, 3, (4,), (7,), count=25, key="9")}))
-    arrays = read_checkpoint(write(path, views))
-    np.testing.assert_array_equal(arrays["part"], [[2, 4, 6], [8, 10, 12]])
-    np.testing.assert_array_equal(arrays["transposed"], [[0, 3], [1, 4], [2, 5]])
-    assert arrays["last"] == 23
-    assert arrays["none"].shape == (0, 5)
-
-
 def test_both_byte_orders(path, arrays):
     assert_same(read_checkpoint(write_zip(path, arrays, order="big")), arrays)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("file/data.pkl", Writer().pickled({}))
-        archive.writestr("file/byteorder", "middle")
-    refused(path)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -171,42 +134,19 @@ def test_notes_of_a_training_are_left_unread(torch, path, zipped):
     assert_same(read_checkpoint(path), {key: tensor.numpy() for key, tensor in network.state_dict().items()})
 
 
-def test_code_is_refused_and_not_executed(path, tmp_path):
-    marker = tmp_path / "made"
-    for content in (
-        Call(Global("os", "mkdir"), (str(marker),)),
-        {"a": np.zeros(3), "b": Call(Global("builtins", "exec"), (f"import os; os.mkdir({str(marker)!r})",))},
-        {"a": View(np.zeros(3), module="os")},
-    ):
-        refused_content(path, content)
-    assert not marker.exists()
-
-
 @pytest.mark.parametrize("protocol", range(1, pickle.HIGHEST_PROTOCOL + 1))
-def test_plain_pickles_are_refused_and_not_executed(path, tmp_path, protocol):
-    path.write_bytes(b"\x80\x01" * (protocol < 2) + pickle.dumps(Runs(tmp_path / "made"), protocol))
+def test_code_is_refused_and_not_executed(path, tmp_path, protocol):
+    code = Runs(tmp_path / "made")
+    for write in (write_zip, write_legacy):
+        assert "nothing was executed" in refused(write(path, {"a": np.zeros(3), "b": code}))
+    path.write_bytes(b"\x80\x01" * (protocol < 2) + pickle.dumps(code, protocol))
     assert "nothing was executed" in refused(path)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.write(__file__, "file/data/0")
-        archive.writestr("file/data.pkl", pickle.dumps({"model": {"weight": Runs(tmp_path / "made")}}, protocol))
-    assert "nothing was executed" in refused(path)
+    layers = {"conv": {"weights": np.zeros(3), "bias": np.array([code, 1])}}
+    for content in (pickle.dumps(layers, protocol), layers):  # without an array, in one
+        assert "nothing was executed" in refused(write_numpy(path, content, protocol=protocol))
     assert not (tmp_path / "made").exists()
-
-
-@pytest.mark.parametrize(
-    "view",
-    [
-        {"offset": 1},
-        {"shape": (7,), "strides": (1,)},
-        {"shape": (2, 2), "strides": (1, 5)},
-        {"shape": (3,), "strides": (-1,)},
-        {"count": 7},
-    ],
-    ids=str,
-)
-@WRITERS
-def test_views_that_are_no_part_of_their_storage_are_refused(path, write, view):
-    refused(write(path, {"a": View(np.zeros(6, np.float32), **view)}))
+    np.load(path, allow_pickle=True)
+    assert (tmp_path / "made").exists()
 
 
 def test_damage_is_refused_wherever_it_is(path):
@@ -217,45 +157,42 @@ def test_damage_is_refused_wherever_it_is(path):
         path.write_bytes(intact[:place] + bytes([intact[place] ^ 16]) + intact[place + 1 :])
         with suppress(InputError):
             assert_same(read_checkpoint(path), expected)
-    for length in range(1, len(intact), 7):
-        path.write_bytes(intact[:length])
-        refused(path)
+    for write in (write_zip, write_legacy, lambda path, arrays: write_numpy(path, {"conv": arrays})):
+        intact = write(path, expected).read_bytes()
+        for length in range(1, len(intact), 7):
+            path.write_bytes(intact[:length])
+            refused(path)
 
 
-def test_zip_files_with_other_entries(path, arrays, tmp_path):
-    write_zip(path, arrays)
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("../outside", "text")
-        archive.writestr("/absolute", "text")
-    assert_same(read_checkpoint(path), arrays)
-    assert list(tmp_path.iterdir()) == [path]
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("other/data.pkl", "")
-    assert "got another zip file" in refused(path)
+def test_what_is_no_checkpoint(path, tmp_path, arrays):
+    assert "got nothing" in refused(path)
+    assert "got a folder" in refused(tmp_path)
+    for content, words in (
+        (b"", "got an empty file"),
+        (b"<!DOCTYPE html><title>Virus scan warning</title>", "got a text file"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "got another"),
+    ):
+        path.write_bytes(content)
+        assert words in refused(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("hello.txt", "hello")
     assert "got another zip file" in refused(path)
     assert "uncompressed" in refused(write_zip(path, arrays, compression=zipfile.ZIP_DEFLATED))
 
 
-def test_what_is_no_checkpoint(path, tmp_path):
-    assert "got nothing" in refused(path)
-    assert "got a folder" in refused(tmp_path)
-    path.write_bytes(b"")
-    assert "got an empty file" in refused(path)
-    path.write_text("<!DOCTYPE html><title>Virus scan warning</title>")
-    assert "got a text file" in refused(path)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    assert "got another" in refused(path)
-    os.mkfifo(tmp_path / "pipe")
-    assert "got a pipe" in refused(tmp_path / "pipe")
-
-
-def test_other_content(path):
-    assert "expected tensors by name, got list" in refused_content(path, [np.zeros(3)])
-    assert "expected tensors by name, got dict" in refused_content(path, {"state_dict": {}})
-    assert "got str at note" in refused_content(path, {"a": np.zeros(3), "note": "text"})
-    assert "asks for os.system" in refused_content(path, {"a": Global("os", "system")})
+@WRITERS
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ([np.zeros(3)], "expected tensors by name, got list"),
+        ({"state_dict": {}}, "expected tensors by name, got "),
+        ({"a": np.zeros(3), "note": "text"}, "got str at note"),
+        ({"a": Global("os", "system")}, "asks for os.system"),
+    ],
+    ids=["list", "empty", "note", "global"],
+)
+def test_other_content(path, write, content, words):
+    assert words in refused(write(path, content))
 
 
 @pytest.fixture
@@ -270,19 +207,12 @@ def layers():
 
 
 @pytest.mark.parametrize("protocol", range(5))
-def test_every_protocol(path, layers, protocol):
-    assert_same(read_checkpoint(write_numpy(path, layered(layers), protocol=protocol)), layers)
-
-
-def test_files_of_this_numpy_and_of_older_ones(path, layers):
-    content = pickle.dumps(np.array(layered(layers), dtype=object), protocol=3)
+def test_every_protocol_of_numpy(path, layers, protocol):
+    content = pickle.dumps(np.array(layered(layers), dtype=object), protocol=protocol)
+    assert_same(read_checkpoint(write_numpy(path, content)), layers)
     old = content.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
-    assert old != content
-    assert_same(read_checkpoint(write_numpy(path, old)), layers)
-    for version in ((1, 0), (2, 0)):
-        with path.open("wb") as file:
-            np.lib.format.write_array(file, np.array(layered(layers), dtype=object), version)
-        assert_same(read_checkpoint(path), layers)
+    if protocol < 4:  # where the name's length is not stored
+        assert_same(read_checkpoint(write_numpy(path, old)), layers)
 
 
 class Python2(pickle._Pickler):  # type: ignore
@@ -316,14 +246,10 @@ def test_layouts_of_values(path):
         "a.big": grid.astype(">f4"),
         "a.fortran": np.asfortranarray(grid),
         "a.turned": grid.transpose(2, 0, 1),
-        "a.both": np.asfortranarray(grid.astype(">f8")),
         "a.part": grid[:, ::2, 1:],
         "a.scalar": np.array(2.5),
         "a.none": np.zeros((0, 3)),
-        "b.i8": np.array([-1]),
-        "b.i4": np.array([2], "i4"),
         "b.i2": np.array([2], ">i2"),
-        "b.i1": np.array([-3], "i1"),
         "b.u1": np.array([255], "u1"),
         "b.bool": np.array([True, False]),
     }
@@ -331,27 +257,8 @@ def test_layouts_of_values(path):
     assert_same(loaded, {key: value.astype(value.dtype.newbyteorder("=")) for key, value in arrays.items()})
 
 
-@pytest.mark.parametrize("protocol", range(5))
-def test_code_in_files_of_numpy_is_refused(path, tmp_path, protocol):
-    code = {"conv": {"weights": np.zeros(3), "bias": np.array([Runs(tmp_path / "made"), 1])}}
-    for content in (pickle.dumps(code, protocol), code):  # without an array, in one
-        assert "asks for posix.mkdir" in refused(write_numpy(path, content, protocol=protocol))
-    assert not (tmp_path / "made").exists()
-    np.load(path, allow_pickle=True)
-    assert (tmp_path / "made").exists()
-
-
 @pytest.mark.parametrize(
     "content", [{}, [np.zeros(3)], {"conv": {}}, {"conv": np.zeros(3)}, {"conv": {"weights": "text"}}, 3]
 )
 def test_other_content_of_numpy(path, content):
     refused(write_numpy(path, content))
-
-
-@pytest.mark.parametrize("protocol", [2, 4])
-def test_a_cut_file_is_refused(path, protocol):
-    expected = {"conv": {"weights": np.arange(4, dtype=np.float32).reshape(2, 2), "bias": np.zeros(2)}}
-    intact = write_numpy(path, expected, protocol=protocol).read_bytes()
-    for length in range(len(intact)):
-        path.write_bytes(intact[:length])
-        refused(path)

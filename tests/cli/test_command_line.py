@@ -4,12 +4,13 @@ import re
 
 import pytest
 
-from mfvpr.systems.choices import choices_of
-from tests.programs import ROOT, composed, run
+from mfvpr.systems.assembly import choices_of
+from tests.programs import ROOT, composed, run, small
 
 pytestmark = pytest.mark.thorough
 
 OWN = ("dataset=folder", "dataset.database=a", "dataset.queries=b")
+SIGMA = "grid.sigma=[10]"
 PROGRAMS = {"evaluate": "evaluate", "sweep": "sweep", "learn": "learn", "map build": "map", "localize": "localize",
             "paper": "paper"}  # fmt: skip
 
@@ -64,10 +65,31 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
     ("evaluate", ["threshold=0.5"], "threshold=0.5: expected confidence=FILE"),
     ("evaluate", ["confidence=/none.json"], "/none.json: expected the confidence.json"),
     ("localize", ["map=a", "images=b", "route=-2000"], "route=-2000: expected a number from -1000 to 1000"),
+    ("evaluate", ["scorer.histogram.weight=[]"], "scorer.histogram.weight=[]: expected "),
+    ("evaluate", ["scorer.histogram.weight=[fs,heavy]"], "heavy']: expected "),
+    ("evaluate", ["scorer.histogram.weight=[fs,fs]"], "expected every scorer once, got histogram_fs twice"),
+    ("sweep", ["scorer=histogram", "scorer.weight=[fs,ratio]", "grid.weight=[unit]"], "scorer.weight: expected one "),
+    ("learn", ["scorer=histogram", "scorer.weight=[fs,ratio]"], "scorer.weight: expected one weight"),
     ("benchmark.__main__", ["foo"], "invalid choice: 'foo'"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_leave_nothing(refuse_at_once, program, arguments, words):
     assert words in refuse_at_once(program, *arguments)
+
+
+@pytest.mark.parametrize(("program", "arguments", "words"), [
+    ("sweep", ["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
+    ("sweep", ["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
+    ("sweep", [SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground"),
+    ("sweep", [SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
+    ("sweep", [SIGMA, "features=sift,aliked"], "add --multirun"),
+    ("learn", ["scorer=count"], "scorer=count: expected one to learn"),
+    ("learn", ["recall.tolerances=[30]"], "smaller tolerances or radius"),
+    ("learn", ["also=[streets]"], "expected report=[...] as well"),
+    ("learn", ["report=[streets]", "split=first_half"], "split=first_half: expected none with report="),
+    ("learn", ["report=[{streets: {seed: -1}}]"], "dataset.seed=-1: expected a whole number from 0"),
+])  # fmt: skip
+def test_mistakes_about_data_are_one_line(root, refuse_at_once, program, arguments, words):
+    assert words in refuse_at_once(program, *small(root), *arguments)
 
 
 @pytest.mark.slow

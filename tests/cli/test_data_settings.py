@@ -70,13 +70,6 @@ def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path,
         assert all(abs(int(name[:4]) - int(query[:4])) > 1 for name in names)
 
 
-def test_nothing_right_is_told_beforehand(small_street, run):
-    settings = ("dataset.ground_truth=order", "dataset.exclude_neighbors=5", "recall.tolerances=[0,5]")
-    rows, printed, _ = run(*same(small_street, *settings))
-    assert "warning: the ground truth has no correct image for any query" in printed.err
-    assert set(recall(rows).values()) == {0.0}
-
-
 def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
     for side in ("database", "query"):
         lines = [f"{row:04d}.png,floor {row // 5}\n" for row in range(10)]

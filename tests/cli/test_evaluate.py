@@ -12,7 +12,7 @@ from mfvpr.baselines import ALONE, PAPER, SCORERS, Homography, OpenCvHomography
 from mfvpr.cli import evaluation
 from mfvpr.cli.command_line import override
 from mfvpr.systems import assembly
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.assembly import CONF
 from mfvpr.utils.errors import InputError
 from tests.programs import MFVPR, QUICK, ROOT, composed, csv_rows, folder, run, settings_of
 

@@ -188,14 +188,3 @@ def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
     assert "learning rate" in error
     assert not (tmp_path / "out").exists()
     assert len([*place.rglob("*.npz")]) == (step == 4)
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["scorer=count"], "scorer=count: expected one to learn"),
-    (["recall.tolerances=[30]"], "smaller tolerances or radius"),
-    (["also=[streets]"], "expected report=[...] as well"),
-    (["report=[streets]", "split=first_half"], "split=first_half: expected none with report="),
-    (["report=[{streets: {seed: -1}}]"], "dataset.seed=-1: expected a whole number from 0"),
-])  # fmt: skip
-def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
-    assert words in refuse_at_once("learn", *small(root), *arguments)

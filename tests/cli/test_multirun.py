@@ -1,14 +1,19 @@
 """Hydra's multirun: many jobs, one after the other or at the same time."""
 
+import hydra
 import pytest
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 
-from tests.programs import csv_rows, results, run, small
-
-pytestmark = pytest.mark.slow
+from mfvpr.cli import schema
+from mfvpr.systems.assembly import CONF
+from tests.needs import reason
+from tests.programs import composed, csv_rows, results, run, small
 
 SIGMA = "grid.sigma=[10]"
 
 
+@pytest.mark.slow
 def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, call, succeed):
     monkeypatch.chdir(tmp_path)
     jobs = ("experiment=weight", "scorer=sum,histogram", "candidates=8,0")
@@ -33,6 +38,7 @@ def test_a_multirun_makes_one_run_folder_per_job(root, tmp_path, monkeypatch, ca
     assert lines[0]["run"] in (joint / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_joint_table_has_a_line_per_job_and_system(root, tmp_path, monkeypatch, succeed):
     monkeypatch.chdir(tmp_path)
     succeed("evaluate", "-m", *small(root), "figures=0", "scorer=sum", "candidates=4,8")
@@ -48,6 +54,7 @@ def test_a_joint_table_has_a_line_per_job_and_system(root, tmp_path, monkeypatch
         ]
 
 
+@pytest.mark.slow
 def test_jobs_in_several_processes(root, tmp_path):
     jobs = ("launcher=joblib", "hydra.launcher.n_jobs=2", "candidates=4,8", f"cache={tmp_path}/store", SIGMA)
     done = run("-m", *small(root), *jobs, program="sweep", cwd=tmp_path)
@@ -55,3 +62,20 @@ def test_jobs_in_several_processes(root, tmp_path):
     assert done.stdout.count("results: runs/folder/") == 2
     assert {results(path)["candidates"] for path in (tmp_path / "runs" / "folder").iterdir()} == {4, 8}
     assert "error" not in done.stderr
+
+
+@pytest.mark.parametrize(("launcher", "plugin"), [
+    ("joblib", "joblib"), ("submitit_local", "submitit_local"), ("slurm", "submitit_slurm"),
+])  # fmt: skip
+def test_a_launcher_composes_and_adds_no_setting(launcher, plugin):
+    """Check a structured configuration, which refuses what the plugin does not know."""
+    Plugins.instance()
+    if f"{plugin}.yaml" not in ConfigStore.instance().repo["hydra"]["launcher"]:
+        pytest.skip(reason("hydra_{}_launcher".format(plugin.split("_")[0])))
+    for config in ("evaluate", "sweep", "learn"):
+        schema.register()
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            hydra_settings = hydra.compose(config, [f"launcher={launcher}"], return_hydra_config=True).hydra
+        assert hydra_settings.job.env_set == {"PJRT_NPROC": str(hydra_settings.launcher.get("cpus_per_task") or 1)}
+        assert plugin.rpartition("_")[2] in hydra_settings.launcher._target_.lower()
+        assert composed(f"launcher={launcher}", config=config) == composed(config=config)

@@ -3,19 +3,17 @@
 import itertools
 import json
 import os
-import re
 import resource
 import signal
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from mfvpr.cli import console, evaluation, jobs
+from mfvpr.cli import evaluation, jobs
 from mfvpr.datasets import AllowedTruth, Positives, read_image
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test
@@ -293,15 +291,3 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_pa
     assert stderr.splitlines()[-1].startswith("interrupted")
     names = {path.name for path in evaluated.iterdir()} - {"figures", "report.html"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
-
-
-# --- progress ----------------------------------------------------------------------------------------------------
-
-
-def test_progress_without_a_terminal_is_a_line_per_ten_seconds(monkeypatch, capsys):
-    now = [0.0]
-    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    for seconds, count, lines in ((0.5, 100, ["4", "24", "44", "64", "84", "100"]), (0.01, 199, []), (1, 0, [])):
-        for _ in console.track("matching")([None] * count, count):
-            now[0] += seconds
-        assert re.findall(r"matching +(\d+) %", capsys.readouterr().err) == lines

@@ -117,20 +117,6 @@ def test_optuna_finds_the_same_with_the_same_seed(sweep, swept, tmp_path):
     assert tried != [entry["parameters"] for entry in other["settings"]]
 
 
-SIGMA = "grid.sigma=[10]"
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["grid.max_distance=[0.3,0.9]", "matching.max_distance=0.4"], "grid.max_distance=[0.3, 0.9]: expected"),
-    (["scorer=all", SIGMA], "scorer: a sweep takes one scorer at a time"),
-    ([SIGMA, "dataset.ground_truth=none", "dataset.index_file=null"], "choosing settings needs a ground truth"),
-    ([SIGMA, "recall.tolerances=[30]", "split=both"], "no query of one half"),
-    ([SIGMA, "features=sift,aliked"], "add --multirun"),
-])  # fmt: skip
-def test_mistakes_are_one_line_and_exit_code_2(root, refuse_at_once, arguments, words):
-    assert words in refuse_at_once("sweep", *small(root), *arguments)
-
-
 def test_bins_that_do_not_fit_are_refused(root, swept, tmp_path, refuse):
     arguments = ("search=optuna", "grid.bin_size=[0.1,5]", f"out={tmp_path}/out")
     assert "bin_size=0.1: expected at most 1024 bins" in refuse("sweep", *small(root), *arguments)

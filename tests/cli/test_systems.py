@@ -11,7 +11,7 @@ from mfvpr import InputError, load_system
 from mfvpr.cli import evaluation, jobs, programs
 from mfvpr.features import AlikedFeatures, Sift
 from mfvpr.storage import FeatureCache
-from mfvpr.systems.choices import CONF
+from mfvpr.systems.assembly import CONF
 from mfvpr.utils.fingerprints import recipe_of
 from tests.programs import CANDIDATES, composed, csv_rows, settings_of, small
 
@@ -50,8 +50,6 @@ def test_a_run_records_the_size_that_the_images_decide(tmp_path):
 @pytest.mark.parametrize(("name", "settings", "words"), [
     ("mix", {}, "Could not find 'system/mix'"),
     ("steering", {"sigma": 3}, "Could not override 'sigma'"),
-    ("steering", {"scorer": {"sgma": 3}}, "Could not override 'scorer.sgma'"),
-    ("steering", {"features": "xfeat"}, "Could not find 'features/xfeat'"),
     ("steering", {"features": "import"}, "^features.image_size=auto: expected a list of 2"),
     ("mfvpr", {"features": "import"}, "^features: files of other programs belong to a data set"),
     ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),

@@ -1,26 +1,36 @@
-"""Matches of other programs: their own files, exchanged and missing pairs, names."""
+"""Matches of other programs: their own files, exchanged and missing pairs, names; what cannot be used is one line."""
+
+import shutil
+import sqlite3
+from contextlib import closing
 
 import h5py
 import numpy as np
 import pytest
 
 from mfvpr.core.types import Shortlist
-from mfvpr.io import Images, open_features, open_matches
+from mfvpr.io import Images, containers, open_features, open_matches
 from tests.io.checks import one_line_error
 from tests.io.match_files import DATABASE, GOLDEN, POINTS, QUERIES, SIZE, npz_folder, pair_of, side, write_hloc
 
+SUPERGLUE = {"keypoints0": POINTS, "keypoints1": POINTS[::-1] + 1, "matches": np.array([2, -1, 0])}
 
-def open_tool(tools, tool):
-    """The matches of a tool, with prefixes as in its files."""
-    if tool != "hloc":
-        path = tools / {"verified": "colmap.db", "colmap": "colmap.db", "kapture": "kapture"}.get(tool, "vismatch")
-        sides = side("queries/", QUERIES), side("database/", DATABASE)
-        return open_matches(path, *sides, verified=tool in ("verified", "inliers"))
+
+def tool_sides(tools=None):
+    """Images with prefixes as in the tools' files; with hloc's features if `tools` is given."""
     sides = []
     for prefix, names in (("queries/", QUERIES), ("database/", DATABASE)):
-        features = open_features(tools / "hloc/feats.h5", [prefix + name for name in names])
+        features = tools and open_features(tools / "hloc/feats.h5", [prefix + name for name in names])
         sides.append(side(prefix, names, features))
-    return open_matches(tools / "hloc/matches.h5", *sides)
+    return sides
+
+
+def open_tool(tools, tool):
+    """The matches of a tool."""
+    if tool == "hloc":
+        return open_matches(tools / "hloc/matches.h5", *tool_sides(tools))
+    path = tools / {"verified": "colmap.db", "colmap": "colmap.db", "kapture": "kapture"}.get(tool, "vismatch")
+    return open_matches(path, *tool_sides(), verified=tool in ("verified", "inliers"))
 
 
 @pytest.mark.parametrize("tool", ["hloc", "kapture", "colmap", "verified", "vismatch", "inliers"])
@@ -54,11 +64,11 @@ def test_distances_are_those_of_hlocs_descriptors(tools):
     assert matches.distance.min() > 0
 
 
-@pytest.mark.parametrize(("tool", "missing"), [("hloc", 1), ("kapture", 1), ("colmap", 1), ("vismatch", 1)])
-def test_missing_pairs_are_one_warning(tools, tool, missing):
+@pytest.mark.parametrize("tool", ["hloc", "kapture", "colmap", "vismatch"])
+def test_missing_pairs_are_one_warning(tools, tool):
     indices = np.array([[0, 1], [0, 1]])
     [warning] = open_tool(tools, tool).warnings(Shortlist(indices, 0.0 * indices, indices >= 0))
-    assert f"{missing} of 4 pairs" in warning
+    assert "1 of 4 pairs" in warning
     assert "queries/0001.png and database/0001.png" in warning
     indices = np.array([[-1, -1], [-1, 1]])
     with one_line_error("got none", "database/0001.png"):
@@ -91,15 +101,10 @@ def test_names_without_prefixes_are_identified_by_the_folders_of_the_images(tool
 def test_one_name_is_not_of_a_query_and_of_another_database_image(tmp_path):
     """Also with prefixes, which tell nothing apart if they are the same."""
     path = write_hloc(tmp_path / "m.h5", ["0000.png/0001.png"], keypoints0=POINTS, keypoints1=POINTS)
-    size = lambda row: SIZE  # noqa: E731
     sides = [
-        Images(QUERIES, [f"/data/{folder}/{name}" for name in QUERIES], has_prefix, size)
-        for folder, has_prefix in (("queries", True), ("database", True))
+        Images(QUERIES, [f"/data/{folder}/{name}" for name in QUERIES], True, lambda row: SIZE)
+        for folder in ("queries", "database")
     ]
-    for row in (0, 1):
-        for folder in ("queries", "database"):
-            (tmp_path / folder).mkdir(exist_ok=True)
-            (tmp_path / folder / f"000{row}.png").write_text(folder)
     with one_line_error("one image for each entry", "0000.png"):
         open_matches(path, *sides)
     same = [side._replace(paths=sides[0].paths) for side in sides]
@@ -137,12 +142,10 @@ def test_npz_of_points(tmp_path):
     matches = pair_of(folder)
     np.testing.assert_array_equal(matches.points1 - matches.points0, np.ones((3, 2)))
     assert matches.image_size1.tolist() == [96, 96]
-    with one_line_error("image_size"):
-        pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS))
     assert pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS), image_size=(64, 64)).mask.all()
-    for length in (0, -1, np.nan, np.inf):
-        with one_line_error("size of an image"):
-            pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS, im_size=length))
+    for size in ({}, {"im_size": 0}, {"im_size": np.nan}):
+        with one_line_error("size of an image, .* set image_size="):
+            pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS, **size))
 
 
 def test_npz_with_names_may_have_either_order(tmp_path):
@@ -155,24 +158,16 @@ def test_npz_with_names_may_have_either_order(tmp_path):
 
 def test_npz_of_superglue(tmp_path):
     """A partner for each keypoint of the first image, -1 = none."""
-    arrays = {
-        "keypoints0": POINTS,
-        "keypoints1": POINTS[::-1] + 1,
-        "matches": np.array([2, -1, 0]),
-        "match_confidence": np.float32([0.5, 0, 0.25]),
-    }
+    arrays = SUPERGLUE | {"match_confidence": np.float32([0.5, 0, 0.25])}
     matches = pair_of(npz_folder(tmp_path, **arrays), image_size=(640, 480))
     np.testing.assert_array_equal(matches.points0, POINTS[[0, 2]])
     np.testing.assert_array_equal(matches.points1, POINTS[[0, 2]] + 1)
     np.testing.assert_array_equal(matches.confidence, np.float32([0.5, 0.25]))
-    for numbers in ([3, -1, 0], [-2, 0, 1]):
-        with one_line_error("-1 to 2"):
-            pair_of(npz_folder(tmp_path, **{**arrays, "matches": np.array(numbers)}), image_size=(640, 480))
 
 
 def test_names_of_files_with_several_readings_are_refused(tmp_path):
     folder = npz_folder(tmp_path, "a_b_c.npz", points0=POINTS, points1=POINTS)
-    with one_line_error("several ways"):
+    with one_line_error("one pair of images, got several"):
         open_matches(folder, Images(["a.jpg", "a_b.jpg"]), Images(["b_c.jpg", "c.jpg"]))
 
 
@@ -191,3 +186,137 @@ def test_confidences_of_all_pairs_or_of_none(tmp_path):
         open_matches(folder, *sides, image_size=(64, 64)).read(0, [0, 1])
     read = open_matches(folder, *sides, image_size=(64, 64), confidences=False).read(0, [0, 1])
     assert all((matches.confidence == 1).all() for matches in read)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"points0": POINTS, "points1": POINTS[:2]}, "as many points"),
+        ({"points0": POINTS, "points1": POINTS * np.nan}, "finite"),
+        ({"points0": POINTS, "points1": POINTS + 1000}, "image of 64 x 64"),
+        ({"points0": POINTS, "points1": POINTS, "confidence": [0.1, 0.2]}, "3 confidences"),
+        ({"points0": POINTS, "points1": POINTS, "confidence": [0.1, 0.2, 7]}, "0 to 1"),
+        ({"points0": POINTS}, "expected points0 and points1"),
+        ({"points0": POINTS, "points1": np.array([None] * 3)}, "cannot be read"),
+        ({"points0": POINTS, "points1": POINTS, "im_size": "large"}, "im_size"),
+        ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
+        ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "the argument image_size="),
+        (SUPERGLUE | {"match_confidence": [0.5, 0.5]}, r"match_confidence \[N\]"),
+        *((SUPERGLUE | {"matches": each}, r"matches \[N\] from -1") for each in ([0, 1], [3, -1, 0], [-2, 0, 1])),
+    ],
+)
+def test_arrays_that_are_no_matches(tmp_path, arrays, message):
+    with one_line_error(message):
+        pair_of(npz_folder(tmp_path, **arrays), image_size=(64, 64))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [(np.int16([-5, 0]), "int16"), (np.int16([0, 30_000]), "keypoints"), (np.float32([0, 1]), "integers")],
+)
+def test_numbers_that_are_no_keypoints(tools, tmp_path, numbers, message):
+    path = write_hloc(tmp_path / "matches.h5", ["queries-0000.png/database-0000.png"], matches0=numbers)
+    with one_line_error(message):
+        open_matches(path, *tool_sides(tools)).read(0, [0])
+
+
+def changed_database(tools, tmp_path, *statements):
+    path = shutil.copy(tools / "colmap.db", tmp_path / "changed.db")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(";".join(statements))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("DROP TABLE matches", "matches"),
+        ("UPDATE matches SET rows = rows + 1", "cannot be read"),
+        ("UPDATE keypoints SET cols = 1", "2 or more columns"),
+        ("DELETE FROM keypoints", "keypoints"),
+        ("UPDATE cameras SET width = 'wide'", "size of an image"),
+    ],
+)
+def test_other_databases_than_colmaps(tools, tmp_path, statement, message):
+    path = changed_database(tools, tmp_path, "PRAGMA foreign_keys = OFF", statement)
+    with one_line_error(message):
+        open_matches(path, *tool_sides()).read(0, [0, 1])
+
+
+def test_pairs_of_images_that_left_colmaps_database_cost_no_others(tools, tmp_path):
+    pair = 998 * (2**31 - 1) + 999
+    path = changed_database(tools, tmp_path, f"INSERT INTO matches VALUES ({pair}, 0, 2, NULL)")
+    changed, whole = (open_matches(each, *tool_sides()).read(0, [0, 1]) for each in (path, tools / "colmap.db"))
+    for one, other in zip(changed, whole, strict=True):
+        np.testing.assert_array_equal(one.points0, other.points0)
+
+
+def test_colmaps_database_is_not_touched(tools, tmp_path):
+    path = tmp_path / "only" / "colmap.db"
+    path.parent.mkdir()
+    path.write_bytes((tools / "colmap.db").read_bytes())
+    before = path.stat().st_mtime_ns
+    open_matches(path, *tool_sides()).read(0, [0, 1])
+    assert [*path.parent.iterdir()] == [path]
+    assert path.stat().st_mtime_ns == before
+    (path.parent / "colmap.db-wal").write_bytes(b"changes")
+    (tmp_path / "link.db").symlink_to(path)
+    for name in (path, tmp_path / "link.db"):
+        with one_line_error("close COLMAP"):
+            open_matches(name, *tool_sides())
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("keypoints/sift/keypoints.txt", b"sift, complex64, 2", "float32"),
+        ("keypoints/sift/queries/0000.png.kpt", b"12345", "cannot be read"),
+        ("keypoints/sift/queries/0000.png.kpt", b"", "keypoints"),
+        (
+            "matches/sift/database/0000.png.overlapping/queries/0000.png.matches",
+            np.float64([[0.5, 0, 1]]).tobytes(),
+            "whole numbers",
+        ),
+    ],
+)
+def test_other_files_than_kaptures(tools, tmp_path, file, content, message):
+    shutil.copytree(tools / "kapture", tmp_path / "kapture")
+    (tmp_path / "kapture/reconstruction" / file).write_bytes(content)
+    with one_line_error(message):
+        open_matches(tmp_path / "kapture", *tool_sides()).read(0, [0, 1])
+
+
+@pytest.mark.parametrize("file", ["pairs/q1_d1.npz", "m.h5"])
+def test_an_array_that_grows_without_limit_is_not_read(tmp_path, monkeypatch, file):
+    monkeypatch.setattr(containers, "MAX_INFLATED", 1 << 20)
+    points = np.zeros((200_000, 2), np.float32)
+    path = tmp_path / file
+    if file == "m.h5":
+        with h5py.File(path, "w") as content:
+            for name in ("keypoints0", "keypoints1"):
+                content.create_dataset(f"q1.jpg/d1.jpg/{name}", data=points, compression="gzip")
+    else:
+        path.parent.mkdir()
+        np.savez_compressed(path, points0=points, points1=points)
+    with one_line_error("at most 1 GiB", file):
+        pair_of(path if file == "m.h5" else path.parent, image_size=SIZE)
+
+
+def test_other_files_are_refused(tools, tmp_path):
+    (tmp_path / "matches.txt").write_text("nothing")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken.db").write_bytes(b"no database" * 100)
+    old = write_hloc(tmp_path / "old.h5", ["q1.jpg_d1.jpg"], matches0=np.int16([0]))
+    hloc, sides = tools / "hloc/matches.h5", (Images(["q.jpg"]), Images(["d.jpg"]))
+    for path, options, words in (
+        (tmp_path / "matches.txt", {}, ".h5"),
+        (tmp_path / "empty", {}, ".npz"),
+        (tmp_path / "missing.h5", {}, "missing.h5"),
+        (tmp_path / "broken.db", {}, "COLMAP"),
+        (old, {}, "since 2021"),
+        (tools / "hloc/feats.h5", {}, "not feats"),
+        (hloc, {}, "give hloc's feats*.h5"),
+        (hloc, {"verified": True}, "verified"),
+    ):
+        with one_line_error(None, words):
+            open_matches(path, *sides, **options)

@@ -60,9 +60,8 @@ def test_signs_and_axes(tmp_path):
 
 def test_other_versions_and_damaged_files_are_one_line(tmp_path):
     path = write_matlab(tmp_path / "a.mat", CONTENT)
-    content = path.read_bytes()
-    header = b"MATLAB 7.3 MAT-file, Platform".ljust(124) + b"\0\2IM" + bytes(1000)
-    for damaged in (header, content[:100], content[: len(content) // 2], b"MATLAB".ljust(200, b"\1")):
+    header, content = b"MATLAB 7.3 MAT-file, Platform".ljust(124) + b"\0\2IM" + bytes(1000), path.read_bytes()
+    for damaged in (header, content[: len(content) // 2]):
         path.write_bytes(damaged)
         with one_line_error("a.mat: cannot be read"):
             read_checkpoint(path)

@@ -47,19 +47,19 @@ def test_matches(names, foreign, expected):
 
 
 @pytest.mark.parametrize(
-    "names, foreign, several",
+    "names, foreign",
     [
-        (["1.jpg"], ["db/1.jpg", "query/1.jpg"], r"got db/1\.jpg for 1\.jpg and query/1\.jpg for 1\.jpg"),
-        (["a/1.jpg", "b/1.jpg"], ["1.jpg"], r"got 1\.jpg for a/1\.jpg and 1\.jpg for b/1"),
-        (["1.jpg", "1.png"], ["1"], r"got 1 for 1\.jpg and 1 for 1\.png"),
-        (["1.jpg", "2.jpg"], ["1", "query/2.jpg"], r"one prefix .* got 1 for 1\.jpg"),
-        (["1.jpg"], ["1.png", "1"], r"got 1 for 1\.jpg and 1\.png for 1\.jpg"),
-        (["0.jpg", "1.jpg", "2.jpg"], ["db/0.jpg", "db/1.jpg", "query/2.jpg"], r"one prefix .*db/0.* .*query/2\.jpg"),
-        (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"], r"one prefix .* got 1\.jpg .*a/1\.jpg .*b/2\.jpg"),
+        (["1.jpg"], ["db/1.jpg", "query/1.jpg"]),
+        (["a/1.jpg", "b/1.jpg"], ["1.jpg"]),
+        (["1.jpg", "1.png"], ["1"]),
+        (["1.jpg", "2.jpg"], ["1", "query/2.jpg"]),
+        (["1.jpg"], ["1.png", "1"]),
+        (["0.jpg", "1.jpg", "2.jpg"], ["db/0.jpg", "db/1.jpg", "query/2.jpg"]),
+        (["a/1.jpg", "b/2.jpg"], ["1.jpg", "2.jpg"]),
     ],
 )
-def test_nothing_is_guessed(names, foreign, several):
-    with one_line_error(several):
+def test_nothing_is_guessed(names, foreign):
+    with one_line_error(r"feats\.h5: expected one name for each image, and one prefix .* got .* for "):
         match_names(FILE, names, foreign)
 
 

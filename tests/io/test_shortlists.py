@@ -1,4 +1,9 @@
-"""Shortlists: pairs of hloc and kapture, predictions in npz."""
+"""Shortlists: pairs of hloc and kapture, predictions in npz and of VPR-methods-evaluation, results of To-Match."""
+
+import os
+import pickle
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, Ranking, Shortlist
-from mfvpr.io import read_shortlist, reranked_shortlist, write_shortlist
+from mfvpr.io import Images, open_matches, read_shortlist, reranked_shortlist, write_shortlist
 from tests.io.checks import one_line_error
+from tests.io.match_files import POINTS, pair_of
+from tests.needs import needs
 
 QUERIES = ["q/1.jpg", "q/2.jpg", "q/3.jpg"]
 DATABASE = ["d/1.jpg", "d/2.jpg", "d/3.jpg", "d/4.jpg"]
@@ -132,10 +139,10 @@ def test_lines_that_are_no_pairs(tmp_path, text, message):
     [
         ({}, r"predictions \[2, K\].* got float64\[0\]"),
         ({"predictions": np.zeros((2, 2))}, r"got float64\[2, 2\]"),
-        ({"predictions": [[0, 1], [4, 0]]}, "0 to 3, .*-1 .*got 0 to 4"),
-        ({"predictions": [[0, -2], [0, 0]]}, "got -2 to 0"),
-        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"scores .*got <U1"),
-        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected scores that descend"),
+        ({"predictions": [[0, 1], [4, 0]]}, "rows from 0 to 3 or -1"),
+        ({"predictions": [[0, -2], [0, 0]]}, "rows from 0 to 3 or -1"),
+        ({"predictions": [[0], [1]], "scores": [["a"], ["b"]]}, r"as many scores, got .*<U1"),
+        ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, 2], [1, 2]]}, r"q/1\.jpg: expected .* scores that descend"),
         ({"predictions": [[0, 1], [1, 0]], "scores": [[1.0, np.nan], [1, 2]]}, "expected finite scores"),
         ({"predictions": np.full((2, 3), -1)}, "got none at all"),
         ({"predictions": np.array([[{}], [1]], object)}, "cannot be read"),
@@ -209,12 +216,134 @@ def test_what_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match=r"layout='csv': .*hloc, kapture"):
         write_shortlist(path, shortlist, QUERIES[:1], DATABASE, layout="csv")  # type: ignore[arg-type]
     wrong, ascending = (shortlist_of([[0, 1]], [[0.5, score]]) for score in (np.nan, 0.7))
-    for shortlist, message in ((wrong, "finite scores"), (ascending, "scores that descend")):
+    for shortlist in (wrong, ascending):
         for file, layout in (("p.txt", "kapture"), ("p.npz", "hloc")):
-            with pytest.raises(InputError, match=rf"q/1\.jpg: expected {message}"):
+            with pytest.raises(InputError, match=r"q/1\.jpg: expected finite scores that descend"):
                 write_shortlist(tmp_path / file, shortlist, QUERIES[:1], DATABASE, layout=layout)
     assert not list(tmp_path.iterdir())
     write_shortlist(path, ascending, QUERIES[:1], DATABASE)
     assert read_shortlist(path, QUERIES[:1], DATABASE).scores.tolist() == [[2, 1]]
     with pytest.raises(InputError, match="expected a new file"):
         write_shortlist(tmp_path, ascending, QUERIES[:1], DATABASE, layout="preds")
+
+
+# Results of To-Match and vismatch
+
+
+def result(num_inliers):
+    """Result of an image matcher for one pair; a pair with few matches has no homography and empty arrays."""
+    points = np.arange(2.0 * num_inliers).reshape(num_inliers, 2)
+    return {
+        "num_inliers": num_inliers,
+        "H": np.eye(3) if num_inliers > 3 else None,
+        "all_desc0": None,
+        "matched_kpts0": points,
+        "matched_kpts1": points + 2,
+        "matched_confidences": None,
+        "inlier_kpts0": points[1:],
+        "inlier_kpts1": points[1:] + 2,
+    }
+
+
+def write_results(path, content, compression=zipfile.ZIP_STORED):
+    """A file as `torch.save` writes it without tensors: a pickle of protocol 2 in a zip file."""
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr(f"{path.stem}/data.pkl", pickle.dumps(content, protocol=2))
+        archive.writestr(f"{path.stem}/byteorder", "little")
+
+
+@pytest.fixture
+def preds(tmp_path):
+    """Two queries, the first with the predictions 4, 3, 2, 1, the second with 1 and 2."""
+    for number, rows in enumerate([(3, 2, 1, 0), (0, 1)]):
+        write_predictions(tmp_path, number, f"/set/{QUERIES[number]}", [f"/set/{DATABASE[row]}" for row in rows])
+    return tmp_path
+
+
+@pytest.mark.parametrize("writer", [write_results, pytest.param("torch", marks=needs("torch"))])
+def test_candidates_are_in_the_order_of_their_inliers(preds, writer):
+    """Equal numbers stay in the order of retrieval, and predictions that were not matched are no candidates."""
+    for number, counts in enumerate([(0, 7, 7), (2, 90)]):
+        path, results = preds / f"{number:03d}.torch", [result(count) for count in counts]
+        if writer == "torch":
+            import torch
+
+            torch.save(results, path)
+        else:
+            write_results(path, results)
+    shortlist = read_shortlist(preds, QUERIES, DATABASE)
+    assert shortlist.indices.tolist() == [[2, 1, 3], [1, 0, -1], [-1, -1, -1]]
+    assert shortlist.scores.tolist() == [[7, 7, 0], [90, 2, 0], [0, 0, 0]]
+
+
+def test_matches_of_predictions(preds):
+    """A result for each prediction, in their order; predictions beyond the results were not matched."""
+    write_results(preds / "000.torch", [result(3), result(0), result(5)])
+    sides = Images(QUERIES[:2]), Images(DATABASE)
+    files = open_matches(preds, *sides, image_size=(512, 512))
+    assert [files.contains(0, row) for row in range(4)] == [False, True, True, True]
+    assert not files.contains(1, 0)
+    read = files.read(0, [3, 1, 0, 2])
+    assert [None if each is None else len(each.mask) for each in read] == [3, 5, None, 0]
+    np.testing.assert_array_equal(read[1].points1 - read[1].points0, np.full((5, 2), 2.0))
+    assert read[1].image_size0.tolist() == [512, 512]
+    verified = open_matches(preds, *sides, image_size=(512, 512), verified=True).read(0, [1])
+    assert len(verified[0].mask) == 4
+    with one_line_error("image_size"):
+        open_matches(preds, *sides).read(0, [3])
+
+
+class Command:
+    def __reduce__(self):
+        return os.system, ("touch executed",)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ([], "expected num_inliers of each prediction"),
+        ([result(1)] * 5, "for each prediction in the text file, got 5 results"),
+        ([result(1), {"H": None}], "expected num_inliers of each prediction"),
+        ([result(1) | {"num_inliers": -1}], "a whole number from 0"),
+        ({"num_inliers": 3}, "expected a list of results"),
+        ([3], "expected a dictionary of To-Match"),
+        ([Command()], "nothing was executed"),
+    ],
+)
+def test_other_content_is_one_line(preds, monkeypatch, content, words):
+    monkeypatch.chdir(preds)
+    write_results(preds / "000.torch", content)
+    with one_line_error(None, "000.torch", words):
+        read_shortlist(preds, QUERIES, DATABASE)
+    assert not (preds / "executed").exists()
+
+
+def test_damaged_and_missing_files_are_one_line(preds):
+    write_results(preds / "000.torch", [result(5)] * 4, zipfile.ZIP_DEFLATED)
+    with one_line_error(None, "000.torch", "uncompressed"):
+        read_shortlist(preds, QUERIES, DATABASE)
+    write_results(preds / "000.torch", [result(5)] * 4)
+    with one_line_error("expected scores of all pairs or of none"):
+        read_shortlist(preds, QUERIES, DATABASE)  # the second query has no results
+    whole = (preds / "000.torch").read_bytes()
+    for part in (b"", whole[: len(whole) // 2], whole.replace(b"num_inliers", b"num_inlierz", 1)):
+        (preds / "000.torch").write_bytes(part)
+        with one_line_error(None, "000.torch"):
+            read_shortlist(preds, QUERIES, DATABASE)
+
+
+def test_results_of_vismatch(tmp_path):
+    names = {"img0_path": Path("/x/q1.jpg"), "img1_path": Path("/y/d1.jpg")}
+    content = names | {"matched_kpts0": POINTS, "matched_kpts1": POINTS, "H": None, "im_size": 64}
+    path = tmp_path / "output_0_result.torch"
+    write_results(path, content)
+    assert len(pair_of(tmp_path).mask) == 3
+    for key, value, message in [
+        ("H", Command(), "nothing was executed"),
+        ("img1_path", Path("/y/other.jpg"), "got none of their names"),
+        ("matched_kpts1", [1, 2], "points"),
+        ("im_size", [64, 64, 64], "im_size"),
+    ]:
+        write_results(path, {**content, key: value})
+        with one_line_error(message):
+            pair_of(tmp_path)

@@ -54,15 +54,14 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([], "expected a pose of each of the 3 images, got 0"),
         (TUM[:2], "expected a pose of each of the 3 images, got 2"),
-        ([*TUM[:2], "13 1 2 3 0 0 0"], "line 3: expected 8 numbers .* got 7"),
-        ([*KITTI[:2], TUM[0]], "line 3: expected 8 numbers .* got 8"),
-        ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected finite numbers, got 'nan 2"),
-        ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected finite numbers, got '1_0 2"),
-        ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected finite numbers, .*1e999"),
-        ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, got 12.750000000 after 13.000000000"),
-        ([*TUM[:2], "nan 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got 'nan'"),
+        ([*TUM[:2], "13 1 2 3 0 0 0"], "line 3: expected 8 .* got '13 1 2 3 0 0 0'"),
+        ([*KITTI[:2], TUM[0]], "line 3: expected 8 "),
+        ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected .* finite numbers .*got '13 nan"),
+        ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected .* finite numbers .*got '13 1_0"),
+        ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected .* finite numbers .*1e999"),
+        ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, .* got 12.750000000 after 13.000000000"),
+        ([*TUM[:2], "-1 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got '-1'"),
     ],
 )
 def test_other_files_are_one_line(write, lines, message):
@@ -73,7 +72,7 @@ def test_other_files_are_one_line(write, lines, message):
 def test_poses_belong_to_the_times_of_the_images(write):
     names = ["rgb/12.504.png", "rgb/12.745.png", "rgb/13.009.png"]
     assert len(read_poses(write(TUM), names)) == 3
-    with one_line_error(r"line 3: expected the pose of rgb/13\.011\.png, within 10 ms, got one at 13\.000000000"):
+    with one_line_error(r"line 3: expected .* within 10 ms .* rgb/13\.011\.png, got 13\.000000000"):
         read_poses(write(TUM), [*names[:2], "rgb/13.011.png"])
     assert len(read_poses(write(KITTI), names)) == 3
     path = write([])
@@ -85,8 +84,8 @@ def test_poses_belong_to_the_times_of_the_images(write):
 @pytest.mark.parametrize(
     ("poses", "stamps", "message"),
     [
-        ([KITTI[0], None], None, "a place of all images, .* write TUM, got 1 places of 2 images"),
-        ([None, None], [1, 2], "a place of at least one image, got 0 places of 2 images"),
+        ([KITTI[0], None], None, "a place of all images, .* got 1 places of 2 images"),
+        ([None, None], [1, 2], "for TUM of at least one, got 0 places of 2 images"),
         (["1 2 3 0 0 0 1"] * 2, [5, 5], "expected different times"),
         (["1 2 3 0 0 0 1"] * 2, None, "expected poses of 12 numbers"),
         (KITTI[:2], [1, 2], "expected poses of 7 numbers"),
