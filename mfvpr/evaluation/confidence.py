@@ -188,7 +188,8 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
 
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     """The confidence whose `vars` were written as JSON; a TypeError for other fields."""
-    return Confidence(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+    fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return Confidence(**fields)
 
 
 class PrecisionRecall(NamedTuple):

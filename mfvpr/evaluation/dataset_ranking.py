@@ -218,15 +218,17 @@ def match_sequence(
     matches, candidates, remarks = kept
     for line in remarks["warnings"]:
         cache.warn(line)
-    bad = [{int(row): reason for row, reason in remarks[side].items()} for side in ("queries", "database")]
+    sides = "queries", "database"
+    bad_queries, bad_database = ({int(row): reason for row, reason in remarks[side].items()} for side in sides)
     there = candidates.mask
     empty = int((there & (matches[0].counts == 0)).sum())
     if pipeline.image_source is not None and empty and 2 * empty >= there.sum():
         cache.warn(f"{sequence.name}: {empty} of {there.sum()} pairs have no matches; they score 0")
-    if missing := [row for row in np.flatnonzero(~there.any(axis=1)) if row not in bad[0]]:
+    if missing := [row for row in np.flatnonzero(~there.any(axis=1)) if row not in bad_queries]:
         queries = f"{len(missing)} such queries of {len(sequence.images)}"
         cache.warn(f"{sequence.images.paths[missing[0]]}: no candidates ({queries}), which counts as a failure")
-    return Matched(sequence, candidates, matches, *bad, tuple(scale.weight for scale in pipeline.scales))
+    weights = tuple(scale.weight for scale in pipeline.scales)
+    return Matched(sequence, candidates, matches, bad_queries, bad_database, weights)
 
 
 def num_candidates(candidates: int | Literal["all"], database: ImageFolder) -> int:

@@ -99,7 +99,8 @@ class HalfComparison:
 
     def rows(self) -> Iterator[Row]:
         """All scores, each evaluated as soon as it is chosen or learned."""
-        split, options, scorer = self.split, self.options, self.axes.scorer
+        split, options = self.split, self.options
+        scorer: Any = self.axes.scorer
         by_hand = {"paper" if isinstance(scorer.weight, _OF_THE_PAPER) else "as set": scorer}
         by_hand["1 - ratio"] = replace(scorer, weight=RatioWeight())
         for name, hand_set in by_hand.items():

@@ -30,7 +30,8 @@ from mfvpr.tuning.learning.training import Fit, Schedule, fit
 from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
 
 Loss = Callable[[Array, Array, Array], Array]
-Scores, Mask = Num[Array, " candidates"], Bool[Array, " candidates"]
+Scores = Num[Array, " candidates"]
+Mask = Bool[Array, " candidates"]
 
 
 def cross_entropy(scores: Scores, positives: Mask, mask: Mask) -> Float[Array, ""]:

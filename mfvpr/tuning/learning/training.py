@@ -180,5 +180,5 @@ def _pack(state: State) -> dict[str, np.ndarray]:
 def _unpack(structure: Any, arrays: Mapping[str, np.ndarray]) -> State:
     history, losses = json.loads(arrays["record"].tobytes())
     leaves = [arrays[str(place)] for place in range(len(arrays) - 1)]
-    arrays_of_state = _strong(jax.tree.unflatten(structure, leaves))
-    return State(*arrays_of_state, tuple(Record(*row) for row in history), tuple(losses))
+    parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+    return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
