@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -123,17 +122,12 @@ class HalfComparison:
         yield self.evaluate(f"{name} + retrieval", learned, {FUSION: options.c})
 
     def evaluate(
-        self,
-        name: str,
-        scorer: Scorer,
-        setting: Setting,
-        values: Mapping[str, Any] = MappingProxyType({}),
-        fitted: Fit | None = None,
+        self, name: str, scorer: Scorer, setting: Setting, values: Any = None, fitted: Fit | None = None
     ) -> Row:
         """Evaluate a setting on the half to report on, with all candidates."""
         queries = self.split.half.report
         [first] = self.first_rows(name, scorer, [setting], queries, self.split.candidates.mask)
-        return Row(self.split.name, name, self.split.protocol.hits(first, queries), values, fitted)
+        return Row(self.split.name, name, self.split.protocol.hits(first, queries), values or {}, fitted)
 
     def search(self, name: str, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
         """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""

@@ -148,12 +148,8 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
             raise InputError(f"{part.name}: expected {words(*expected)} as {first.name} has, got {words(*got)}")
     sizes, databases = ([len(part.match_set) for part in parts], [part.protocol.places.num_database for part in parts])
     split, allowed = sum(sizes[: len(teach)]), sum(databases[: len(teach)])
-    half = Half(
-        np.arange(split),
-        np.arange(split, sum(sizes)),
-        np.arange(sum(databases)) < allowed,
-        tuple(sizes[: len(teach)]),
-    )
+    queries, rows = np.arange(sum(sizes)), np.arange(sum(databases))
+    half = Half(queries[:split], queries[split:], rows < allowed, tuple(sizes[: len(teach)]))
     protocol = replace(
         first.protocol,
         positives=[join_positives(sets) for sets in zip(*(part.protocol.positives for part in parts), strict=True)],
@@ -170,10 +166,8 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         return np.concatenate([np.pad(array, padding(array), constant_values=fill) for array in arrays])
 
     listed = [part.candidates for part in parts]
-    indices = [
-        np.where(each.mask, each.indices + start, -1).astype(np.int32)
-        for each, start in zip(listed, np.cumsum([0, *databases[:-1]]), strict=True)
-    ]
+    starts = zip(listed, np.cumsum([0, *databases[:-1]]), strict=True)
+    indices = [np.where(each.mask, each.indices + start, -1).astype(np.int32) for each, start in starts]
     scores, mask = join([each.scores for each in listed], 0), join([each.mask for each in listed], False)
     match_set = MatchSet(
         _Joined([part.match_set.matches for part in parts], width),
