@@ -66,7 +66,6 @@ def sweep_program(settings: Settings) -> None:
         )
         with watch("sweep"):
             if settings.search == "grid":
-                axes.check(matches.image_sizes)
                 outcome = search_grid(axes, protocol, matches, candidates, options)
             else:
                 trials = {"trials": settings.trials, "seed": settings.seed}

@@ -315,9 +315,9 @@ def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candid
     """Scores with mean 0 and standard deviation 1 over the finite scores of candidates."""
     finite = mask & jnp.isfinite(scores)
     # Relative to the maximum, equal scores deviate by exactly 0, without rounding.
-    maximum = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
+    maximum = jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf)
     values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # its square may overflow
+    largest = jnp.max(jnp.abs(values), initial=0.0)  # its square may overflow
     values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
     mean, deviation = masked_mean(values, finite), _masked_std(values, finite)
     return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)

@@ -19,7 +19,7 @@ from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import write_gains
 from mfvpr.report.tables import read_table
-from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import runtime
@@ -179,19 +179,6 @@ def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     moved = Path(shutil.copytree(files, tmp_path / "elsewhere"))
     recipes = [feature_cache.recipes.of(FeatureFiles(at(dataset, root, ".npz"))) for root in (files, moved)]
     assert recipes[0] == recipes[1]  # by content
-
-
-def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several, tmp_path, monkeypatch):
-    fitted, lines = [], []
-    for kind in (VladFitting, WhitenedSearch):
-        plain = kind.fit
-        monkeypatch.setattr(kind, "fit", lambda self, sample, plain=plain: fitted.append(self) or plain(self, sample))
-    whitened = replace(VLAD, search=WhitenedSearch(4))
-    runtime = mfvpr.Runtime(log=lines.append)
-    evaluate_parts(several, SIFT, whitened, SCORERS, candidates=5, cache=FeatureCache(tmp_path), runtime=runtime)
-    assert fitted == [VLAD.describer.fitting, whitened.search]
-    assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[:1]
-    assert sum("images to do" in line for line in lines) == 3
 
 
 @pytest.mark.slow

@@ -169,17 +169,3 @@ def test_a_scale_without_weight_takes_no_part_and_no_candidates_have_no_score():
     scores, mask = np.array([[np.inf, 1], [1, 3], [3, np.nan]], np.float32), np.array([True, True, False])
     np.testing.assert_allclose(fuse_scales(scores, mask, np.float32([0, -2])), [2, -2, np.nan], rtol=1e-6)
     assert fuse_scales(np.zeros((0, 2), np.float32), np.zeros(0, bool)).shape == (0,)
-
-
-def test_fused_scales_have_a_gradient_where_scores_are_equal_or_missing():
-    mask = np.array([True, True, True, True, False])
-    equal, unequal = np.full(5, 2.0), np.array([1.0, np.nan, 4.0, 2.0, np.nan])
-
-    def total(scores):
-        fused = fuse_scales(scores, mask)
-        return jnp.sum(jnp.where(jnp.isfinite(fused), fused, 0.0) ** 3)  # the sum of squares is their number
-
-    for scores in (np.stack([equal, equal], 1), np.stack([equal, unequal], 1)):
-        slope = jax.grad(total)(jnp.asarray(scores, jnp.float32))
-        assert np.isfinite(slope).all()
-    assert np.abs(slope[[0, 2, 3], 1]).min() > 0.05

@@ -79,7 +79,6 @@ def compare(
     """
     if not can_learn(axes.scorer) or not hasattr(axes.scorer, "weight"):
         raise InputError(f"{type(axes.scorer).__name__}: expected a scorer with numbers to learn and a match weight")
-    axes.check(match_set.image_sizes)
     options = options or Options()
     splits = training_splits(match_set, candidates, protocol, retrieval_score=options.retrieval_score)
     halves = [list(HalfComparison(split, axes, options, checkpoints, runtime).rows()) for split in splits]

@@ -135,16 +135,14 @@ def rank_settings(
         else:
             rows[number] = kept
 
-    pairs = f"{int(candidates.mask.sum()):,} pairs of {num_queries:,} queries with their candidates"
-    options.runtime.log(f"{options.label}: {len(missing):,} of {len(settings):,} settings to do on {pairs}")
     # Settings that differ in c alone share their scores.
     names = [name for name in settings[0] if name != FUSION]
     by_score = list(_group(missing, lambda number: _items(settings[number], names)).values())
     scored = [{name: settings[first][name] for name in names} for first, *_ in by_score]
     groups = list(group_by_program(scorer, scored, match_set.image_sizes))
-    share = (
-        len(scored) / len(groups) if groups else 1
-    )  # settings of a program, on average: with more, batches are smaller
+    share = len(scored) / len(groups) if groups else 1  # settings of a program: with more, batches are smaller
+    pairs = f"{int(candidates.mask.sum()):,} pairs of {num_queries:,} queries with their candidates"
+    options.runtime.log(f"{options.label}: {len(missing):,} of {len(settings):,} settings to do on {pairs}")
     blocks = [block for group in groups for block in group.blocks(at_once)]
     batches_of = lru_cache(maxsize=1)(lambda queries: list(all_batches(match_set, queries, settings=share)))
     batches_of_block = sum(len(partition(each, part, settings=share)) for part in parts for each in scales(match_set))

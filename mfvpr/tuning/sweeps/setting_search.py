@@ -111,11 +111,6 @@ class Axes:
         }
         return {name: converters[name](value) if name in converters else value for name, value in plain.items()}
 
-    def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
-        for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
-            fit_capacities(with_parameters(self.scorer, setting), *image_sizes)
-
     def _own_value(self, name: str) -> Any:
         if name in (MAX_DISTANCE, FUSION):
             return None if name == MAX_DISTANCE else 0
@@ -207,7 +202,6 @@ def search_grid(
     options: SweepOptions = DEFAULT_OPTIONS,
 ) -> Outcome:
     """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them."""
-    axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), axes.grid()
     settings += [] if dict(axes.own_values) in settings else [dict(axes.own_values)]
     of_scorer = list(map(axes.setting, settings))
@@ -233,7 +227,8 @@ def search_optuna(
     require_optuna()
     import optuna
 
-    axes.check(match_set.image_sizes)
+    for setting in grid({name: axes.values[name] for name in CAPACITY if name in axes.values}):  # before any work
+        fit_capacities(with_parameters(axes.scorer, setting), *match_set.image_sizes)
     protocol, settings = protocol.of(candidates), [dict(axes.own_values)]
 
     def rank(settings: list[dict[str, Any]], label: str) -> np.ndarray:

@@ -56,26 +56,6 @@ def test_candidates_are_right_wrong_or_of_no_account(half):
     assert not batch.mask[len(at.train) :].any()
 
 
-def test_statistics_of_a_learned_weight_are_of_nothing_hidden():
-    """Distances of hidden candidates, and of candidates of no account, are moved out of range: nothing changes."""
-
-    def weight(at):
-        return Model.of_ranking(at, AggregatedScore(), OPTIONS, learned_weight=True).start["weight"]
-
-    at = split()
-    moved = []
-    for query, flat in enumerate(at.match_set.matches):
-        there = np.repeat(at.usable[query], at.match_set.counts[query]) & (query in at.train)
-        moved.append(replace(flat, distance=np.where(there, flat.distance, np.float32(50))))
-    far = replace(at, match_set=replace(at.match_set, matches=moved))
-    jax.tree.map(np.testing.assert_array_equal, weight(far), weight(at))
-    distances = np.concatenate([
-        at.match_set.matches[query].distance[np.repeat(at.usable[query], at.match_set.counts[query])]
-        for query in at.train[np.linspace(0, len(at.train) - 1, 4).astype(int)]
-    ])  # fmt: skip
-    assert weight(at).center[ABSOLUTE.index("distance")] == pytest.approx(distances.mean(), rel=1e-5)
-
-
 HISTOGRAM = HistogramOfShifts(bin_size=20.0, sigma=20.0)
 scores_of_one = jax.jit(score_candidates)
 
