@@ -101,15 +101,6 @@ def test_a_killed_worker_costs_time_alone(dataset, cluster, flag, tmp_path, stag
     assert_same(result, rank_dataset(dataset, system_of(), cache=FeatureCache(tmp_path / "plain")))
 
 
-def test_an_error_in_a_worker_is_that_of_one_process(dataset, cluster, tmp_path):
-    (tmp_path / "bad.png").write_bytes(b"no image")
-    folder = mfvpr.datasets.image_folder(tmp_path)
-    for runtime in (Runtime(), Runtime(cluster=cluster)):
-        with pytest.raises(InputError, match=r"bad\.png: .*, or set on_bad_image=skip") as raised:
-            FeatureCache(tmp_path / "store", runtime=runtime).local(folder, SIFT)
-        assert "\n" not in str(raised.value)
-
-
 def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(dataset, cluster, tmp_path):
     extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))

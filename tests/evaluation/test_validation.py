@@ -1,18 +1,16 @@
 """Errors of an evaluation's arguments and of user-defined parts: one line, before anything is done."""
 
-import shutil
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from PIL import Image
 
 import mfvpr
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets import FrameTruth, image_folder
+from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
-from mfvpr.features import Aggregated, Description, Sift, VladFitting
+from mfvpr.features import Description, Sift
 from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
@@ -172,13 +170,3 @@ def test_a_ground_truth_of_other_images_is_told(dataset):
         result.recall([0], [0])
     with pytest.raises(InputError, match="threshold=-1: expected a number from 0"):
         result.recall([-1])
-
-
-def test_images_of_nothing_have_no_shortlist(dataset, tmp_path):
-    """Their aggregated descriptor is zero, which resembles all images alike."""
-    Image.new("RGB", (160, 120)).save(tmp_path / "0.png")
-    shutil.copy(dataset.queries.paths[3], tmp_path / "1.png")
-    sequence = replace(dataset.only, images=image_folder(tmp_path))
-    described = Retrieval(Aggregated(SIFT, VladFitting(num_words=4)))
-    candidates = described.shortlist(sequence, dataset.database, 3, FeatureCache()).candidates
-    assert candidates.mask.tolist() == [[False] * 3, [True] * 3]

@@ -1,6 +1,5 @@
 """Sweeps against one evaluation after the other."""
 
-import itertools
 import sys
 from dataclasses import replace
 
@@ -12,8 +11,8 @@ import mfvpr
 from mfvpr.core.scorer import with_parameters
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import rankings
-from mfvpr.matchers import MatchSet, Scales
-from mfvpr.matchers.match_set import shapes, slots
+from mfvpr.matchers import Scales
+from mfvpr.matchers.match_set import shapes
 from mfvpr.tuning import sweeps
 from mfvpr.tuning.sweeps.setting_rankings import group_by_program
 from mfvpr.utils import InputError
@@ -176,20 +175,6 @@ def test_one_program_per_shape_and_capacity(data, compilations):
     assert compilations.count == 0
     rank(mfvpr.HistogramOfShifts(), sweeps.grid(axes | {"bin_size": [8.0, 12.0, 12.1]}), *data)
     assert 1 <= compilations.count <= 2 * len(shapes(match_set))  # two capacities
-
-
-@pytest.mark.parametrize("pairs", [50, 5_000, 500_000])
-def test_a_shape_is_compiled_where_that_costs_less_than_padding(pairs):
-    """The fewer settings there are to score, and the fewer pairs, the fewer shapes."""
-    counts = np.random.default_rng(0).integers(0, 321, (pairs // 50, 50))
-    match_set = MatchSet([], counts, 320)
-    of_settings = [slots(match_set, settings=settings) for settings in (1, 8, 64, 10_000)]
-    for few, many in itertools.pairwise(of_settings):
-        assert (counts <= many).all()
-        assert (many <= few).all()
-    fewest, *_, most = (len(np.unique(sizes)) for sizes in of_settings)
-    assert fewest == (1 if pairs < 500_000 else 4)
-    assert most == len(np.unique(slots(match_set))) >= 4
 
 
 def with_points(match_set, points):
