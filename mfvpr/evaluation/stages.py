@@ -1,4 +1,4 @@
-"""The stages of re-ranking a data set: match, score in batches on all devices, explain. `fusion` fuses and ranks.
+"""The stages of re-ranking a data set: match, score in batches on all devices, explain. `rankings` fuses and ranks.
 
 Files and threads stay on the host; each computation is one compiled program per shape.
 """
