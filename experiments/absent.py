@@ -14,23 +14,16 @@ from jaxtyping import Bool, Float
 
 from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
-from mfvpr.datasets import Dataset
 from mfvpr.datasets.datasets import folder
-from mfvpr.evaluation import Confidence, System, confidence_inputs, fit_confidence, rank_dataset
+from mfvpr.evaluation import Confidence, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
 from mfvpr.localization.map_settings import data_of_drive
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer
 
+# Inputs of the confidence, and whether the top prediction is correct.
 Ranked = tuple[Float[np.ndarray, "queries inputs"], Bool[np.ndarray, " queries"]]
-
-
-def rank_elsewhere(dataset: Dataset, system: System, cache: FeatureCache) -> Ranked:
-    """Inputs of the confidence of queries that show no place of the database, so that no top prediction is correct."""
-    result = rank_dataset(dataset, system, cache=cache)
-    [ranked] = result.systems[system.headline]
-    return confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)
 
 
 def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> list[str]:
@@ -54,7 +47,8 @@ def run(drives: list[str]) -> None:
     absent = {}
     for place, other in itertools.permutations(folders, 2):
         elsewhere = folder(folders[place][0], folders[other][1], ground_truth="none")
-        absent[place, other] = rank_elsewhere(elsewhere, system, cache)
+        [ranked] = rank_dataset(elsewhere, system, cache=cache).systems[system.headline]
+        absent[place, other] = confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)
     print("| fitted on | queries count | ECE, % | absent, answered, % | present and correct, answered, % |")
     print("| :-- | :-- | --: | --: | --: |")
     for name in datasets:

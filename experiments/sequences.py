@@ -14,7 +14,6 @@ The field's methods see the same images as "causal": those before.
 - SeqSLAM 1, SeqSLAM any: straight trajectories of 10 images, 0.8 to 1.2 or -8 to 8 rows from one to the next, through
   the similarities of global descriptors, which are standardized for each image (after Milford & Wyeth, ICRA 2012)
 - scores 1, scores any: the same, through the standardized scores
-- descriptors: mean global descriptors of 5 images on both sides (as SeqNet, without learning)
 """
 
 from collections import defaultdict
@@ -27,8 +26,7 @@ from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
-from mfvpr.evaluation import Confidence, System, rank_dataset
-from mfvpr.evaluation.confidence import CalibrationData, calibration_data
+from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.drives import Drive, DriveFilter
 from mfvpr.evaluation.rankings import FrameCorrelation, Ranked
 from mfvpr.evaluation.statistics import path_test
@@ -37,7 +35,7 @@ from mfvpr.storage import FeatureCache
 
 NEAR = 2  # frames
 STEADY, ANY = np.arange(0.8, 1.25, 0.1), np.arange(-8, 8.5, 0.5)  # rows from one image to the next
-TRAJECTORY, WINDOW = 10, 5  # images
+TRAJECTORY = 10  # images
 
 Drives = dict[str, Int[np.ndarray, " images"]]
 Matrix = Float[np.ndarray, "queries rows"]
@@ -77,16 +75,6 @@ def trajectories(values: Matrix, speeds: Float[np.ndarray, " speeds"], length: i
     return best
 
 
-def mean_descriptors(queries: Float[np.ndarray, "queries d"], database: Float[np.ndarray, "rows d"]) -> Matrix:
-    """Similarities of mean descriptors of the last images on both sides."""
-
-    def means(vectors: np.ndarray) -> np.ndarray:
-        sums = np.stack([vectors[max(0, end - WINDOW + 1) : end + 1].sum(axis=0) for end in range(len(vectors))])
-        return sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-
-    return means(queries) @ means(database).T
-
-
 class Place:
     """A data set, ranked once: drives along it take some of its queries."""
 
@@ -96,7 +84,8 @@ class Place:
         [self._ranked] = ranked.systems[system.headline]
         self.number, self._rows = len(dataset.only.images), len(dataset.database)
         sides = (dataset.only.images, dataset.database)
-        self._vectors = [cache.vectors(images, retriever.describer, dataset.database).values for images in sides]
+        queries, database = (cache.vectors(each, retriever.describer, dataset.database).values for each in sides)
+        self._similarities = queries @ database.T
         self._scores = np.full((self.number, self._rows), np.nan)
         there = self._ranked.rows >= 0
         self._scores[np.nonzero(there)[0], self._ranked.rows[there]] = self._ranked.scores[there]
@@ -111,61 +100,38 @@ class Place:
         first["at speed 1"] = DriveFilter("causal", Drive(advance=1))(ranked, self._rows).rows[:, 0]
         frames = np.where(shortlist.mask, FrameCorrelation()(shortlist, ranked.scores), -np.inf)
         first["frames"] = ranked.rows[np.arange(len(images)), frames.argmax(axis=1)]
-        vectors, scores = self._vectors[0][images], standardized(self._scores[images])
-        similarities = standardized(vectors @ self._vectors[1].T)
+        similarities, scores = standardized(self._similarities[images]), standardized(self._scores[images])
         matrices = {
             f"{name} {rows}": trajectories(values, speeds, TRAJECTORY)
             for name, values in (("SeqSLAM", similarities), ("scores", scores))
             for rows, speeds in (("1", STEADY), ("any", ANY))
-        } | {"descriptors": mean_descriptors(vectors, self._vectors[1])}
+        }
         first |= {name: values.argmax(axis=1) for name, values in matrices.items()}
         return {name: np.abs(rows - images) <= NEAR for name, rows in first.items()}
 
 
 def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
     """Rows of the table: recall of each set and drive, then gains over single images, pooled over the sets."""
-    pooled = {drive: (list[Hits](), list[np.ndarray]()) for drive in drives(1)}
+    pooled = {drive: list[tuple[Int[np.ndarray, " images"], Hits]]() for drive in drives(1)}  # with places along a path
     for number, (name, parts) in enumerate(places.items()):
-        for drive, (all_hits, all_places) in pooled.items():
+        for drive, all_hits in pooled.items():
             images = [drives(place.number)[drive] for place in parts]
             hits = [place.hits(each) for place, each in zip(parts, images, strict=True)]
-            all_hits += hits
-            all_places += [number * 10**6 + each for each in images]
-            yield [name, drive, *(f"{100 * _joined(hits, method).mean():.1f}" for method in hits[0])]
-    for drive, (hits, images) in pooled.items():
-        yield ["all", drive, *(_gain(hits, method, np.concatenate(images)) for method in hits[0])]
+            all_hits += [(number * 10**6 + each, part) for each, part in zip(images, hits, strict=True)]
+            recalls = [np.concatenate([part[method] for part in hits]).mean() for method in hits[0]]
+            yield [name, drive, *(f"{100 * recall:.1f}" for recall in recalls)]
+    for drive, all_hits in pooled.items():
+        path = np.argsort(np.concatenate([images for images, _ in all_hits]), kind="stable")
+        hits = {method: np.concatenate([part[method] for _, part in all_hits])[path] for method in all_hits[0][1]}
+        alone, cells = hits.pop("single"), []
+        for correct in hits.values():
+            gain, p = correct.mean() - alone.mean(), path_test(correct, alone).p_value
+            cells.append(f"{100 * correct.mean():.1f} ({100 * gain:+.1f}, p {p:.3f})")
+        yield ["all", drive, f"{100 * alone.mean():.1f}", *cells]
 
 
-def _joined(hits: Sequence[Hits], method: str) -> Bool[np.ndarray, " images"]:
-    return np.concatenate([part[method] for part in hits])
-
-
-def _gain(hits: Sequence[Hits], method: str, places: Int[np.ndarray, " images"]) -> str:
-    """Recall over all sets, and its gain over single images, with p along the path."""
-    correct, alone = _joined(hits, method), _joined(hits, "single")
-    if method == "single":
-        return f"{100 * alone.mean():.1f}"
-    path = np.argsort(places, kind="stable")
-    p = path_test(correct[path], alone[path]).p_value
-    return f"{100 * correct.mean():.1f} ({100 * (correct.mean() - alone.mean()):+.1f}, p {p:.3f})"
-
-
-def fit(arguments: list[str]) -> Confidence:
-    """The confidence of all scores of `scorer=demo` with SIFT on some drives, see `mfvpr.evaluation.drives.STREETS`."""
-    system, cache, parts = load_system("mfvpr", features="sift", scorer="demo"), FeatureCache(), []
-    for argument in arguments:
-        dataset = folder(*argument.partition("=")[2].split(":"), ground_truth="order")
-        systems, truth = rank_dataset(dataset, system, cache=cache).systems, dataset.only.truth
-        assert truth is not None
-        parts += [calibration_data(systems[name][0], truth, NEAR) for name in system.scorers]
-    return CalibrationData(*map(np.concatenate, zip(*parts, strict=True))).fit()
-
-
-def run(arguments: list[str], features: str, *, is_fit: bool = False) -> None:
-    """Print a table of all data sets, or the confidence that is fitted on them."""
-    if is_fit:
-        print(fit(arguments))
-        return
+def run(arguments: list[str], features: str) -> None:
+    """Print a table of all data sets."""
     system, cache = load_system("mfvpr", features=features), FeatureCache()
     places = defaultdict[str, list[Place]](list)
     for name, _, paths in (argument.partition("=") for argument in arguments):
@@ -182,7 +148,6 @@ def add_arguments(parser: Parser) -> None:
     """Declare the command line."""
     parser.add_argument("arguments", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives along data sets")
     parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
-    parser.add_argument("--fit", dest="is_fit", action="store_true", help="fit a confidence on the drives instead")
     parser.set_defaults(run="experiments.sequences:run")
 
 

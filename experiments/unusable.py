@@ -46,14 +46,13 @@ def coarse_noise(image: Pixels, rng: np.random.Generator) -> Pixels:
 
 def blur(share: float) -> Change:
     """Defocus: the mean over a square with a share of the width."""
-    return lambda image, rng: scipy.ndimage.uniform_filter(
-        image, (size := round(share * image.shape[1]), size, 0), mode="nearest"
-    )
+    side = lambda image: round(share * image.shape[1])  # noqa: E731
+    return lambda image, _: scipy.ndimage.uniform_filter(image, (side(image), side(image), 0), mode="nearest")
 
 
 def expose(gain: float) -> Change:
     """Brightness times a gain, clipped."""
-    return lambda image, rng: gain * image
+    return lambda image, _: gain * image
 
 
 CHANGES: dict[str, Change] = {

@@ -1,7 +1,5 @@
 """A made-up run folder whose names are hostile, as the files of an evaluation would have them."""
 
-import json
-
 import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -10,7 +8,7 @@ from mfvpr.evaluation.rankings import Ranked
 from mfvpr.report import Table, write_json
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
-from mfvpr.report.run_files import write_failures, write_predictions
+from mfvpr.report.run_files import write_predictions
 from mfvpr.report.runs import file_names
 from mfvpr.report.tables import write_csv
 from mfvpr.utils.files import printable
@@ -45,6 +43,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     common = {
         "retrieval": {"name": HOSTILE[0]}, "features": {"name": HOSTILE[1]}, "matching": {}, "candidates": CANDIDATES,
         "queries": len(HOSTILE) * len(sequences), "database": len(HOSTILE), "dataset": sequences[0],
+        "description": f"{HOSTILE[0]}: {'recall in %' if truth else 'no ground truth: rankings only'}",
         "data_fingerprint": {"database": "0"}, "ground_truth": known, "seconds": {HOSTILE[2]: 1.5, "scores": 2.0},
         "versions": {"mfvpr": "</script>"}, **changes,
     }  # fmt: skip
@@ -78,7 +77,6 @@ def _write_answers(folder, ranks, truth):
         scores = np.arange(len(HOSTILE))[:, None] + 10.0 - np.arange(CANDIDATES)
         rankings = HOSTILE, HOSTILE[::-1], Ranked(rows, scores), correct if truth else None
         write_predictions(folder / "predictions" / f"{files[system]}.csv", *rankings)
-        write_failures(folder / "failures" / f"{files[system]}.csv", *rankings)
     if truth:
         header = ["query", "place", *(column for name in ranks for column in (name, f"{name} rank"))]
         lines = []
@@ -103,15 +101,7 @@ def _write_tables(folder, ranks, sequences):
               for name, first in ranks.items() for part in names or [None]]  # fmt: skip
     header = ["system", *(["sequence"] if names else []), "R@1 ±2"]
     (folder / "table.csv").write_text(Table(header, recall).csv(), encoding="utf-8")
-    pairs = [[*SYSTEMS[:2], 0, 5, 0.06, 2, 0.25], [*SYSTEMS[1:], 2, 0, "1e-09", 2, 0.25]]
-    write_csv(folder / "differences.csv", ["system", "other", *"abcde"], pairs)
     write_csv(folder / "confidence.csv", ["system", "AP by score"], [[HEADLINE, "90.0"]])
-    write_csv(folder / "rerank_share.csv", ["re-ranked", *SYSTEMS[1:]], [["0.00", 30.0, 30.0], ["1.00", 80.0, 70.0]])
     points = [[HEADLINE, "score", 3, 1, 0.25], [HEADLINE, "score", 2, 1, 0.5], [HEADLINE, "score", 1, 0.75, 0.75]]
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
     write_csv(folder / "skipped.csv", ["folder", "image", "reason"], [["queries", HOSTILE[1], HOSTILE[0]]])
-
-
-def change_json(path, change):
-    """Rewrite a JSON file by a function of its value."""
-    path.write_text(json.dumps(change(json.loads(path.read_text("utf-8")))))

@@ -175,8 +175,6 @@ def lost_distance(points0, points1, distance, confidence, *, form="weighted", mi
         x0 = [float(width) - 1 - x for x in x0]
     matches = range(len(x0))
     c, cosine = [float(value) for value in confidence], [float(d) ** 2 / 2 for d in distance]
-    if form == "described":
-        return math.fsum(c[k] * abs(x1[k] - x0[k]) * cosine[k] for k in matches)
     if form == "unweighted":
         return _cosine_distance(x0, x1, c) / math.fsum(c)
     total = math.fsum(c[k] * cosine[k] for k in matches)
@@ -192,11 +190,10 @@ def lost_distance(points0, points1, distance, confidence, *, form="weighted", mi
 
 
 def lost_score(points0, points1, distance, confidence, **options):
-    """log(1 + 1 / L), with a smallest cosine distance, or `described` L, of 1e-12; 0 without matches."""
+    """log(1 + 1 / L), with a smallest cosine distance of 1e-12; 0 without matches."""
     if len(distance) == 0:
         return 0.0
-    smallest = lost_distance(points0, points1, distance, confidence, **options)
-    return math.log1p(1 / (max(smallest, 1e-12) if options.get("form") == "described" else smallest))
+    return math.log1p(1 / lost_distance(points0, points1, distance, confidence, **options))
 
 
 def _cosine_distance(first, second, confidence):

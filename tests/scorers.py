@@ -86,7 +86,6 @@ OWN = [
     VisualPhrases(length=3, cell_size=40.0, align="zero_edge"),
     LostScore(),
     LostScore(form="unweighted", mirrored=True),
-    LostScore(form="described"),
     HistogramOfShifts(temperature=0.05),
     AnchorPoints(num_bins=8, temperature=0.2),
     AggregatedScore(mean="weighted", clamp=True, temperature=30.0),

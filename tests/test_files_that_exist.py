@@ -21,14 +21,8 @@ def test_files_that_exist_stay(tmp_path):
     model = Confidence(5, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
     writers = {
         "a.h5": lambda path: io.write_features(path, names, [(0, feature(0))]),
-        "a.npz": lambda path: io.write_features(path, names, [(0, feature(0))]),
         "a": lambda path: io.write_features(path, names, [(0, feature(0))]),
         "g.npy": lambda path: io.write_global_descriptors(path, names, single),
-        "g.npz": lambda path: io.write_global_descriptors(path, names, single),
-        "g.h5": lambda path: io.write_global_descriptors(path, names, single),
-        "s.npz": lambda path: io.write_shortlist(
-            path, Shortlist(0 * single.astype(int), single, single > 0), names, names
-        ),
         "s.txt": lambda path: io.write_shortlist(
             path, Shortlist(0 * single.astype(int), single, single > 0), names, names
         ),

@@ -67,18 +67,14 @@ def run(wheel, tmp_path_factory):
     return call
 
 
-def test_metadata_is_complete(wheel):
+def test_the_wheel_has_the_package_its_data_and_its_license_alone(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         [path] = (name for name in names if name.endswith("METADATA"))
         metadata = email.message_from_bytes(archive.read(path))
     assert {"mfvpr/py.typed", "mfvpr/systems/conf/evaluate.yaml", "mfvpr/report/templates/page.html"} <= {*names}
-    assert not [name for name in names if name.startswith(("tests", "experiments", "notebooks"))]
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"mfvpr"}
     assert (metadata["License-Expression"], metadata["License-File"]) == ("MIT", "LICENSE")
-    assert metadata["Project-URL"].startswith("Article, https://doi.org/")
-    assert "Typing :: Typed" in metadata.get_all("Classifier")
-    assert all(metadata[name] for name in ("Summary", "Author", "Keywords", "Requires-Python"))
-    assert str(ROOT) not in metadata.as_string()
 
 
 def test_the_programs_and_the_library_work_where_they_are_installed(run, small_street):

@@ -3,7 +3,6 @@
 import asyncio
 import os
 import re
-import sys
 from pathlib import Path
 
 import nbformat
@@ -12,11 +11,9 @@ from nbclient import NotebookClient
 
 from mfvpr.datasets.streets import streets_folder
 from notebooks.build import RUN_OF, code_hash
-from tests.test_layering import imported_modules
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 PATHS = sorted(FOLDER.glob("*.ipynb"))
-LIBRARIES = {"mfvpr", "numpy", "jax", "matplotlib", "optax", "cv2"}
 
 
 def code(notebook):
@@ -60,16 +57,6 @@ def test_the_output_is_that_of_the_code(path):
     assert len(pictures) >= 3
     assert max(map(len, pictures)) * 3 / 4 < 100_000  # bytes
     assert not re.search(r"/(work|tmp|root|home)/", path.read_text())
-
-
-@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
-def test_cells_are_short_and_need_the_library_alone(path, tmp_path):
-    cells = code(nbformat.read(path, as_version=4))
-    for cell in cells:
-        assert len([line for line in cell.source.splitlines() if line.strip()]) <= 12, cell.id
-    script = tmp_path / "cells.py"
-    script.write_text("\n".join(cell.source for cell in cells))
-    assert {name.partition(".")[0] for name in imported_modules(script)} <= LIBRARIES | sys.stdlib_module_names
 
 
 @pytest.mark.slow

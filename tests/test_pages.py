@@ -8,12 +8,9 @@ import sys
 
 import pytest
 
-from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
-from mfvpr.systems.assembly import CONF, GROUPS, choices_of
-from mfvpr.utils.fields import settings_of
-from notebooks.draw_results import candidate_times, draw, query_times, real_recall
+from notebooks.draw_results import draw, query_times, real_recall
 from tests import programs
 from tests.needs import needs
 from tests.programs import QUICK, ROOT, run, typed
@@ -38,11 +35,6 @@ def blocks(page, language):
 
 COMMANDS = [(page, line) for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
 SETTINGS = [(line, config) for _, line in COMMANDS for start, config in CONFIGS.items() if line.startswith(start)]
-
-
-def test_readme_is_short():
-    assert len(PAGES[README].splitlines()) <= 130
-    assert len(PAGES[README].split()) <= 1200
 
 
 def test_commands_exist():
@@ -106,8 +98,8 @@ def test_benchmark_runs(tmp_path):
     out = tmp_path / "benchmark.json"
     done = run("--rounds", "1", "--out", out, program="benchmark")
     assert done.returncode == 0, done.stderr
-    for step in ("matching", "matching + histogram", "histogram", "anchor", "sum"):
-        assert re.search(rf"^{re.escape(step)} +mfvpr", done.stdout, flags=re.MULTILINE)
+    for step in ("matching, 50 x 700 x 512", "1 queries to rankings", "histogram, 50 pairs"):
+        assert re.search(rf"^{step} +mfvpr", done.stdout, flags=re.MULTILINE)
     assert out.is_file()
 
 
@@ -128,43 +120,8 @@ def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_every_page_is_one_click_from_the_readme():
-    linked = {target.partition("#")[0] for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[README])}
-    assert {*PAGES} - {README} <= linked
-
-
-def test_settings_that_pages_name_exist():
-    text = re.sub(r"`hydra\.[^`]*`|`\w+=(?:True|False)`", "", "".join(PAGES.values()))  # of Hydra, and of Python
-    names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
-    assert len(names) > 20
-    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*GROUPS, "cluster", "name"}
-    known = set()
-    for owner in schema.PROGRAMS.values():
-        members = settings_of(owner)
-        known |= {*members} | {name for each in members.values() if isinstance(each, dict) for name in each}
-    known |= {name for group in GROUPS for each in choices_of(group).values() for name in each}
-    known |= {name for owner in schema.OTHERS for name in settings_of(owner)}
-    assert {*names} <= known | groups
-
-
-def test_pages_name_no_machine_path():
-    assert not re.search(r"/(work|tmp|root|home)/", "".join(PAGES.values()))
-
-
-def test_tables_have_rows_of_one_length():
-    blocks = re.findall(r"(?:^\|.*\|\n)+", RESULTS, flags=re.MULTILINE)
-    assert len(blocks) > 20
-    for block in blocks:
-        assert len({line.count("|") for line in block.splitlines()}) == 1, block
-
-
 def test_pictures_are_drawn_from_the_tables(tmp_path):
-    recall, times = real_recall(RESULTS), query_times(RESULTS)
-    assert len(recall) == 12
-    assert recall["system=mfvpr"] == {"SIFT": [53.5, 71.2], "ALIKED": [90.1, 86.5]}
-    assert all({*by_features} == {"SIFT", "ALIKED"} for by_features in recall.values())
-    assert [len(points) for points in times.values()] == [4, 2, 2, 2, 2]
-    assert times["map, SIFT, candidates from memory"] == [[1000.0, 62.6], [10_000.0, 67.6]]
+    assert real_recall(RESULTS)["system=mfvpr"] == {"SIFT": [53.5, 71.2], "ALIKED": [90.1, 86.5]}
+    assert query_times(RESULTS)["map, SIFT, candidates from memory"] == [[1000.0, 62.6], [10_000.0, 67.6]]
     draw(RESULTS, tmp_path)
-    assert all(len(points) == 5 for points in candidate_times(RESULTS).values())
     assert {path.name for path in tmp_path.iterdir()} == {"recall.png", "database_size.png", "candidates.png"}

@@ -3,7 +3,7 @@
 import json
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,50 +17,56 @@ from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus
 
 Entry = tuple[str, str, Callable[[], Any]]  # step, implementation, the call that is timed
-Seconds = Mapping[tuple[str, str], list[float]]  # (step, implementation) -> seconds of every call
 Results = Mapping[tuple[str, str], Any]  # (step, implementation) -> result of the first call
 
-QUICK = 0.05  # seconds
+QUICK, REPEATED = 0.05, 10  # seconds; untimed calls at most
 
 
 def compete(
-    entries: list[Entry], rounds: int, out: Path, *,
-    title: str, setting: Mapping[str, Any], remarks: Callable[[Seconds, Results], Iterable[str]],
-) -> Results:  # fmt: skip
-    """Time entries in turns, print a table below the title, and write it with the setting as JSON to `out`.
-
-    Each step has an implementation called "mfvpr"; the table shows how many times as long the others take.
-    """
-    seconds, results = take_turns(entries, rounds)
-    steps, medians = [step for step, _ in seconds], {name: float(np.median(times)) for name, times in seconds.items()}
-    rows, lines = [], []
-    for step, name in sorted(seconds, key=lambda entry: (steps.index(entry[0]), medians[entry])):
-        median, ratio = 1e3 * medians[step, name], medians[step, name] / medians[step, "mfvpr"]
-        low, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.75))
-        rows.append({"step": step, "name": name, "median_ms": median, "quartiles_ms": [low, high]})
-        lines.append([step, name, f"{median:.2f}", f"{low:.2f} .. {high:.2f}", f"{ratio:.2f}"])
-    table = Table(["step", "who", "median, ms", "quartiles, ms", "/ mfvpr"], lines, text_columns=2)
-    parts = [table, *remarks(seconds, results)]
-    write_report(out, title, parts, {**setting, "rounds": rounds, "results": rows})
+    entries: Sequence[Entry],
+    rounds: int,
+    out: Path,
+    *,
+    title: str,
+    remarks: Callable[[Results], Iterable[str]] | None = None,
+) -> Results:
+    """Time entries, print a table below the title, and write it as JSON to `out`."""
+    rows, table, results = measure(entries, rounds)
+    write_report(out, title, [table, *(remarks(results) if remarks else [])], {"rounds": rounds, "results": rows})
     return results
 
 
-def take_turns(entries: list[Entry], rounds: int) -> tuple[Seconds, Results]:
-    """Seconds of every call after an untimed first one, and the results of the first ones.
+def measure(entries: Sequence[Entry], rounds: int) -> tuple[list[dict[str, Any]], Table, Results]:
+    """Time entries in turns after a first call, which compiles; the table compares with each step's first entry.
 
     Calls of a few milliseconds are repeated untimed before each timed one: other implementations have just emptied the
     caches, and their idle threads may still be spinning.
     """
-    results = {(step, name): call() for step, name, call in progress("warm-up", len(entries), entries)}
-    seconds: dict[tuple[str, str], list[float]] = {name: [] for name in results}
+    results, first_calls, seconds = {}, {}, {(step, name): list[float]() for step, name, _ in entries}
+    for step, name, call in progress("warm-up", len(entries), entries):
+        start = time.perf_counter()
+        results[step, name] = call()
+        first_calls[step, name] = time.perf_counter() - start
     for _ in progress("rounds", rounds, range(rounds)):
         for step, name, call in entries:
             times = seconds[step, name]
-            is_quick = bool(times) and times[-1] < QUICK
-            for _ in range(10 if is_quick else 0):
+            for _ in range(min(REPEATED, int(QUICK / times[-1])) if times else 0):
                 call()
             times.append(duration(call))
-    return seconds, results
+    steps, medians = [step for step, _ in seconds], {entry: float(np.median(times)) for entry, times in seconds.items()}
+    rows, lines = [], []
+    for step, name in sorted(seconds, key=lambda entry: (steps.index(entry[0]), medians[entry])):
+        low, median, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.5, 0.75))
+        ratio, first = (
+            medians[step, name] / medians[next(entry for entry in seconds if entry[0] == step)],
+            first_calls[step, name],
+        )
+        rows.append(
+            {"step": step, "name": name, "median_ms": median, "quartiles_ms": [low, high], "first_call_s": first}
+        )
+        lines.append([step, name, f"{median:.2f}", f"{low:.2f} .. {high:.2f}", f"{ratio:.2f}", f"{first:.1f}"])
+    header = ["step", "who", "median, ms", "quartiles, ms", "/ mfvpr", "first call, s"]
+    return rows, Table(header, lines, text_columns=2), results
 
 
 def duration(call: Callable[[], Any]) -> float:

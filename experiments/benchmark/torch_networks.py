@@ -18,7 +18,6 @@ from mfvpr.checkpoints.conversion import Table
 from mfvpr.networks.layers import DEVIATION, MEAN
 
 Weights = Callable[[str], Tensor]  # published key -> weight
-Local = tuple[np.ndarray, ...]  # descriptor of an image, then the descriptors of its patches by size
 
 
 def torch_weights(arrays: Mapping[str, np.ndarray], table: Table, device: str, layout: torch.memory_format) -> Weights:
@@ -86,21 +85,6 @@ def linear(w: Weights, name: str, x: Tensor) -> Tensor:
     return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
 
 
-_VGG16 = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # positions of the convolutions
-_POOLED = (5, 10, 17, 24)  # convolutions after a pooling
-
-
-def vgg16(w: Weights, name: str, x: Tensor, last: int = 28, dilated: int = 29) -> Tensor:
-    """Maps `[B, 512, h, w]` before the last ReLU; from `dilated` on, dilation replaces the pooling's stride."""
-    for position in _VGG16[: _VGG16.index(last) + 1]:
-        x = F.relu(x, inplace=True) if position else x
-        if position in _POOLED:
-            x = F.avg_pool2d(x, 2, stride=1) if position == dilated else F.max_pool2d(x, 2)
-        reach = 2 if position >= dilated else 1
-        x = conv(w, f"{name}.{position}", x, bias=True, padding=reach, dilation=reach)
-    return x
-
-
 _BGR_MEAN = (103.939, 116.779, 123.68)
 _EDGE = (5 + 1) ** 2 / 5
 
@@ -109,7 +93,15 @@ def d2net_map(w: Weights, images: Tensor) -> Tensor:
     """Dense maps `[B, 512, h, w]`: VGG16 to conv4_3 with stride 4; the mean is subtracted in float64, as published."""
     mean = torch.tensor(_BGR_MEAN, dtype=torch.float64, device=images.device)
     x = (images.flip(1) - mean[:, None, None]).float()
-    return F.relu(vgg16(w, "dense_feature_extraction.model", x, last=21, dilated=17), inplace=True)
+    for position in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21):  # of the convolutions
+        x = F.relu(x, inplace=True) if position else x
+        if position in (5, 10):
+            x = F.max_pool2d(x, 2)
+        elif position == 17:  # dilation replaces the stride of the last pooling
+            x = F.avg_pool2d(x, 2, stride=1)
+        reach = 2 if position >= 17 else 1
+        x = conv(w, f"dense_feature_extraction.model.{position}", x, bias=True, padding=reach, dilation=reach)
+    return F.relu(x, inplace=True)
 
 
 def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
@@ -146,8 +138,7 @@ def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeat
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
     """Unit descriptors `[B, D]`: four mixers over the positions, two projections."""
-    layers = tuple(f"backbone.model.layer{place}" for place in (1, 2, 3))
-    x = resnet(w, images, "backbone.model.conv1", "backbone.model.bn1", layers).flatten(2)  # [B, 1024, positions]
+    x = resnet(w, images).flatten(2)  # [B, 1024, positions]
     for place in range(4):
         name = f"aggregator.mix.{place}.mix"
         normal = F.layer_norm(x, x.shape[2:], w(f"{name}.0.weight"), w(f"{name}.0.bias"))
@@ -156,23 +147,15 @@ def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
     return F.normalize(linear(w, "aggregator.row_proj", x).flatten(1)).cpu().numpy()
 
 
-def normalize(images: Tensor) -> Tensor:
-    """Normalize images as networks trained on ImageNet expect them."""
+def resnet(w: Weights, images: Tensor) -> Tensor:
+    """Maps `[B, 1024, h, w]` of MixVPR's ResNet-50 after its third layer."""
     mean, deviation = (torch.tensor(values, device=images.device)[:, None, None] for values in (MEAN, DEVIATION))
-    return (images / 255 - mean) / deviation
-
-
-_BLOCKS = (3, 4, 6, 3)  # of ResNet-50's layers
-
-
-def resnet(w: Weights, images: Tensor, first: str, norm: str, layers: tuple[str, ...]) -> Tensor:
-    """Maps `[B, C, h, w]` of ResNet-50 after the last of the named layers."""
-    x = conv(w, first, normalize(images), stride=2, padding=3)
-    x = F.max_pool2d(F.relu(batch_norm(w, norm, x), inplace=True), 3, stride=2, padding=1)
-    for place, (layer, blocks) in enumerate(zip(layers, _BLOCKS, strict=False)):
+    x = conv(w, "backbone.model.conv1", (images / 255 - mean) / deviation, stride=2, padding=3)
+    x = F.max_pool2d(F.relu(batch_norm(w, "backbone.model.bn1", x), inplace=True), 3, stride=2, padding=1)
+    for layer, blocks in ((1, 3), (2, 4), (3, 6)):
         for block in range(blocks):
-            stride = 2 if place and block == 0 else 1
-            x = _bottleneck(w, f"{layer}.{block}", x, stride, shortcut=block == 0)
+            stride = 2 if layer > 1 and block == 0 else 1
+            x = _bottleneck(w, f"backbone.model.layer{layer}.{block}", x, stride, shortcut=block == 0)
     return x
 
 
@@ -184,97 +167,6 @@ def _bottleneck(w: Weights, name: str, x: Tensor, stride: int, shortcut: bool) -
     if shortcut:
         x = batch_norm(w, f"{name}.downsample.1", conv(w, f"{name}.downsample.0", x, stride=stride))
     return F.relu(out.add_(x), inplace=True)
-
-
-def _project(w: Weights, sums: Tensor) -> Tensor:
-    """Normalize sums `[N, K, D]` by cluster and together, project and normalize again -> `[N, P]`."""
-    return F.normalize(linear(w, "WPCA.0", F.normalize(F.normalize(sums, dim=2).flatten(1))))
-
-
-def _netvlad(w: Weights, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Map, shares of the clusters, and descriptors of images."""
-    x = F.normalize(vgg16(w, "encoder", normalize(images)))
-    share = F.softmax(F.conv2d(x, w("pool.conv.weight")[..., None, None]), dim=1)
-    sums = torch.einsum("bkp,bdp->bkd", share.flatten(2), x.flatten(2))
-    return x, share, _project(w, sums - share.sum((2, 3))[..., None] * w("pool.centroids"))
-
-
-def netvlad(w: Weights, images: Tensor) -> np.ndarray:
-    """Descriptors of images."""
-    return _netvlad(w, images)[2].cpu().numpy()
-
-
-def patch_netvlad(w: Weights, images: Tensor, sizes: tuple[int, ...]) -> list[Local]:
-    """Descriptors of images and of all their patches, from an integral image as published."""
-    x, share, vectors = _netvlad(w, images)
-    residuals = share[:, :, None] * (x[:, None] - w("pool.centroids")[None, :, :, None, None])
-    integral = F.pad(residuals.cumsum(4).cumsum(3), (1, 0, 1, 0))
-    descriptors = [vectors]
-    for size in sizes:
-        below, above = integral[..., size:, :], integral[..., :-size, :]
-        sums = below[..., size:] - below[..., :-size] - above[..., size:] + above[..., :-size]
-        patches = sums.flatten(3).permute(0, 3, 1, 2)
-        descriptors.append(_project(w, patches.flatten(0, 1)).unflatten(0, patches.shape[:2]))
-    return list(zip(*(part.cpu().numpy() for part in descriptors), strict=True))
-
-
-def gem(w: Weights, images: Tensor) -> np.ndarray:
-    """Descriptors of CosPlace's ResNet-50."""
-    x = resnet(w, images, "backbone.0", "backbone.1", tuple(f"backbone.{place}" for place in (4, 5, 6, 7)))
-    pooled = _generalized_mean(F.normalize(x), w("aggregation.1.p"))
-    return F.normalize(linear(w, "aggregation.3", pooled)).cpu().numpy()
-
-
-def _generalized_mean(x: Tensor, power: Tensor) -> Tensor:
-    return x.clamp(min=1e-6).pow(power).mean((2, 3)).pow(1 / power)
-
-
-_HEAD, _PATCH, _TRAINED = 64, 14, 37  # dimensions of a head, px of a patch, patches per side in training
-
-
-def selavpr(w: Weights, images: Tensor, blocks: int) -> list[Local]:
-    """Descriptors of images and their local maps."""
-    batch, _, height, width = images.shape
-    x = conv(w, "backbone.patch_embed.proj", normalize(images), bias=True, stride=_PATCH).flatten(2).mT
-    first, learned = w("backbone.pos_embed").split([1, _TRAINED**2])
-    grid = learned.T.reshape(1, -1, _TRAINED, _TRAINED)
-    scale = [(side // _PATCH + 0.1) / _TRAINED for side in (height, width)]
-    positions = F.interpolate(grid, scale_factor=scale, mode="bicubic").flatten(2).mT
-    x = torch.cat([(w("backbone.cls_token") + first).expand(batch, 1, -1), x + positions], dim=1)
-    for place in range(blocks):
-        x = _block(w, f"backbone.blocks.{place}", x)
-    tokens = _norm(w, "backbone.norm", x)[:, 1:].mT.unflatten(2, (height // _PATCH, width // _PATCH))
-    descriptors = F.normalize(_generalized_mean(F.normalize(tokens), w("aggregation.1.p")))
-    local = F.relu(_upsample(w, "LocalAdapt.upconv1", tokens))
-    local = F.normalize(_upsample(w, "LocalAdapt.upconv2", local)).permute(0, 2, 3, 1)
-    return list(zip(descriptors.cpu().numpy(), local.cpu().numpy(), strict=True))
-
-
-def _block(w: Weights, name: str, x: Tensor) -> Tensor:
-    queries, keys, values = (
-        part.unflatten(2, (-1, _HEAD)).transpose(1, 2)
-        for part in linear(w, f"{name}.attn.qkv", _norm(w, f"{name}.norm1", x)).chunk(3, dim=2)
-    )
-    seen = F.scaled_dot_product_attention(queries, keys, values).transpose(1, 2).flatten(2)
-    seen = linear(w, f"{name}.attn.proj", seen)
-    x = x + w(f"{name}.ls1.gamma") * (seen + _adapter(w, f"{name}.adapter1", seen))
-    y = _norm(w, f"{name}.norm2", x)
-    hidden = F.gelu(linear(w, f"{name}.mlp.fc1", y))
-    return x + w(f"{name}.ls2.gamma") * (
-        linear(w, f"{name}.mlp.fc2", hidden) + 0.2 * _adapter(w, f"{name}.adapter2", y)
-    )
-
-
-def _adapter(w: Weights, name: str, x: Tensor) -> Tensor:
-    return linear(w, f"{name}.D_fc2", F.relu(linear(w, f"{name}.D_fc1", x)))
-
-
-def _norm(w: Weights, name: str, x: Tensor) -> Tensor:
-    return F.layer_norm(x, x.shape[2:], w(f"{name}.weight"), w(f"{name}.bias"), 1e-6)
-
-
-def _upsample(w: Weights, name: str, x: Tensor) -> Tensor:
-    return F.conv_transpose2d(x, w(f"{name}.weight"), w(f"{name}.bias"), stride=2, padding=1)
 
 
 _RADIUS = 2  # of the detector, px

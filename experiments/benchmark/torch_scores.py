@@ -14,11 +14,6 @@ def product(left: Tensor, right: Tensor) -> Tensor:
     return left @ right
 
 
-def copy(array: Tensor) -> Tensor:
-    """Read an array, and write another."""
-    return array + 1
-
-
 def match(query: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Nearest neighbors of descriptors `[N0, D]` in `[C, N1, D]`, and whether they are mutual, `[C, N0]`."""
     similarity = torch.matmul(query, candidates.mT)
@@ -88,14 +83,20 @@ def score(
 
 
 def grid(
-    shifts: Tensor, weights: Tensor, distance: Tensor, mask: Tensor, *, sigmas: Sequence[float],
-    bin_sizes: Sequence[float], max_distances: Sequence[float],
-) -> Tensor:  # fmt: skip
-    """Scores of all settings, with weights and 1: `[bins * sigmas, C, 2 * distances]`."""
+    shifts: Tensor,
+    weights: Tensor,
+    distance: Tensor,
+    mask: Tensor,
+    *,
+    sigmas: Sequence[float],
+    bin_sizes: Sequence[float],
+    max_distances: Sequence[float],
+) -> Tensor:
+    """Scores of all settings for weights `[C, W, K]`: `[bins * sigmas, C, W * distances]`."""
     centers, limits = [bin_centers(size, mask.device) for size in bin_sizes], distance.new_tensor(max_distances)
     near = ((distance[:, None] <= limits[:, None]) & mask[:, None]).float()
-    both = torch.cat([weights[:, None] * near, near], 1)
-    return torch.stack([histogram(shifts, both, c, sigma) for c in centers for sigma in sigmas])
+    near_weights = (weights[:, :, None] * near[:, None]).flatten(1, 2)
+    return torch.stack([histogram(shifts, near_weights, c, sigma) for c in centers for sigma in sigmas])
 
 
 def search(queries: Tensor, database: Tensor, *, candidates: int) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.paper import runs, systems
-from experiments.paper.pages import paper_figures, write_pages
+from experiments.paper.pages import draw_averages, write_pages
 from experiments.paper.systems import Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, row_result
 from mfvpr.checkpoints import how_to_install
@@ -18,7 +18,7 @@ from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.report import Table, write_json, write_table
+from mfvpr.report import write_json, write_table
 from mfvpr.report.rendering import PAGE
 from mfvpr.report.runs import LAST
 from mfvpr.utils.errors import InputError
@@ -28,17 +28,15 @@ from mfvpr.utils.files import expand_user
 def paper(settings: Paper) -> None:
     """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
     rows = systems.chosen_rows(settings.systems)
-    places, absent, refused = systems.places(settings.data, settings.datasets)
-    lacking: dict[str, str] = {}  # a line for each evaluation whose networks are not installed
+    places, left_out = systems.places(settings.data, settings.datasets)
     for run in _names(rows) if places else ():
         if missing := systems.missing_weights(runs.settings_of(run, places[0], settings)):
             needs = [f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing]
-            lacking[run] = f"{run}: needs {'; '.join(needs)}"
-    rows = [row for row in rows if row.run not in lacking]
-    left_out = [*absent.values(), *refused, *lacking.values()]
+            left_out.append(f"{run}: needs {'; '.join(needs)}")
+            rows = [row for row in rows if row.run != run]
+    for line in left_out:
+        tell(f"left out: {line}")
     if not places or not rows:
-        for line in left_out:
-            tell(f"left out: {line}")
         raise InputError("nothing to evaluate: the lines above say what is missing")
     names, known = _names(rows), [place.name for place in places]
     tell(
@@ -46,16 +44,36 @@ def paper(settings: Paper) -> None:
         f"{len(_finished_runs(rows, known, settings))} of {len(names) * len(places)} finished; then tables, seconds of "
         f"a query, and figures in {settings.out}"
     )
-    groups = {
-        f"data sets that are not in {settings.data or 'data=DIR'}, see `mfvpr data list`": absent,
-        "evaluations without their weights, see `mfvpr weights list`": lacking,
-    }
-    parts = [f"{len(members)} {words} ({', '.join(members)})" for words, members in groups.items() if members]
-    for line in [*(["; ".join(parts)] if parts else []), *refused]:
-        tell(f"left out: {line}")
     out = expand_user(settings.out)
     with runs.lock_output(out):
-        _evaluate_and_report(rows, places, settings, out, left_out)
+        datasets, failures = evaluate_all(rows, places, settings)
+        if not datasets:
+            raise InputError(f"nothing was evaluated: {failures[0]}")
+        evaluations = _read_evaluations(rows, datasets, settings)
+        name = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets))
+        about = runs.device()
+        evaluations = replace(evaluations, timed_on=f"{name}, on {about['cores']} cores of {about['device']}")
+        for table_name, heading, table in paper_tables(evaluations):  # before the seconds, which take a while
+            if table_name in ("recall", "averages"):
+                print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
+        timed_on = next(place for place in places if place.name == name)
+        times = measure_times(rows, timed_on, datasets[name], settings, out)
+        leading = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
+        _write_output(out, replace(evaluations, seconds=leading), [*left_out, *failures])
+    if failures:
+        raise InputError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
+
+
+def _write_output(out: Path, evaluations: Evaluations, left_out: Sequence[str]) -> None:
+    for name in ("tables", "figures", "comparisons"):  # they may have those of other rows and data sets
+        shutil.rmtree(out / name, ignore_errors=True)
+    (out / "figures").mkdir()
+    tables = {name: (heading, table) for name, heading, table in paper_tables(evaluations)}
+    for name, (heading, table) in tables.items():
+        write_table(out / "tables", table, heading, name=name)
+    draw_averages(out / "figures" / "averages.png", evaluations)
+    write_pages(out, evaluations, tables, left_out)
+    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
 
 
 def _names(rows: Sequence[Row]) -> list[str]:
@@ -63,41 +81,9 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.run for row in rows))
 
 
-def _evaluate_and_report(
-    rows: Sequence[Row], places: Sequence[Place], settings: Paper, out: Path, left_out: Sequence[str]
-) -> None:
-    datasets, failures = evaluate_all(rows, places, settings)
-    if not datasets:
-        raise InputError(f"nothing was evaluated: {failures[0]}")
-    evaluations = _read_evaluations(rows, datasets, settings)
-    name = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets))
-    timed_on = next(place for place in places if place.name == name)
-    about = f"{timed_on.name}, on {runs.device()['cores']} cores of {runs.device()['device']}"
-    evaluations = replace(evaluations, timed_on=about)
-    for name, (heading, table) in _write_tables(out, evaluations).items():  # before the seconds, which take a while
-        if name in ("recall", "averages"):
-            print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
-    times = measure_times(rows, timed_on, datasets[timed_on.name], settings, out)
-    leading = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-    evaluations = replace(evaluations, seconds=leading)
-    for name in ("figures", "comparisons"):  # they may have those of other rows and data sets
-        shutil.rmtree(out / name, ignore_errors=True)
-    (out / "figures").mkdir()
-    tables = _write_tables(out, evaluations)
-    for name, draw in paper_figures(evaluations):
-        draw(out / "figures" / name)
-    write_pages(out, evaluations, tables, [*left_out, *failures])
-    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
-    if failures:
-        raise InputError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
-
-
 def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) -> tuple[dict[str, Dataset], list[str]]:
     """Evaluate; return readable data sets, and a line per failed evaluation."""
-    names = _names(rows)
-    total, finished = len(places) * len(names), 0
-    datasets: dict[str, Dataset] = {}
-    failures: list[str] = []
+    names, datasets, failures = _names(rows), dict[str, Dataset](), list[str]()
 
     def fail(line: str) -> None:
         failures.append(line)
@@ -122,10 +108,8 @@ def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) 
         for turn, run in enumerate(names, start=number * len(names) + 1):
             chosen, folder = runs.settings_of(run, place, settings), runs.folder_of(run, place.name, settings)
             inputs = runs.input_fingerprints(chosen, images, correct)
-            if runs.is_finished_with(inputs, folder):
-                finished += 1
-            else:
-                tell(f"{turn} of {total}: {run} on {place.name}")
+            if not runs.is_finished_with(inputs, folder):
+                tell(f"{turn} of {len(places) * len(names)}: {run} on {place.name}")
                 try:
                     runs.evaluate(chosen, inputs)
                 except InputError as error:
@@ -133,8 +117,6 @@ def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) 
                     continue
             if not (folder / PAGE).is_file():
                 jobs.report_page(folder)
-    if finished:
-        tell(f"{finished} of {total} evaluations were finished before")
     return datasets, failures
 
 
@@ -148,9 +130,8 @@ def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], sett
     results, sizes, folders = {}, {}, _finished_runs(rows, datasets, settings)
     for (name, run), folder in folders.items():
         content, size = runs.read_json(folder / LAST), runs.read_json(folder / runs.SIZES)
-        candidates = runs.read_json(folder / "run.json")["settings"]["candidates"]
         for row in (row for row in rows if row.run == run):
-            if result := row_result(row, content, candidates):
+            if result := row_result(row, content):
                 results[row.name, name] = result
             if row.leads or row.ranking == RETRIEVAL:  # retrieval alone has no local features
                 of_image = size["descriptor"] + (0 if row.ranking == RETRIEVAL else size["local"])
@@ -169,19 +150,6 @@ def measure_times(
         times[run] = runs.read_json(path) or {}
         if any(times[run].get(name) != value for name, value in about.items()):
             tell(f"timing: {run} on {place.name}")
-            try:
-                times[run] = runs.measure_query(runs.settings_of(run, place, settings), dataset) | about
-                write_json(path, times[run])
-            except InputError as error:
-                tell(f"left out: seconds of {run}: {error}")
-                del times[run]
+            times[run] = runs.measure_query(runs.settings_of(run, place, settings), dataset) | about
+            write_json(path, times[run])
     return times
-
-
-def _write_tables(out: Path, evaluations: Evaluations) -> dict[str, tuple[str, Table]]:
-    """Write the tables; return headings and tables by name."""
-    shutil.rmtree(out / "tables", ignore_errors=True)  # it may have tables of other rows and data sets
-    tables = {name: (heading, table) for name, heading, table in paper_tables(evaluations)}
-    for name, (heading, table) in tables.items():
-        write_table(out / "tables", table, heading, name=name)
-    return tables

@@ -32,7 +32,6 @@ from mfvpr.utils.files import expand_user, lock_folder
 from mfvpr.utils.fingerprints import fingerprint, versions
 from mfvpr.utils.numerics import available_cpus
 
-FIGURES = 2  # queries that each run draws
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
 _SHARED = ("cache", "memory", "devices")  # settings of both programs
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
@@ -45,11 +44,7 @@ _FREE = {"out", "cache", "memory", "devices", "compiled", "cluster"}  # settings
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
-    """Lock a folder for evaluations.
-
-    Raises:
-        InputError: another process uses the folder, or it has files of others.
-    """
+    """Lock a folder for evaluations; an InputError if another process uses it, or if it has files of others."""
     in_use = InputError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
     with ExitStack() as stack:
         try:
@@ -65,7 +60,7 @@ def lock_output(out: Path) -> Iterator[None]:
 
 def settings_of(run: str, place: Place, settings: Paper) -> Evaluate:
     """The checked settings of an evaluation."""
-    chosen = [*place.settings, *overrides(run, place.name), f"figures={FIGURES}"]
+    chosen = [*place.settings, *overrides(run, place.name), "figures=2"]
     shared = {name: getattr(settings, name) for name in _SHARED}
     out, command = str(folder_of(run, place.name, settings)), f"mfvpr evaluate {' '.join(chosen)}"
     return replace(checked("evaluate", compose("evaluate", chosen)), out=out, command=command, **shared)
@@ -93,13 +88,9 @@ def input_fingerprints(settings: Evaluate, images: Mapping[str, str], truth: str
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
-    """Whether a run of these inputs is finished there; InputError for one of other inputs, or a damaged one."""
+    """Whether a run of these inputs is finished there; InputError for one of other inputs."""
     if not (folder / LAST).is_file():
         return False
-    for name in (LAST, "run.json", SIZES):
-        if not read_json(folder / name):
-            mend = "remove the folder, and run this again, or name another with out=DIR"
-            raise InputError(f"{folder}/{name}: is damaged, or missing; {mend}")
     before = read_json(folder / INPUTS) or {}
     if other := [name for name, value in inputs.items() if before.get(name) != value]:
         mend = "remove it, or name another folder with out=DIR"

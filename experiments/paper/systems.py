@@ -1,15 +1,17 @@
-"""Rows of the tables, the evaluations that give them, and the data sets at hand."""
+"""Rows of the tables and the evaluations that give them, of systems.yaml; and the data sets at hand."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.networks import Entry
 from mfvpr.cli.command_line import override
 from mfvpr.cli.schema import DATA_SET_NAME, Evaluate
 from mfvpr.datasets.published import PUBLISHED
-from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
@@ -17,7 +19,6 @@ DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
 _SIDES = ("database", "queries")
 _POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
-COMBINED = f"histogram + {RETRIEVAL}"
 
 
 @dataclass(frozen=True)
@@ -40,71 +41,23 @@ class Row:
 
 @dataclass(frozen=True)
 class Place:
-    """A data set at hand, its settings of `mfvpr evaluate`, and its folder (None = it is synthetic)."""
+    """A data set at hand, and its settings of `mfvpr evaluate`."""
 
     name: str
     settings: tuple[str, ...]
-    root: Path | None = None
 
 
-_SSM = {"hist": "hist", "anchor": "anchor", "sum": "sum", "ran_8": "RAN 8 px", "ran_24": "RAN 24 px"}
-_MIX = {"hist_10": "hist 10", "hist_50": "hist 50", "hist_comb_10": "hist-comb 10", "hist_comb_50": "hist-comb 50"}
-_PAPER = (
-    Row("patch_netvlad_performance", "Patch-NV perf.", "patch_netvlad_performance"),
-    Row("patch_netvlad_speed", "Patch-NV speed", "patch_netvlad_speed"),
-    Row("mixvpr", "MixVPR", "mix_hist_50", RETRIEVAL),
-    Row("selavpr_pitts_stage_1", "SelaVPR pits. stage 1", "selavpr_pitts", RETRIEVAL),
-    Row("selavpr_pitts", "SelaVPR pits.", "selavpr_pitts"),
-    Row("selavpr_msls_stage_1", "SelaVPR msls stage 1", "selavpr_msls", RETRIEVAL),
-    Row("selavpr_msls", "SelaVPR msls", "selavpr_msls"),
-    Row("ssm_vpr", "SSM-VPR", "ssm_vpr"),
-    *(Row(f"ssm_{name}", f"SSM-{title}", f"ssm_{name}") for name, title in _SSM.items()),
-    *(Row(f"mix_{name}", f"Mix-{title}", f"mix_{name}") for name, title in _MIX.items()),
-    Row("mix_hist_aliked_50", "Mix-hist 50, ALIKED", "mix_hist_aliked_50"),
-)
-_SCORES = {name: name for name in ("count", "rapid", "sum", "anchor")} | {
-    "histogram": "hist 50",
-    "homography_8": "RAN 8 px",
-    "homography_24": "RAN 24 px",
-    COMBINED: "hist-comb 50",
-}
-_NAMES = {"histogram": "hist_50", "homography_8": "ran_8", "homography_24": "ran_24", COMBINED: "hist_comb_50"}
-
-
-def _stand_ins(features: str, title: str) -> Iterator[Row]:
-    """The methods with features whose weights are here, after VLAD of the same features."""
-    yield Row(f"{features}_vlad", f"VLAD of {title}", f"{features}_50", RETRIEVAL)
-    for ranking, words in _SCORES.items():
-        yield Row(f"{features}_{_NAMES.get(ranking, ranking)}", f"{title}-{words}", f"{features}_50", ranking)
-    yield Row(f"{features}_hist_10", f"{title}-hist 10", f"{features}_10", "histogram")
-    yield Row(f"{features}_hist_comb_10", f"{title}-hist-comb 10", f"{features}_10", COMBINED)
-    yield Row(f"{features}_mfvpr", f"{title}, system=mfvpr", f"{features}_mfvpr")
-
-
-ROWS = (*_PAPER, *_stand_ins("sift", "SIFT"), *_stand_ins("aliked", "ALIKED"))
-
-_SIFT = ("features=sift", "retrieval=vlad")
-_ALIKED = ("features=aliked", "features.weights=aliked-n32", "retrieval=vlad")
-_ALL, _FEW = ("scorer=compared", "candidates=50"), ("scorer=histogram", "candidates=10")
-_RUNS = {
-    "sift_50": (*_SIFT, *_ALL),
-    "sift_10": (*_SIFT, *_FEW),
-    "sift_mfvpr": ("system=mfvpr", "features=sift"),
-    "aliked_50": (*_ALIKED, *_ALL),
-    "aliked_10": (*_ALIKED, *_FEW),
-    "aliked_mfvpr": ("system=mfvpr",),
-}
+_SYSTEMS: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "systems.yaml").read_text(encoding="utf-8"))
+ROWS = tuple(Row(name, **{"run": name, **values}) for name, values in _SYSTEMS["rows"].items())
 
 
 def overrides(run: str, dataset: str) -> tuple[str, ...]:
     """Settings of `mfvpr evaluate` that make an evaluation, without its data set."""
-    chosen = _RUNS.get(run, (f"system={run}",))
-    if run.startswith("selavpr"):
-        return (*chosen, "candidates=50")
+    chosen = _SYSTEMS["evaluations"].get(run, [f"system={run}"])
     if run.startswith("patch_netvlad") and dataset == "robotcar_seasons":
         size = ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()  # of the patches' grid
         return (*chosen, "features.image_size=[480,480]", *size)
-    return chosen
+    return (*chosen,)
 
 
 def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
@@ -118,33 +71,31 @@ def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]
         raise InputError(f"{setting}=[{unknown[0]}]: expected some of {', '.join(known)}")
 
 
-def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], dict[str, str], list[str]]:
-    """The data sets that are at hand, a line by name for those that are absent, and for each folder that is refused."""
+def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
+    """The data sets that are at hand, and a line for each that is not, with the reason."""
     root = None if data is None else expand_user(data)
     if root is not None and not root.is_dir():
-        got = "a file" if root.exists() else "nothing"
-        raise InputError(f"data={data}: expected a folder with a folder per data set, got {got}; check the path")
+        raise InputError(f"data={data}: expected a folder with a folder per data set; check the path")
     located = {place.name: place for place in _places_by_coordinates(root)} if root else {}
     known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))
     _check_names("datasets", names, known)
-    available, absent, refused = list[Place](), dict[str, str](), list[str]()
+    available, left_out = list[Place](), list[str]()
     for name in known if names is None else [name for name in known if name in names]:
         folders = PUBLISHED[name].folders if name in PUBLISHED else (name,)
         present = [root / folder for folder in folders if root and folder not in located and (root / folder).is_dir()]
         if name == DRAWN:
             available.append(Place(name, (f"dataset={name}",)))
-        elif name in located and name in (*REAL, *PUBLISHED):
-            refused.append(f"{name}: expected another layout than that of names with positions; rename the folder")
-        elif name in located and not DATA_SET_NAME.holds(name):
-            refused.append(f"{name}: expected a folder's name of {DATA_SET_NAME.expected}; rename it")
+        elif name in located and (name in (*REAL, *PUBLISHED) or not DATA_SET_NAME.holds(name)):
+            expected = f"{DATA_SET_NAME.expected}, and not that of a published data set"
+            left_out.append(f"{name}: expected a name of {expected}, for a folder of images with positions; rename it")
         elif name in located:
             available.append(located[name])
         elif present:
-            available.append(Place(name, (f"dataset={name}", override("dataset.root", present[0])), present[0]))
+            available.append(Place(name, (f"dataset={name}", override("dataset.root", present[0]))))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
-            absent[name] = f"{name}: needs {data or 'data=DIR'}/{name} {needs}"
-    return available, absent, refused
+            left_out.append(f"{name}: needs {data or 'data=DIR'}/{name} {needs}")
+    return available, left_out
 
 
 def _places_by_coordinates(root: Path) -> Iterator[Place]:
@@ -155,7 +106,7 @@ def _places_by_coordinates(root: Path) -> Iterator[Place]:
             if all(any(path.is_file() for path in side.glob(f"{_POSITIONS}*")) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
                 settings = (override(f"dataset.{name}", value) for name, value in chosen.items())
-                yield Place(folder.name, ("dataset=folder", *settings), folder)
+                yield Place(folder.name, ("dataset=folder", *settings))
                 break
 
 

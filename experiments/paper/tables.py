@@ -1,9 +1,8 @@
 """The paper's tables: numbers of the evaluations at hand beside the printed ones, and averages of both."""
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,18 @@ INCOMPLETE = " (incomplete)"
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
 TOLERANCES = (1, 2, 5)  # of the printed recalls
 _NONE = "-"
-_BEST = ("mix_hist_50", "aliked_hist_50", "sift_hist_50")
+_BRACKETS = "; in brackets the printed numbers and the differences"
 
 
 @dataclass(frozen=True)
 class RowResult:
     """The result of a row's ranking on a data set: recall in % by sequence (`OVERALL` for all), threshold and depth.
 
-    `about` are settings, from the results. `candidates` is a setting, of which a small database has fewer.
+    `about` are settings, from the results.
     """
 
     recall: Mapping[str, Mapping[float, Mapping[int, float]]]
     about: Mapping[str, Any]
-    candidates: int | str | None = None
 
 
 @dataclass(frozen=True)
@@ -61,11 +59,6 @@ class Evaluations:
     timed_on: str = ""
     folders: Mapping[tuple[str, str], Path] = field(default_factory=dict)
 
-    @property
-    def best_rows(self) -> list[Row]:
-        """Rows whose histograms and failures are shown, the most important first."""
-        return [row for name in _BEST for row in self.rows if row.name == name]
-
     def title(self, name: str) -> str:
         """A data set's name, marked if it lacks images."""
         return name + INCOMPLETE * any(published_differences(self.datasets[name]))
@@ -78,23 +71,26 @@ class Evaluations:
         Rows that lack one have no mean.
         """
         names = [name for name in self.datasets if {*TOLERANCES} <= {*self.thresholds(name)}]
-        six = [name for name in names if name in (*BERLIN, *OTHERS)]
-        names = six if len(six) == len(BERLIN) + len(OTHERS) else names
+        is_papers = {*BERLIN, *OTHERS} <= {*names}
+        names = [name for name in names if not is_papers or name in (*BERLIN, *OTHERS)]
         means = {}
         for row in self.rows:
-            recalls = {}
-            for name in names:
-                if result := self.results.get((row.name, name)):
-                    recalls[name] = [result.recall[OVERALL][tolerance][1] for tolerance in TOLERANCES]
-            if names and len(recalls) == len(names):
-                macro = average(recalls) if names == six else None
-                means[row.name] = np.mean([*recalls.values()], axis=0) if macro is None else macro
+            recalls = {
+                name: np.array([self.recall(row, name, OVERALL, at) for at in TOLERANCES], float) for name in names
+            }
+            if names and np.isfinite([*recalls.values()]).all():  # None became NaN
+                means[row.name] = average(recalls) if is_papers else np.mean([*recalls.values()], axis=0)
         return names, means
 
     @property
     def averaged(self) -> str:
         """The data sets of the means, in words."""
         return ", ".join(map(self.title, self.means[0])) or "none"
+
+    def recall(self, row: Row, dataset: str, sequence: str, threshold: float, k: int = 1) -> float | None:
+        """Recall of a row in %, None = it has none."""
+        result = self.results.get((row.name, dataset))
+        return None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(k)
 
     def thresholds(self, dataset: str) -> list[float]:
         """Thresholds of a data set's evaluations."""
@@ -108,7 +104,7 @@ def printed_tables() -> Mapping[str, Any]:
     return yaml.safe_load((Path(__file__).parent / "printed.yaml").read_text(encoding="utf-8"))
 
 
-def average(recalls: Mapping[str, Sequence[float]]) -> Float[np.ndarray, " tolerances"] | None:
+def average(recalls: Mapping[str, Any]) -> Float[np.ndarray, " tolerances"] | None:
     """The paper's average recall: Berlin's three count as one data set; None if one of six is missing.
 
     `recalls` are by data set and tolerance.
@@ -119,20 +115,7 @@ def average(recalls: Mapping[str, Sequence[float]]) -> Float[np.ndarray, " toler
     return np.mean([berlin, *(recalls[name] for name in OTHERS)], axis=0)
 
 
-def printed_recall(row: str, dataset: str, sequence: str | None = None) -> Sequence[float] | None:
-    """Recall of a system within 1, 2, 5 frames in %, on a data set or a sequence of RobotCar's; None = not printed."""
-    if sequence is None:
-        return printed_tables()["recall"].get(row, {}).get(dataset)
-    return printed_tables()["sequences"].get(row, {}).get(sequence) if dataset == "robotcar_seasons" else None
-
-
-def printed_settings(row: str) -> Mapping[str, Any]:
-    """Sizes of images and candidates of a system, by column; empty = not printed."""
-    families = (family for family in printed_tables()["settings"] if row.startswith(family))
-    return printed_tables()["settings"].get(max(families, key=len, default=""), {})
-
-
-def row_result(row: Row, results: Sequence[Mapping[str, Any]], candidates: int | str | None = None) -> RowResult | None:
+def row_result(row: Row, results: Sequence[Mapping[str, Any]]) -> RowResult | None:
     """A row's part of an evaluation's results; None if it has none."""
     parts = [part for part in results if (part["decides"] if row.ranking is None else part["system"] == row.ranking)]
     recall: dict[str, dict[float, dict[int, float]]] = {}
@@ -141,43 +124,47 @@ def row_result(row: Row, results: Sequence[Mapping[str, Any]], candidates: int |
         depths = {int(k): 100 * value for k, value in part["recall_at"].items()}
         recall.setdefault(OVERALL if sequence == MEANS[0] else sequence, {})[threshold] = depths
     recall.pop(MEANS[1], None)
-    return RowResult(recall, parts[0], candidates) if parts and OVERALL in recall else None
+    return RowResult(recall, parts[0]) if parts and OVERALL in recall else None
 
 
 def beside(ours: float | None, theirs: float | None, form: str = ".1f") -> str:
     """Both numbers and their difference, as far as there are."""
     if ours is None:
         return _NONE if theirs is None else f"({theirs:{form}})"
-    if theirs is None:
-        return f"{ours:{form}}"
-    return f"{ours:{form}} ({theirs:{form}}, {round(ours, 1) - theirs:+{form}})"
+    text = f"{ours:{form}}"
+    return text if theirs is None else f"{text} ({theirs:{form}}, {float(text.replace(',', '')) - theirs:+{form}})"
+
+
+Cells = Mapping[str, tuple[float | None, float | None]]  # by column: the number here, and the printed one
 
 
 def paper_tables(evaluations: Evaluations) -> Iterator[tuple[str, str, Table]]:
-    """(name, heading, table) of each that is not empty."""
-    names = [(evaluations.title(name), name, OVERALL) for name in evaluations.datasets]
-    tables = [
-        ("data_sets", "Data sets (Table I)", _data_sets(evaluations)),
-        ("settings", "Settings (Table II)", _settings(evaluations)),
-        ("recall", "Recall@1 in %, by data set and threshold (Tables III and VII)", _recalls(evaluations, names)),
-    ]
+    """(name, heading, table) of each that is not empty; systems without numbers are left out."""
+    yield "data_sets", f"Data sets (Table I){_BRACKETS}", _data_sets(evaluations)
+    yield "settings", f"Settings (Table II){_BRACKETS}", _settings(evaluations)
+    parts = [(evaluations.title(name), name, OVERALL) for name in evaluations.datasets]
+    heading = "Recall@1 in %, by data set and threshold (Tables III and VII)"
+    tables: dict[str, tuple[str, Any]] = {"recall": (heading, partial(_recalls, parts=parts))}
     for name, dataset in evaluations.datasets.items():
         if len(dataset.sequences) > 1:
             parts = [*((part.name, name, part.name) for part in dataset.sequences), ("mean", name, OVERALL)]
             heading = f"Recall@1 in %, sequences of {evaluations.title(name)} (Table IV)"
-            tables.append((f"sequences_{name}", heading, _recalls(evaluations, parts)))
-    averages = f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}"
+            tables[f"sequences_{name}"] = heading, partial(_recalls, parts=parts)
+    tables["averages"] = f"Average Recall@1 in % (figure 8), here over {evaluations.averaged}", _averages
+    tables["depths"] = "Recall@1, @5 and @10 in %, by data set (Table VIII)", _depths
+    tables["sizes"] = "Size of the database in MiB, of float32 (Table V)", _sizes
     device = f"RobotCar's snow, an RTX 2080 Ti; here {evaluations.timed_on}"
-    tables += [
-        ("averages", averages, _averages(evaluations)),
-        ("depths", "Recall@1, @5 and @10 in %, by data set (Table VIII)", _depths(evaluations)),
-        ("sizes", "Size of the database in MiB, of float32 (Table V)", _sizes(evaluations)),
-        ("seconds", f"Seconds of a query by step (Table VI: {device})", _seconds(evaluations)),
-    ]
-    for name, heading, table in tables:
-        if table.rows:
-            has_printed = any("(" in cell.replace(INCOMPLETE, "") for row in table.rows for cell in row[1:])
-            yield name, heading + "; in brackets the printed numbers and the differences" * has_printed, table
+    tables["seconds"] = f"Seconds of a query by step (Table VI: {device})", _seconds
+    for name, (heading, cells_of) in tables.items():
+        by_title = {row.title: cells_of(evaluations, row) for row in evaluations.rows}
+        by_title = {title: cells for title, cells in by_title.items() if {*cells.values()} - {(None, None)}}
+        if by_title:
+            form, columns = ".3f" if name == "seconds" else ".1f", [*next(iter(by_title.values()))]
+            lines = [
+                [title, *(beside(*cells[column], form=form) for column in columns)] for title, cells in by_title.items()
+            ]
+            has_printed = any("(" in cell for line in lines for cell in line[1:])
+            yield name, heading + _BRACKETS * has_printed, Table(["system", *columns], lines)
 
 
 def _data_sets(evaluations: Evaluations) -> Table:
@@ -191,13 +178,14 @@ def _data_sets(evaluations: Evaluations) -> Table:
 
 
 def _settings(evaluations: Evaluations) -> Table:
-    """Retrieval and features with the sizes of their images in px, and candidates."""
-    lines: dict[str, list[str]] = {}
+    """Retrieval and features with the sizes of their images in px, and candidates; printed ones are by family."""
+    lines, printed = dict[str, list[str]](), printed_tables()["settings"]
     for (name, _), result in evaluations.results.items():
-        about, theirs = result.about, printed_settings(name)
+        about, families = result.about, [family for family in printed if name.startswith(family)]
+        theirs = printed.get(max(families, key=len, default=""), {})
         sides = [about[group].get("image_size") for group in ("retrieval", "features")]
         ours = [" x ".join(map(str, side)) if side else _NONE for side in sides]
-        ours.append(str(result.candidates or about["candidates"]))
+        ours.append(str(about["candidates"]))
         values = [theirs.get(column) for column in ("retrieval", "re_ranking", "candidates")]
         cells = [cell if value is None else f"{cell} ({value})" for cell, value in zip(ours, values, strict=True)]
         lines[name] = [about["retrieval"]["name"], cells[0], about["features"]["name"], *cells[1:]]
@@ -205,72 +193,56 @@ def _settings(evaluations: Evaluations) -> Table:
     return Table(["system", "retrieval", "its images", "features", "their images", "candidates"], rows, text_columns=5)
 
 
-def _recalls(evaluations: Evaluations, parts: Sequence[tuple[str, str, str]]) -> Table:
+def _recalls(evaluations: Evaluations, row: Row, parts: Sequence[tuple[str, str, str]]) -> Cells:
     """Recall by part and threshold; parts are (words, data set, sequence)."""
-    columns = [(*part, threshold) for part in parts for threshold in evaluations.thresholds(part[1])]
-
-    def cell(row: Row, name: str, sequence: str, threshold: float) -> str:
-        result, theirs = evaluations.results.get((row.name, name)), printed_recall(row.name, name, sequence or None)
-        ours = None if result is None else result.recall.get(sequence, {}).get(threshold, {}).get(1)
-        return beside(ours, theirs[TOLERANCES.index(int(threshold))] if theirs and threshold in TOLERANCES else None)
-
-    header = [f"{words} ±{threshold:g}" for words, *_, threshold in columns]
-    return _filled(header, {row.title: [cell(row, *column[1:]) for column in columns] for row in evaluations.rows})
-
-
-def _filled(header: Sequence[str], cells: Mapping[str, Sequence[str]]) -> Table:
-    """A table of the systems that have numbers; `cells` are by title."""
-    rows = [[title, *texts] for title, texts in cells.items() if any(text != _NONE for text in texts)]
-    return Table(["system", *header], rows)
+    printed, cells = printed_tables(), {}
+    for words, name, sequence in parts:
+        theirs = printed["recall"].get(row.name, {}).get(name)
+        if sequence:  # only RobotCar's are printed
+            theirs = printed["sequences"].get(row.name, {}).get(sequence) if name == "robotcar_seasons" else None
+        known: dict[float, float] = dict(zip(TOLERANCES, theirs or (), strict=False))
+        for threshold in evaluations.thresholds(name):
+            ours = evaluations.recall(row, name, sequence, threshold)
+            cells[f"{words} ±{threshold:g}"] = ours, known.get(threshold)
+    return cells
 
 
-def _averages(evaluations: Evaluations) -> Table:
+def _averages(evaluations: Evaluations, row: Row) -> Cells:
     """Means over the data sets that are here, see `Evaluations.means`, and the printed ones beside those of all six."""
     names, means = evaluations.means
-    is_papers, no_values, cells = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES), {}
-    for row in evaluations.rows:
-        ours, theirs = means.get(row.name, no_values), average(printed_tables()["recall"].get(row.name, {}))
-        pairs = zip(ours if is_papers else no_values, no_values if theirs is None else theirs, strict=True)
-        cells[row.title] = [beside(*pair) for pair in pairs]
-        cells[row.title] += [beside(value, None) for value in (no_values if is_papers else ours)]
-    words = "of the paper's six", f"of {len(names)} here"
-    table = _filled([f"{name} ±{tolerance}" for name in words for tolerance in TOLERANCES], cells)
-    columns = [column for column in zip(table.header, *table.rows, strict=True) if {*column[1:]} != {_NONE}]
-    header, *rows = map(list, zip(*columns, strict=True))
-    return Table(header, rows)
+    is_papers, none = {*names} == {*BERLIN, *OTHERS}, [None] * len(TOLERANCES)
+    ours, theirs = means.get(row.name, none), average(printed_tables()["recall"].get(row.name, {}))
+    pairs = zip(TOLERANCES, ours, none if theirs is None else theirs, strict=True)
+    cells, here = {}, {}
+    for tolerance, mean, printed in pairs:
+        cells[f"of the paper's six ±{tolerance}"] = mean if is_papers else None, printed
+        here[f"of {len(names)} here ±{tolerance}"] = mean, None
+    return cells if is_papers else cells | here
 
 
-def _depths(evaluations: Evaluations) -> Table:
+def _depths(evaluations: Evaluations, row: Row) -> Cells:
     """Recall at several depths, within the threshold in the middle; Pittsburgh's beside the printed."""
-    ks = (1, 5, 10)
-    rows = []
-    for row, name in itertools.product(evaluations.rows, evaluations.datasets):
-        if result := evaluations.results.get((row.name, name)):
-            recall = result.recall[OVERALL]
-            threshold = middle(sorted(recall))
-            theirs = printed_tables()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
-            cells = [beside(recall[threshold].get(k), theirs and theirs[place]) for place, k in enumerate(ks)]
-            rows.append([row.title, f"{evaluations.title(name)} ±{threshold:g}", *cells])
-    return Table(["system", "data set", *(f"R@{k}" for k in ks)], rows, text_columns=2)
-
-
-def _sizes(evaluations: Evaluations) -> Table:
-    """Sizes of the databases."""
     cells = {}
-    for row in evaluations.rows:
-        printed, sizes = printed_tables()["sizes"].get(row.name, {}), evaluations.sizes
-        cells[row.title] = [beside(sizes.get((row.name, name)), printed.get(name)) for name in evaluations.datasets]
-    return _filled([*map(evaluations.title, evaluations.datasets)], cells)
+    for name in evaluations.datasets:
+        threshold = middle(evaluations.thresholds(name) or [0])
+        theirs = printed_tables()["pitts30k"].get(row.name) if name == "pitts30k_val" else None
+        for place, k in enumerate((1, 5, 10)):
+            ours = evaluations.recall(row, name, OVERALL, threshold, k)
+            cells[f"{evaluations.title(name)} ±{threshold:g} R@{k}"] = ours, theirs and theirs[place]
+    return cells
 
 
-def _seconds(evaluations: Evaluations) -> Table:
-    """Seconds by step, and their sum."""
-    rows = []
-    for row in evaluations.rows:
-        theirs = printed_tables()["seconds"].get(row.name, [None] * 4)
-        if steps := evaluations.seconds.get(row.name):
-            ours = [steps["retrieval"], steps["features"], steps["matching"] + steps["scores"]]
-            pairs = zip([*ours, sum(ours)], theirs, strict=True)
-            cells = [f"{value:.3f}" + ("" if known is None else f" ({known:.2f})") for value, known in pairs]
-            rows.append([row.title, *cells])
-    return Table(["system", "retrieval", "features", "matching and score", "in all"], rows)
+def _sizes(evaluations: Evaluations, row: Row) -> Cells:
+    """Sizes of the databases."""
+    printed, sizes = printed_tables()["sizes"].get(row.name, {}), evaluations.sizes
+    return {evaluations.title(name): (sizes.get((row.name, name)), printed.get(name)) for name in evaluations.datasets}
+
+
+def _seconds(evaluations: Evaluations, row: Row) -> Cells:
+    """Seconds by step, and their sum; nothing of systems that were not timed."""
+    columns, steps = ("retrieval", "features", "matching and score", "in all"), evaluations.seconds.get(row.name)
+    if steps is None:
+        return dict.fromkeys(columns, (None, None))
+    ours = [steps["retrieval"], steps["features"], steps["matching"] + steps["scores"]]
+    theirs = printed_tables()["seconds"].get(row.name, [None] * 4)
+    return dict(zip(columns, zip([*ours, sum(ours)], theirs, strict=True), strict=True))

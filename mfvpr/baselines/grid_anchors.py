@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fields import FLAG, check_fields, one_of, setting, whole
+from mfvpr.utils.fields import check_fields, setting, whole
 from mfvpr.utils.numerics import masked
 
-_OUTSIDE = {"unequal": -1000, "zero": 0}
+_OUTSIDE = -1000  # padding around the grid in the public code on a CPU; equals no expected cell up to a side of 51
 
 
 @value
@@ -25,24 +25,16 @@ class GridAnchors:
         mfvpr.GridAnchors(side=26)(mfvpr.match(cells0, cells1, cross_check="candidate"))  # of 26 x 26 cells
 
     The score counts as the public code does. That code compares flat cell numbers, so that an expected cell may lie at
-    the other end of a row (`wrap`), and the padding around the grid takes part (`outside`). With `wrap` False neither
-    happens. A cell without a match never agrees, not even with itself. If a cell has several matches, the match with
-    the lowest query cell counts.
+    the other end of a row, and the padding around the grid takes part. A cell without a match never agrees, not even
+    with itself. If a cell has several matches, the match with the lowest query cell counts.
 
     Attributes:
         side: cells per side of both images; every cell is a keypoint: 40 at 336 px, 26 at 224, 54 at 448.
         patch: n, odd and up to the side (else an InputError); None = 3/4 of the side, rounded down to an odd number.
-        wrap: compare flat cell numbers, as published; False: displacements in rows and columns.
-        outside: value of the padding: "unequal" (-1000) as in the public code on a CPU, which equals no expected cell
-            up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
     """
 
     side: int = setting(40, whole(1, 74), "as the features have", unit="cells per side", swept=False, static=True)
     patch: int | None = setting(None, whole(1, 73) | None, "odd; None = 3/4 of the side", unit="cells", static=True)
-    wrap: bool = setting(True, FLAG, "flat numbers are compared, as published", static=True)
-    outside: str = setting(
-        "unequal", one_of("unequal", "zero"), "beyond the grid, of the CPU and of the GPU path", static=True
-    )
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -73,15 +65,13 @@ class GridAnchors:
         target = jnp.where(real, cell1, len(cells))  # out of range, hence dropped, unless it is a match
         index = jnp.full(len(cells), len(cells), jnp.int32).at[target].min(cell0, mode="drop")
         matched = index < len(cells)
-        score = self._agreements(index, matched, cells)
-        if self.wrap:  # anchors may agree with the value of the padding around the grid
-            side, half = self.side, self.size // 2
-            row, column = jnp.divmod(cells, side)
-            down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset, as n <= side
-            right = right - half
-            outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
-            is_near = (jnp.abs(down) <= half) & (right <= half)
-            score += jnp.sum(matched & is_near & outside, dtype=jnp.int32)
+        side, half = self.side, self.size // 2
+        row, column = jnp.divmod(cells, side)
+        down, right = jnp.divmod(_OUTSIDE - index + half, side)  # the only offset to the padding, as n <= side
+        right = right - half
+        outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
+        is_near = (jnp.abs(down) <= half) & (right <= half)
+        score = self._agreements(index, matched, cells) + jnp.sum(matched & is_near & outside, dtype=jnp.int32)
         usable = jnp.all((cell1 >= 0) & (cell1 < len(cells)) & (cell0 >= 0) & (cell0 < len(cells)))
         for count in (matches.count0, matches.count1):
             usable &= count is None or jnp.asarray(count) == len(cells)
@@ -93,11 +83,7 @@ class GridAnchors:
         Agreement is symmetric: the offsets to the right and in the rows below suffice, shifts of the padded flat array.
         """
         side, half = self.side, self.size // 2
-        shift = index - cells
-        if not self.wrap:
-            (row0, column0), (row1, column1) = (jnp.divmod(number, side) for number in (index, cells))
-            shift = (row0 - row1) * 4 * side + column0 - column1
-        pitch, never = side + half, 8 * side**2  # no displacement is as large
+        shift, pitch, never = index - cells, side + half, 8 * side**2  # no displacement is as large
         anchors, neighbors = (
             jnp.pad(masked(shift, matched, fill).reshape(side, side), ((0, 0), (0, half)), constant_values=fill)
             for fill in (never, -never)

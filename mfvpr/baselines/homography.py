@@ -49,7 +49,6 @@ class Homography:
             the search ends early if almost all draws (49 of 50) are degenerate.
         confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
             as the best model has; an array of 1 never stops early, one not above 0 scores NaN.
-        measure: `inliers` counts inliers; `msac` sums 1 - (error / threshold)^2 (Torr & Zisserman, CVIU 2000).
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after the count.
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD); 4 matches score 4.
@@ -60,7 +59,6 @@ class Homography:
     threshold: float | Array = setting(24.0, POSITIVE, unit="px")
     max_iterations: float | Array = setting(2000.0, number(1.0, 1000000.0), "at most", unit="samples")
     confidence: float | Array = setting(0.995, number(1e-06, 0.999999), "that a sample was all inliers")
-    measure: str = setting("inliers", one_of("inliers", "msac"), static=True)
     refit: bool = setting(False, FLAG, "count again after least squares", static=True)
     few: str = setting("count", one_of("count", "zero"), "less than 4 matches", static=True)
     per_feature: bool = setting(False, FLAG, static=True)
@@ -92,7 +90,7 @@ class Homography:
         order = planes.canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
         limits = threshold, max_iterations, probability
-        search = _Search(self.measure, matches.confidence is None, normalized[order], counts[order], number, *limits)
+        search = _Search(matches.confidence is None, normalized[order], counts[order], number, *limits)
         # The generator is named, because others draw different numbers in a batch.
         model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
         if self.refit:
@@ -100,10 +98,7 @@ class Homography:
                 model, masked(normalized, real), masked(counts, planes.is_inlier(model, normalized, threshold))
             )
         inliers = jnp.where(number == 4, real, planes.is_inlier(model, normalized, threshold))
-        quality = jnp.ones_like(counts)
-        if self.measure == "msac":
-            quality = _closeness(*planes.miss(model, normalized, threshold))
-        score = jnp.sum(masked(quality, inliers) * counts)
+        score = jnp.sum(masked(counts, inliers))
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
         score = score / query_features(matches) if self.per_feature else score
@@ -115,7 +110,6 @@ class Homography:
 class _Search(NamedTuple):
     """RANSAC of one pair, with matches in canonical order and in the coordinates of a frame."""
 
-    measure: str
     each_counts_one: bool
     points: Float[Array, "slots 4"]
     counts: Float[Array, " slots"]  # confidence of the matches
@@ -135,49 +129,45 @@ class _Search(NamedTuple):
         def search_round(state: _State) -> _State:
             four, num_samples = planes.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
             models, place = planes.through(four), jnp.arange(planes.ROUND, dtype=jnp.int32)
-            quality, inliers, number = self._compare(models)
-            quality = jnp.where((place < num_samples) & (number > 3), quality, 0.0)
+            inliers, number = self._compare(models)
+            inliers = jnp.where((place < num_samples) & (number > 3), inliers, 0.0)
             # As if samples came one after the other: samples after the one where that search stops do not count.
-            leading = masked(inliers, quality > _maximum_before(quality, state.quality))  # of every new best model
-            most_before = _maximum_before(leading, state.inliers)
+            before = jnp.concatenate([jnp.zeros_like(inliers[:1]), jax.lax.cummax(inliers)[:-1]])
+            most_before = jnp.maximum(before, state.inliers)
             counted = (place < num_samples) & (state.samples + place < self._count_samples(most_before))
-            quality = masked(quality, counted)
-            best = jnp.argmax(quality)
+            inliers = masked(inliers, counted)
+            best = jnp.argmax(inliers)
             return _State(
                 round=state.round + 1,
                 samples=state.samples + jnp.sum(counted, dtype=jnp.int32),
-                quality=jnp.maximum(quality[best], state.quality),
-                inliers=jnp.maximum(jnp.max(masked(leading, counted)), state.inliers),
-                model=jnp.where(quality[best] > state.quality, models[:, best], state.model),
+                inliers=jnp.maximum(inliers[best], state.inliers),
+                model=jnp.where(inliers[best] > state.inliers, models[:, best], state.model),
                 has_samples=num_samples > 0,
             )
 
         zero, start = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-        state = _State(start, start, zero, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
+        state = _State(start, start, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
         state = jax.lax.while_loop(is_searching, search_round, state)
         return state.model, state.samples
 
-    def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array, Array]:
-        """Quality, sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
+    def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array]:
+        """Sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
         padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
         points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
         counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)
 
-        def compare_step(step: Array, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            quality, inliers, number = sums
+        def compare_step(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+            inliers, number = sums
             for point, count in zip(points[step], counts[step], strict=True):
-                error, limit = planes.miss(models, point, self.threshold)
-                inlier = error <= limit
+                inlier = planes.is_inlier(models, point, self.threshold)
                 inliers = inliers + jnp.where(inlier, count, 0.0)
                 if not self.each_counts_one:
                     number = number + inlier.astype(number.dtype)
-                if self.measure == "msac":
-                    quality = quality + jnp.where(inlier, count * _closeness(error, limit), 0.0)
-            return quality, inliers, number
+            return inliers, number
 
         zeros = jnp.zeros_like(models[0])
-        quality, inliers, number = jax.lax.fori_loop(0, len(points), compare_step, (zeros, zeros, zeros))
-        return inliers if self.measure == "inliers" else quality, inliers, inliers if self.each_counts_one else number
+        inliers, number = jax.lax.fori_loop(0, len(points), compare_step, (zeros, zeros))
+        return inliers, inliers if self.each_counts_one else number
 
     def _count_samples(self, inliers: Array) -> Array:
         """Samples needed to draw four inliers with `probability`, at most `max_iterations`."""
@@ -188,23 +178,12 @@ class _Search(NamedTuple):
         return samples.astype(jnp.int32)
 
 
-def _closeness(error: Array, limit: Array) -> Array:
-    """1 - error / limit (squares, in the same unit): 1 without error, 0 at the threshold."""
-    return 1.0 - error / jnp.where(limit > 0, limit, 1.0)
-
-
 class _State(NamedTuple):
     round: Int[Array, ""]
     samples: Int[Array, ""]
-    quality: Float[Array, ""]
-    inliers: Float[Array, ""]  # most inliers of any model that was the best at some time
+    inliers: Float[Array, ""]  # of the best model
     model: Float[Array, "9"]
     has_samples: Bool[Array, ""]  # whether the last round had a sample
-
-
-def _maximum_before(values: Float[Array, " samples"], start: Float[Array, ""]) -> Float[Array, " samples"]:
-    """Maximum of `start` and all values before each one."""
-    return jnp.maximum(jnp.concatenate([jnp.zeros_like(values[:1]), jax.lax.cummax(values)[:-1]]), start)
 
 
 def _without_gradient(why: str, values: Any) -> Any:

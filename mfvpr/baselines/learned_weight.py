@@ -5,8 +5,7 @@ The file of a learned weight is JSON with its provenance.
 
 import json
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field, fields
 from functools import cache, partial
 from pathlib import Path
@@ -28,6 +27,8 @@ ABSOLUTE = ("scores0", "scores1", "distance", "ratio", "x0", "y0", "x1", "y1")
 SUFFIX = ".json"
 _FORMAT = "mfvpr match weight 1"
 _LEARNED = {path.stem: path for path in sorted((Path(__file__).parent / "learned").glob(f"*{SUFFIX}"))}
+WORDS = (*WEIGHTS, *_LEARNED)
+"""Words for weights: the fixed ones, then those that this library learned."""
 
 
 @value
@@ -165,34 +166,21 @@ def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         names = (*content["inputs"],)
-        arrays = {f.name: np.asarray(content[f.name], np.float32) for f in fields(LearnedWeight) if f.name != "names"}
+        arrays = {f.name: jnp.asarray(content[f.name], float) for f in fields(LearnedWeight) if f.name != "names"}
         inputs, hidden = len(names), arrays["output"].size
         shapes = [(inputs,), (inputs,), (inputs, hidden), (hidden,), (hidden,), ()]
-        if content["format"] != _FORMAT or not {*names} <= {*INPUTS}:
+        if content["format"] != _FORMAT or not {*names} <= {*INPUTS} or [a.shape for a in arrays.values()] != shapes:
             raise ValueError("another format")
-        if [values.shape for values in arrays.values()] != shapes or not (arrays["scale"] > 0).all():
-            raise ValueError("arrays of other shapes")
-        if not all(np.isfinite(values).all() for values in arrays.values()):
-            raise ValueError("numbers that are not finite")
-        weight = LearnedWeight(
-            **{name: jnp.asarray(values, dtype=float) for name, values in arrays.items()}, names=names
-        )
-        return weight, dict(content["made"])
-    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+        return LearnedWeight(**arrays, names=names), dict(content["made"])
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path}: expected a match weight that mfvpr learn wrote ({error})") from error
 
 
-class _NamedWeights(Mapping[str, Weight]):
-    """Weights by name; files are read on access, and the same name returns the same object."""
-
-    def __getitem__(self, name: Any) -> Weight:
-        return WEIGHTS[name] if name in WEIGHTS else _read_by_name(name)[0]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter([*WEIGHTS, *_LEARNED])
-
-    def __len__(self) -> int:
-        return len(WEIGHTS) + len(_LEARNED)
+def named_weight(weight: Weight | str) -> Weight:
+    """The weight that a word, or the path of a file that `mfvpr learn` wrote, stands for; other weights as they are."""
+    if not isinstance(weight, str):
+        return weight
+    return WEIGHTS[weight] if weight in WEIGHTS else _read_by_name(weight)[0]
 
 
 def provenance(name: str) -> dict[str, Any]:
@@ -200,10 +188,10 @@ def provenance(name: str) -> dict[str, Any]:
     return {} if name in WEIGHTS else _read_by_name(name)[1]
 
 
-def _read_by_name(name: Any) -> tuple[Weight, dict[str, Any]]:
-    if name not in _LEARNED and not (isinstance(name, str) and name.endswith(SUFFIX)):
-        raise KeyError(name)
-    path = _LEARNED.get(name, Path(os.path.expanduser(name)))
+def _read_by_name(name: str) -> tuple[Weight, dict[str, Any]]:
+    path = _LEARNED.get(name, Path(name).expanduser())
+    if path.suffix != SUFFIX:
+        raise InputError(f"weight={name!r}: expected one of {', '.join(WORDS)}, or FILE{SUFFIX}")
     return _read(path, path.stat().st_mtime_ns if path.exists() else 0)
 
 
@@ -211,14 +199,3 @@ def _read_by_name(name: Any) -> tuple[Weight, dict[str, Any]]:
 def _read(path: Path, modified_ns: int) -> tuple[Weight, dict[str, Any]]:
     """Contents of a file; `modified_ns` makes a modified file a new entry of the cache."""
     return read_weight(path)
-
-
-NAMED_WEIGHTS: Mapping[str, Weight] = _NamedWeights()
-"""Weights by word, or by the path `*.json` of a file that `mfvpr learn` wrote (InputError for other files)."""
-
-
-def named_weight(weight: Weight | str) -> Weight:
-    """The weight that a word or the path of a file stands for; any other weight as it is."""
-    if isinstance(weight, str) and weight not in NAMED_WEIGHTS:
-        raise InputError(f"weight={weight!r}: expected one of {', '.join(NAMED_WEIGHTS)}, or FILE{SUFFIX}")
-    return NAMED_WEIGHTS[weight] if isinstance(weight, str) else weight

@@ -165,21 +165,15 @@ def _shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
     return a123 / size, -a023 / size, a013 / size
 
 
-def miss(model: Array, points: Array, threshold: Array) -> tuple[Array, Array]:
-    """Squared distance of H p1 from p0, and squared threshold, times the squared last coordinate of H p1.
+def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
+    """Whether the distance of H p1 from p0 is at most the threshold.
 
     Either models `[9, ...]` and one match `[4]`, or one model and matches `[K, 4]`.
     """
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
-    u, v, limit = u - x0 * w, v - y0 * w, threshold * w
-    return u * u + v * v, limit * limit
-
-
-def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
-    """Whether the distance of H p1 from p0 is at most the threshold; shapes as in `miss`."""
-    error, limit = miss(model, points, threshold)
-    return error <= limit
+    u, v, limit = u - x0 * w, v - y0 * w, threshold * w  # both sides times the last coordinate of H p1
+    return u * u + v * v <= limit * limit
 
 
 def least_squares(

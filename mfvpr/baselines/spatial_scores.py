@@ -138,16 +138,16 @@ class LostScore:
     and matches by channels and semantic labels.
 
     If all distances are equal, for instance of a single match, v is 0 and L infinite, so that s = 0. Two matches are
-    always perfect: with few matches the score says little. 1 - cos and the `described` L are at least 1e-12; 1 - cos is
-    1 if all positions with a weight are 0.
+    always perfect: with few matches the score says little. 1 - cos is at least 1e-12, and 1 if all positions with a
+    weight are 0.
 
     Attributes:
         form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, LoST's program without descriptors of
-            points; `described` is sum |x1 - x0| distance^2 / 2, as the paper describes LoST: more matches score worse.
+            points.
         mirrored: count the query's x from the right, W - 1 - x, for images with opposite viewing directions.
     """
 
-    form: str = setting("weighted", one_of("weighted", "unweighted", "described"), static=True)
+    form: str = setting("weighted", one_of("weighted", "unweighted"), static=True)
     mirrored: bool = setting(False, FLAG, "views from opposite directions", static=True)
 
     __post_init__ = check_fields
@@ -159,10 +159,7 @@ class LostScore:
         if self.mirrored:
             x0 = masked(image_sizes(matches)[0][:1] - 1 - x0, matches.mask)
         distance = masked(at_least_single(matches.distance), matches.mask)
-        if self.form == "described":
-            agreement = jnp.any(confidence > 0).astype(confidence.dtype)
-            difference = jnp.sum(confidence * jnp.abs(x1 - x0) * distance**2 / 2)
-        elif self.form == "unweighted":
+        if self.form == "unweighted":
             agreement, difference = jnp.sum(confidence), _cosine_distance(x0, x1, confidence)
         else:
             real = confidence > 0

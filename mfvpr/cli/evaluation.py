@@ -15,8 +15,8 @@ from mfvpr.evaluation import Confidence, System, rank_dataset, read_confidences
 from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
-from mfvpr.report.figures import query_figures, reliability_figures
-from mfvpr.report.run_files import RunDescription, ground_truth, heading, parameters, write_run_folder
+from mfvpr.report.figures import query_figures
+from mfvpr.report.run_files import RunDescription, ground_truth, heading, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.systems import assembly
 from mfvpr.utils import Stopwatch
@@ -71,18 +71,15 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport(ranked, inputs.thresholds, settings.recall.ks, confidences, settings.threshold, lacking)
-    figures = query_figures(report, figure_queries) + (reliability_figures(report) if figure_queries else [])
     values, scorers = to_values(settings), assembly.describe_settings(settings.scorer)
     description = RunDescription(
-        {"retrieval": settings.retrieval, "features": settings.features, "matching": settings.matching},
-        parameters(system.final_scores.values(), scorers, values["fusion"]),
         inputs.ground_truth,
         truth_in_words(inputs.ground_truth),
         inputs.contents,
         {name: values[name] for name in _NAMES} | {"scorer": scorers},
         settings.command,
     )
-    return Outcome(inputs, report, description, figures)
+    return Outcome(inputs, report, description, query_figures(report, figure_queries))
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:

@@ -1,4 +1,9 @@
-"""Scores of the candidates of one query, by one scorer or by a grid of its parameters: `lax.map` around `vmap`."""
+"""Scores of the candidates of one query, by one scorer or by a grid of its parameters: `lax.map` around `vmap`.
+
+sigma=[10, 20] of a grid is an axis (`_axis`), becomes rows of settings (`_product`), which are grouped by the capacity
+that they need (`by_capacity`); one program per group (`_score_settings`) puts the sigma of each row into the scorer
+(`with_parameters`), and calls it.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,7 +39,7 @@ from mfvpr.utils.numerics import available_cpus, compiled, device_of, holds_func
 
 Tree = TypeVar("Tree")
 BIN_STEP = 8  # capacities of histograms are multiples of it
-WEIGHTINGS = ("weight", "max_distance")  # axes that only change how much a match counts
+MATCH_AXES = ("weight", "max_distance")  # axes that only change how much a match counts
 
 
 def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " candidates"]:
@@ -85,10 +90,10 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     if weights:
         scorer = replace(scorer, weight=ChosenWeight(weights, 0))
     plain, scorer = holds_function(scorer), with_static_functions(scorer)
-    inner = [name for name in values if name in WEIGHTINGS]
-    outer = [name for name in values if name not in WEIGHTINGS]
-    settings, weightings = _product(values, outer), _product(values, inner)
-    rows = int(np.prod([len(values[name]) for name in outer]))
+    match_axes = [name for name in values if name in MATCH_AXES]
+    scorer_axes = [name for name in values if name not in MATCH_AXES]
+    settings, weightings = _product(values, scorer_axes), _product(values, match_axes)
+    rows = int(np.prod([len(values[name]) for name in scorer_axes]))
     groups = fit_to_sizes(partial(by_capacity, scorer, settings, rows), matches)
     on_cpu = device_of(matches).platform == "cpu"
 
@@ -106,7 +111,7 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     # On a CPU, single operations of JAX would wait for its queue; elsewhere NumPy would wait for the device.
     xp: Any = np if on_cpu and is_concrete(scores) else jnp
     order = np.argsort(np.concatenate([part for _, part in groups]))
-    names = outer + inner
+    names = scorer_axes + match_axes
     scores = xp.concatenate(scores)[order].reshape(*(len(values[name]) for name in names), -1)
     return jnp.asarray(xp.moveaxis(scores, range(len(names)), [list(axes).index(name) for name in names]))
 
@@ -252,7 +257,7 @@ def check_candidates(scorer: Any, matches: Matches) -> None:
         )
 
 
-def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = WEIGHTINGS) -> None:
+def refuse_own_names(scorer: Any, names: Iterable[str], reserved: Iterable[str] = MATCH_AXES) -> None:
     """Raise an InputError if a number of the scorer has the name of an axis with another meaning."""
     for name in {*names} & {*numbers_by_name(scorer)} & {*reserved}:
         raise InputError(f"{type(scorer).__name__}.{name}: a grid means something else by {name}; rename the field")

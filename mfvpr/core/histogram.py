@@ -202,8 +202,8 @@ class HistogramOfShifts:
         return needed
 
     def _fit_to(self, matches: Matches) -> "HistogramOfShifts":
-        """With the capacity that one pair needs, before `jit` hides its sizes."""
-        if is_concrete(matches) and not np.asarray(matches.mask).any():  # the sizes may be anything
+        """`fit_capacity` to one pair, before `jit` hides its sizes; without matches they may be anything."""
+        if is_concrete(matches) and not np.asarray(matches.mask).any():
             return replace(self, max_bins=self.max_bins or min(self._count_bins(*image_sizes(matches)), MAX_BINS))
         return self.fit_capacity(matches.image_size0, matches.image_size1)
 
@@ -217,7 +217,7 @@ class HistogramOfShifts:
         return capacity
 
     def _bin_range(self, image_size0: Array, image_size1: Array, dtype: Any, xp: Any) -> tuple[Array, Array]:
-        """Center of the first bin and number of bins, `[..., 2]` (x, y), in NumPy or JAX (`xp`)."""
+        """Center of the first bin and number of bins, `[..., 2]` (x, y): by NumPy for a capacity, else by JAX."""
         lower, upper = -xp.asarray(image_size0, dtype=dtype), xp.asarray(image_size1, dtype=dtype)
         if self.direction == "query_minus_candidate":
             lower, upper = -upper, -lower
@@ -263,7 +263,7 @@ class _Bins:
     """Shifts of one pair, the bins that they vote for, and the width of the votes, px."""
 
     shifts: Float[Array, "2 slots"]  # (x, y)
-    first: Float[Array, "2"]  # center (x, y) of the first bin
+    first_center: Float[Array, "2"]  # (x, y), of the first bin
     num_bins: Float[Array, "2"]
     bin_size: Float[Array, ""]
     deviation: Float[Array, ""]  # sigma of equation 1
@@ -273,11 +273,11 @@ class _Bins:
     @property
     def index(self) -> Float[Array, " bins"]:
         """Numbers of bins along an axis."""
-        return jnp.arange(self.capacity, dtype=self.first.dtype)
+        return jnp.arange(self.capacity, dtype=self.first_center.dtype)
 
     def centers(self, axis: int, index: Array) -> Array:
         """Centers of bins along an axis, px, by bin number."""
-        return self.first[axis] + index * self.bin_size
+        return self.first_center[axis] + index * self.bin_size
 
     def votes(self, axis: int) -> Float[Array, "bins slots"]:
         """Votes exp(-d^2 / (2 sigma^2)) of the shifts along one axis, without weights."""

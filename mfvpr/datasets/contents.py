@@ -27,7 +27,7 @@ SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks e
 
 @dataclass(frozen=True)
 class Content:
-    """Hash and header of one file, see `mfvpr.datasets.image_reading.read_header`."""
+    """Hash and header (`read_header`) of one file."""
 
     sha256: str = ""  # of all bytes; "" = the file cannot be read
     orientation: int = 1
@@ -65,7 +65,7 @@ class Contents:
         return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, int | bool | None]:
-        """Conversions of the images when they are read: numbers of turned and of scaled images, for results."""
+        """Numbers of images that are turned and scaled when they are read, for results."""
         largest = [file.largest for file in self.files if file.largest is not None]
         return {
             "orient": self.folder.orient,
@@ -90,14 +90,13 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
     path = None if cache is None else Path(cache) / name
     records: dict[str, list[Any]] = {}  # state and content of files by name
     start = time.time_ns()
-    if path is not None:
-        with suppress(OSError, ValueError):  # missing or damaged
-            records = json.loads(path.read_text(encoding="ascii"))
+    with suppress(OSError, ValueError):  # missing or damaged
+        records = {} if path is None else json.loads(path.read_text(encoding="ascii"))
     states = dict(zip(folder.names, map(state_of, folder.paths), strict=True))
-    unchanged = {name for name, state in states.items() if state and name in records and records[name][:4] == state}
-    changed = [name for name in folder.names if name not in unchanged]
+    changed = [name for name, state in states.items() if not state or records.get(name, [])[:4] != state]
     new = ordered_map(read_content, [folder.root / name for name in changed], workers=2)
-    files = {name: Content(*records[name][4:]) for name in unchanged} | dict(zip(changed, new, strict=True))
+    files = dict(zip(changed, new, strict=True))
+    files |= {name: Content(*records[name][4:]) for name in states if name not in files}
     if path is not None and changed:  # records of other files of this folder, from other data sets, stay
         settled = {name: state for name, state in states.items() if state and max(state[1:3]) < start - SETTLED}
         records |= {name: [*state, *astuple(files[name])] for name, state in settled.items()}
@@ -124,8 +123,8 @@ def own_rows(queries: Contents, database: Contents) -> OwnRows:
     """
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
-        if file.sha256:
-            rows[file.sha256].append(row)
+        rows[file.sha256].append(row)
+    rows[""] = []  # files that cannot be read
     return tuple(tuple(rows.get(file.sha256, ())) for file in queries.files)
 
 

@@ -188,7 +188,7 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
     """
     root, names = Path(root), []
     if not root.is_dir():
-        got = "a file" if os.path.lexists(root) else "nothing"
+        got = "a file" if root.exists() else "nothing"
         raise InputError(f"{root}: expected a folder of images, got {got}; check the path")
     if bits is not None and not 8 <= bits <= 16:
         raise InputError(f"bits={bits}: expected from 8 to 16 bits in use, or none")
@@ -209,9 +209,9 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
     if not names:
         raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
 
-    def natural(name: str) -> tuple[list[tuple[int, int, str]], str]:  # runs of digits compare as numbers
+    def natural(name: str) -> tuple[list[tuple[int, str]], str]:  # runs of digits compare as numbers of any length
         parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-        return [(1, len(part), part) if place % 2 else (0, 0, part) for place, part in enumerate(parts)], name
+        return [(place % 2 and len(part), part) for place, part in enumerate(parts)], name
 
     return ImageFolder(root, tuple(sorted(names, key=natural)), orient, bits)
 

@@ -38,7 +38,7 @@ _reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets
 
 
 class Truth(ABC):
-    """The correct database images of each query, as a base class for ground truth of your own.
+    """The correct database images of each query; a base class for ground truth of your own.
 
     Example:
         data.truth.positives(2).of(5)  # database rows within 2 frames of query 5
@@ -108,12 +108,11 @@ class FrameTruth(Truth):
     def positives(self, threshold: float) -> Positives:
         """Correct database images at a tolerance in frames, inclusive."""
         tolerance = int(min(threshold, self.num_database)) if self.widened else 0
-        correct = []
-        for rows in self.rows:
-            drives = [(row, *self._drive(row)) for row in rows]
-            near = (range(max(row - tolerance, first), min(row + tolerance + 1, last)) for row, first, last in drives)
-            correct.append([*chain(*near)])
-        return Positives.from_rows(correct, self.num_database)
+        near = {}  # rows within the tolerance of a row, in its drive
+        for row in {*chain(*self.rows)}:
+            first, last = self._drive(row)
+            near[row] = range(max(row - tolerance, first), min(row + tolerance + 1, last))
+        return Positives.from_rows(([*chain(*(near[row] for row in rows))] for rows in self.rows), self.num_database)
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
         """Frames to the nearest of the query's rows."""
@@ -212,7 +211,7 @@ class AllowedTruth(Truth):
 def require_positions(where: str, xy: np.ndarray, count: int) -> None:
     """Raise an InputError unless there is a position in meters for each of `count` images."""
     if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
-        got = f"shape {list(xy.shape)}" if xy.shape != (count, 2) else f"{np.abs(xy).max():g} m"
+        got = f"{[*xy.shape]} up to {np.abs(xy).max(initial=0):g} m"
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
 
 
@@ -222,16 +221,14 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
     for names in (query_names, database_names):
         positions = []
         for name in names:
-            parts = PurePosixPath(name).name.split("@")[1:3]  # folders may contain '@' as well
-            try:
-                easting, northing = map(parse_number, parts)
-                if not abs(easting) + abs(northing) <= FARTHEST:  # NaN neither
-                    raise ValueError
+            try:  # folders may contain '@' as well
+                easting, northing = map(parse_number, PurePosixPath(name).name.split("@")[1:3])
             except ValueError:
-                expected = f"a name like @easting@northing@..., in meters up to {FARTHEST:g}"
-                raise InputError(f"{name}: expected {expected}; or choose another ground truth") from None
+                mend = "or choose another ground truth"
+                raise InputError(f"{name}: expected a name like @easting@northing@..., in meters; {mend}") from None
             positions.append((easting, northing))
         sides.append(np.array(positions))
+        require_positions("positions in names", sides[-1], len(names))
     return RadiusTruth(*sides)
 
 
@@ -251,8 +248,8 @@ def truth_from_labels(
         for number, (name, label) in enumerate(lines, start=1):
             row = table.get(name.strip())
             if row is None or row in labels:
-                got = f"{shorten(name)!r} {'again' if row in labels else ', which none or several have'}"
-                raise InputError(f"{path}: entry {number}: expected the path of an image, each once, got {got}")
+                expected = "the path of one image, each once"
+                raise InputError(f"{path}: entry {number}: expected {expected}, got {shorten(name)!r}")
             labels[row] = label.strip()
         sides.append(require_all(path, names, [labels.get(row) for row in range(len(names))], _LINES))
     numbers = {"": -1} | {label: number for number, label in enumerate(sorted({*sides[0], *sides[1]} - {""}))}
@@ -284,13 +281,11 @@ def truth_from_file(
         elif path.suffix.lower() == ".npz":
             arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
             if {"utmQ", "utmDb"} <= arrays.keys():
-                query_xy, database_xy = (arrays[name].astype(np.float64) for name in ("utmQ", "utmDb"))
-                require_positions("utmQ", query_xy, len(query_names))
-                require_positions("utmDb", database_xy, len(database_names))
-                return RadiusTruth(query_xy, database_xy)
+                for name, names in (("utmQ", query_names), ("utmDb", database_names)):
+                    require_positions(name, arrays[name], len(names))
+                return RadiusTruth(arrays["utmQ"].astype(np.float64), arrays["utmDb"].astype(np.float64))
             if not {"query", "database"} <= arrays.keys():
-                got = shorten(", ".join(arrays)) or "neither"
-                raise InputError(f"expected arrays query and database, or utmQ and utmDb; got {got}")
+                raise InputError("expected arrays query and database, or utmQ and utmDb, got neither")
             content = list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
         else:
             raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}")

@@ -55,33 +55,32 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             Pillow's conversion: gray is cut off at 255, of color the upper 8 of 16 bits are kept.
 
     Raises:
-        InputError: not a regular file, empty, not an image of a format in `FORMATS`, truncated, over 64 megapixels
-            (checked before decoding), or of 32 bits a channel, whose range is unknown (unless `bits` is None).
-            Every damage to a PNG file is noticed by its checksums; other formats have none, so that a flipped bit may
-            change pixels.
+        InputError: not an image file of a format in `FORMATS`, truncated, over 64 megapixels (checked before decoding),
+            or of 32 bits a channel, whose range is unknown (unless `bits` is None). Every damage to a PNG file is
+            noticed by its checksums; other formats have none, so that a flipped bit may change pixels.
     """
     path = Path(path)
-    with reading(path, "an image file", "replace or remove it"):
-        if path.stat().st_size == 0:
-            raise InputError("expected an image file, got 0 bytes; replace or remove it")
-        limit = f"expected at most {MAX_PIXELS // 10**6} megapixels"
-        try:
-            image = open_image(path)
-        except Image.DecompressionBombError:
-            raise InputError(f"{limit}, got several times as many; shrink the image") from None
-        with image:
-            if image.width * image.height > MAX_PIXELS:
-                raise InputError(f"{limit}, got {image.width} x {image.height} px; shrink the image")
-            used = _bits_in_use(image, bits)
-            if used is None and bits is not None and image.mode in ("I", "F"):
-                raise InputError("expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
-            orientation = _orientation(image)
-            rgb = _as_rgb(image, path, used)
-            if image.format == "TIFF":  # already turned by Pillow
-                orientation = 1 if orient else _INVERSE.get(orientation, orientation)
-            elif not orient:
-                orientation = 1
-            return np.asarray(rgb.transpose(_TURN[orientation]) if orientation in _TURN else rgb)
+    with reading(path, "an image file", "replace or remove it"), open_image(path) as image:
+        if image.width * image.height > MAX_PIXELS:
+            limit = f"at most {MAX_PIXELS // 10**6} megapixels"
+            raise InputError(f"expected {limit}, got {image.width} x {image.height} px; shrink the image")
+        used = _bits_in_use(image, bits)
+        if used is None and bits is not None and image.mode in ("I", "F"):
+            raise InputError("expected 8 or 16 bits a channel, got 32, of unknown range; convert it")
+        orientation, is_turned = _orientation(image), image.format == "TIFF"  # Pillow and OpenCV turn these
+        is_color = image.mode not in _GRAY
+        if used is None or (is_color and used == 16):  # Pillow takes the upper 8 of 16 bits of color
+            rgb = image.convert("RGB")
+        elif is_color and image.mode not in _COLOR:
+            raise ValueError(f"its 16 bits a channel are {image.mode}, not gray or RGB")
+        else:
+            values = _color_values(np.fromfile(path, np.uint8)) if is_color else np.asarray(image)
+            upper = np.clip(values.astype(np.int32), 0, 2**used - 1) >> (used - 8)
+            rgb = Image.fromarray(upper.astype(np.uint8)).convert("RGB")
+        if bool(orient) == is_turned:
+            return np.asarray(rgb)
+        turn = _INVERSE.get(orientation, orientation) if is_turned else orientation
+        return np.asarray(rgb.transpose(_TURN[turn]) if turn in _TURN else rgb)
 
 
 def read_size(path: Path | str, *, orient: bool = True) -> tuple[int, int]:
@@ -211,18 +210,6 @@ def _bits_in_use(image: ImageFile.ImageFile, bits: int | None) -> int | None:
     if raw == "I;12":
         return 12
     return bits if ";16" in raw else None
-
-
-def _as_rgb(image: Image.Image, path: Path, used: int | None) -> Image.Image:
-    """Convert to 8-bit RGB, as stored, except for TIFF files, which Pillow and OpenCV turn."""
-    is_color = image.mode not in _GRAY
-    if used is None or (is_color and used == 16):  # Pillow takes the upper 8 of 16 bits of color
-        return image.convert("RGB")
-    if is_color and image.mode not in _COLOR:
-        raise ValueError(f"its 16 bits a channel are {image.mode}, not gray or RGB")
-    values = _color_values(np.fromfile(path, np.uint8)) if is_color else np.asarray(image)
-    upper = np.clip(values.astype(np.int32), 0, 2**used - 1) >> (used - 8)
-    return Image.fromarray(upper.astype(np.uint8)).convert("RGB")
 
 
 def _color_values(content: np.ndarray) -> np.ndarray:

@@ -20,42 +20,28 @@ class Positives:
         positives = mfvpr.datasets.Positives.from_rows([[0, 1], [], [2]], num_database=4)  # or from_matrix
         positives.of(0)  # [0, 1]
 
-    `first | second` and `first - second` go query by query. Rows or offsets of another form raise an `InputError`.
+    `first | second` and `first - second` go query by query.
 
     Attributes:
-        rows: of all queries one after the other; ascending and distinct for each query. int32.
-        offsets: `[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`.
-        num_database: N.
+        matrix: sparse, `[Q, N]` bool, in SciPy's canonical form.
     """
 
-    rows: Int[np.ndarray, " _"]
-    offsets: Int[np.ndarray, " _"]
-    num_database: int
+    matrix: "scipy.sparse.csr_array"
 
     def __post_init__(self) -> None:
-        rows, offsets, last = self.rows, self.offsets, self.num_database - 1
-        is_in_range = not len(rows) or 0 <= rows.min() <= rows.max() <= last
-        if [*offsets[[0, -1]]] != [0, len(rows)] or (np.diff(offsets) < 0).any() or not is_in_range:
-            raise InputError(f"positives: expected rows from 0 to {last}, and offsets that grow from 0 to {len(rows)}")
-        is_ascending = rows[1:] > rows[:-1]
-        starts = offsets[(offsets > 0) & (offsets < len(rows))]
-        is_ascending[starts - 1] = True  # the first row of a query may be any
-        if not is_ascending.all():
-            raise InputError("positives: expected rows that ascend for each query; from_rows takes them in any order")
+        self.matrix.sum_duplicates()  # and sort each query's rows
 
     @classmethod
     def from_rows(cls, rows: Iterable[Sequence[int] | np.ndarray], num_database: int) -> "Positives":
         """Create from the rows of each query, in any order; an `InputError` unless they are rows of the database."""
         per_query = [np.asarray(query_rows) for query_rows in rows]
         flat = np.concatenate([query_rows for query_rows in per_query if len(query_rows)] or [np.zeros(0, np.int32)])
-        if flat.dtype.kind not in "iu":
-            raise InputError(f"positives: expected rows as whole numbers, got {flat.dtype}; from_matrix takes matrices")
-        if flat.size and not 0 <= flat.min() <= flat.max() < num_database:
-            got = f"{flat.min()} to {flat.max()}; check the ground truth"
+        if flat.dtype.kind not in "iu" or (flat.size and not 0 <= flat.min() <= flat.max() < num_database):
+            got = f"{flat.dtype} from {flat.min()} to {flat.max()}; from_matrix takes matrices"
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {got}")
         offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
         content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
-        return cls._from_csr(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
+        return cls(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> "Positives":
@@ -63,16 +49,26 @@ class Positives:
         matrix = np.asarray(matrix, bool)
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        return cls._from_csr(scipy.sparse.csr_array(matrix))
+        return cls(scipy.sparse.csr_array(matrix))
 
-    @classmethod
-    def _from_csr(cls, matrix: Any) -> "Positives":
-        matrix.sum_duplicates()  # and sort each query's rows
-        return cls(matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64), matrix.shape[1])
+    @property
+    def rows(self) -> Int[np.ndarray, " _"]:
+        """Rows of all queries one after the other; ascending and distinct for each query. int32."""
+        return self.matrix.indices.astype(np.int32, copy=False)
+
+    @property
+    def offsets(self) -> Int[np.ndarray, " _"]:
+        """`[Q + 1]` int64; query q has `rows[offsets[q] : offsets[q + 1]]`."""
+        return self.matrix.indptr.astype(np.int64, copy=False)
+
+    @property
+    def num_database(self) -> int:
+        """N."""
+        return self.matrix.shape[1]
 
     def __len__(self) -> int:
         """Number Q of queries."""
-        return len(self.offsets) - 1
+        return self.matrix.shape[0]
 
     @property
     def counts(self) -> Int[np.ndarray, " queries"]:
@@ -82,11 +78,12 @@ class Positives:
     def of(self, query: int) -> Int[np.ndarray, " _"]:
         """Rows of one query, ascending."""
         query = range(len(self))[query]
-        return self.rows[self.offsets[query] : self.offsets[query + 1]]
+        first, last = self.matrix.indptr[query : query + 2]
+        return self.matrix.indices[first:last].astype(np.int32, copy=False)
 
     def take(self, queries: Any) -> "Positives":
         """Select queries by numbers `[q]` in any order, a mask `[Q]`, or a slice."""
-        return self._from_csr(self._csr()[np.arange(len(self))[queries]])
+        return Positives(self.matrix[np.arange(len(self))[queries]])
 
     def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
         """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
@@ -98,40 +95,36 @@ class Positives:
             InputError: another number of queries, or rows beyond the database.
         """
         rows = np.asarray(rows)
-        if rows.ndim < 2 or rows.shape[-2] != len(self):
-            raise InputError(f"rows: expected shape [..., {len(self)} queries, k], got {list(rows.shape)}")
-        if rows.size and (rows.dtype.kind not in "iu" or rows.max() >= self.num_database):
-            got = f"{rows.dtype} up to {rows.max()}; rank images of this database"
-            raise InputError(f"rows: expected whole numbers below {self.num_database}, got {got}")
+        is_valid = rows.ndim >= 2 and rows.shape[-2] == len(self)
+        if not is_valid or (rows.size and (rows.dtype.kind not in "iu" or rows.max() >= self.num_database)):
+            expected = f"whole numbers [..., {len(self)} queries, k] below {self.num_database}"
+            got = f"{rows.dtype}{[*rows.shape]} up to {rows.max(initial=-1)}; rank images of this database"
+            raise InputError(f"rows: expected {expected}, got {got}")
         if not rows.size or not self.num_database:
             return np.zeros(rows.shape, bool)
         queries = np.broadcast_to(np.arange(len(self))[:, None], rows.shape)
-        is_correct = self._csr()[queries.ravel(), np.maximum(rows, 0).ravel()].reshape(rows.shape)
+        is_correct = self.matrix[queries.ravel(), np.maximum(rows, 0).ravel()].reshape(rows.shape)
         return np.asarray(is_correct) & (rows >= 0)
 
     def dense(self, queries: Any = slice(None)) -> Bool[np.ndarray, "_ database"]:
         """Matrix `[q, N]` of queries that are selected as in `take`; large data sets do not fit into memory."""
-        return self.take(queries)._csr().toarray()
+        return self.take(queries).matrix.toarray()
 
     def __or__(self, other: "Positives") -> "Positives":
-        return self._from_csr(self._csr() + other._csr())
+        return Positives(self.matrix + other.matrix)
 
     def __sub__(self, other: "Positives") -> "Positives":
-        return self._from_csr(self._csr() > other._csr())
-
-    def _csr(self) -> "scipy.sparse.csr_array":
-        content = np.ones(len(self.rows), bool), self.rows, self.offsets
-        return scipy.sparse.csr_array(content, shape=(len(self), self.num_database))
+        return Positives(self.matrix > other.matrix)
 
 
 def join_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries and databases of independent data sets."""
-    return Positives._from_csr(scipy.sparse.block_diag([part._csr() for part in parts], format="csr"))
+    return Positives(scipy.sparse.block_diag([part.matrix for part in parts], format="csr"))
 
 
 def stack_positives(parts: Sequence[Positives]) -> Positives:
     """Concatenate queries of the same database."""
-    return Positives._from_csr(scipy.sparse.vstack([part._csr() for part in parts], format="csr"))
+    return Positives(scipy.sparse.vstack([part.matrix for part in parts], format="csr"))
 
 
 def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:

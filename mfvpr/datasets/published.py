@@ -2,8 +2,10 @@
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
 from mfvpr.datasets.positives import rows_within
-from mfvpr.io.containers import parse_number, reading
+from mfvpr.io.containers import parse_number, reading, shorten
 from mfvpr.io.object_files import read_matlab, read_objects
 from mfvpr.utils.errors import InputError
 
@@ -41,6 +43,9 @@ train_val/cph/query, train_val/sf/database, train_val/sf/query  the same; or, as
 msls_val_dbImages.npy, msls_val_qImages.npy, msls_val_qIdx.npy, msls_val_pIdx.npy  instead of the tables"""
 
 
+Content = tuple[ImageFolder, ImageFolder, Truth]  # database, queries and ground truth of one sequence
+
+
 @dataclass(frozen=True)
 class Published:
     """A published data set."""
@@ -50,7 +55,7 @@ class Published:
     layout: str  # contents of its folder, in lines
     database: int  # published number of database images
     queries: Mapping[str, int]  # published numbers of queries, by sequence
-    read: Callable[..., Dataset]  # `read(folder, name)`, with the keyword `seasons` if it has seasons
+    read: Callable[..., Content | Dataset]  # `read(folder)`, with the keyword `seasons` if it has seasons
     source: str
     folders: tuple[str, ...]  # possible names of its folder below a folder of data sets: its own, its archive's
     seasons: tuple[str, str] | None = None  # default (database, queries) if seasons can be chosen
@@ -73,9 +78,13 @@ def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] |
         raise InputError(f"seasons={list(seasons)}: expected two of {', '.join(SEASONS)}")
     options = {} if entry.seasons is None else {"seasons": seasons or entry.seasons}
     try:
-        return entry.read(root, name, **options)
+        result = entry.read(root, **options)
     except InputError as error:
         raise InputError(f"{error} (layout: mfvpr data list {name})") from error
+    if isinstance(result, Dataset):
+        return result
+    database, queries, truth = result
+    return Dataset(name, database, (QuerySequence(name, queries, truth),))
 
 
 def published_differences(dataset: Dataset) -> Iterator[str]:
@@ -93,53 +102,55 @@ def published_differences(dataset: Dataset) -> Iterator[str]:
             yield f"{got:,} queries in {sequence.name} where {number:,} are published"
 
 
-def ssm_vpr(root: Path, name: str) -> Dataset:
+def ssm_vpr(root: Path) -> Content:
     """A data set of SSM-VPR (Camara and Preucil, 2020), which the paper uses as well: two folders and a table."""
     database, queries = image_folder(root / "Reference"), image_folder(root / "Live")
     for images in (database, queries):
         for row, image in enumerate(images.names):  # the table has the numbers at the ends of the names
             if not re.search(rf"(^|\D)0*{row}$", PurePosixPath(image).stem):
                 raise InputError(f"{images.root}: expected images numbered from 0 without gaps, got {image}")
-    truth = truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
-    return _dataset(name, database, queries, truth)
+    return database, queries, truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
 
 
-def nordland(root: Path, name: str, *, seasons: tuple[str, str]) -> Dataset:
-    """Equal frames of two seasons; each folder of the database is a drive.
-
-    Patch-NetVLAD's and gmberton's 27,592 are every frame but tunnels and stations, correct within 10 frames; the 3,450
-    of Olid, Facil and Civera (2018) are two sections, correct within 2 frames of the same section.
-    """
+def nordland_27592(root: Path, seasons: tuple[str, str]) -> Content:
+    """Patch-NetVLAD's and gmberton's: every frame but tunnels and stations, correct within 10 frames."""
     folders = []
     for season, side in zip(seasons, ("index", "query"), strict=True):
-        origin = root / f"nordland_imageNames_{side}.txt"
-        images = root / (season if name == "nordland_27592" else f"{season}_images_test")
-        if name == "nordland_27592" and origin.exists():  # its names begin with other folders
-            folders.append(listed_images(images, [PurePosixPath(line).name for line in _lines(origin)], origin))
+        listed = root / f"nordland_imageNames_{side}.txt"
+        if listed.exists():  # its names begin with other folders
+            names = [PurePosixPath(line).name for line in _lines(listed)]
+            folders.append(listed_images(root / season, names, listed))
         else:
-            folders.append(image_folder(images))
-    database, queries = folders
-    stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in folders]
+            folders.append(image_folder(root / season))
+    return equal_frames(*folders)
+
+
+def nordland_3450(root: Path, seasons: tuple[str, str]) -> Content:
+    """The test part of Olid, Facil and Civera (PPNIV 2018): two sections, correct within 2 frames of the same."""
+    return equal_frames(*(image_folder(root / f"{season}_images_test") for season in seasons))
+
+
+def equal_frames(database: ImageFolder, queries: ImageFolder) -> Content:
+    """Frames of equal names show the same place; each folder of the database is a drive."""
+    stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in (database, queries)]
     if stems[0] != stems[1]:
-        differing = next((stem for pair in zip(*stems, strict=False) for stem in pair if pair[0] != pair[1]), None)
-        got = f"{len(queries):,} and {len(database):,} frames" + (f", first {differing} alone" if differing else "")
+        alone = sorted({*stems[0]} ^ {*stems[1]})
+        got = f"{len(queries):,} and {len(database):,} frames, first {alone[0]} alone"
         raise InputError(f"{queries.root}: expected the frames of {database.root}, got {got}; get the whole data set")
     drives = [stem.parent for stem in stems[0]]
     starts = tuple(row for row in range(1, len(drives)) if drives[row] != drives[row - 1])
-    truth = FrameTruth(tuple((row,) for row in range(len(queries))), len(database), starts=starts)
-    return _dataset(name, database, queries, truth)
+    return database, queries, FrameTruth(tuple((row,) for row in range(len(queries))), len(database), starts=starts)
 
 
-def nordland_vprbench(root: Path, name: str) -> Dataset:
+def nordland_vprbench(root: Path) -> Content:
     """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame."""
     database, queries = image_folder(root / "ref"), image_folder(root / "query")
     if 10 * (len(queries) - 1) >= len(database):
         raise InputError(f"{root}: expected 10 database images per query, got {len(database)} for {len(queries)}")
-    truth = FrameTruth(tuple((10 * row,) for row in range(len(queries))), len(database))
-    return _dataset(name, database, queries, truth)
+    return database, queries, FrameTruth(tuple((10 * row,) for row in range(len(queries))), len(database))
 
 
-def robotcar_seasons(root: Path, name: str) -> Dataset:
+def robotcar_seasons(root: Path) -> Dataset:
     """Oxford RobotCar Seasons (Sattler et al., CVPR 2018), version 2, as in the paper.
 
     Images are those of the rear camera with public positions: summer is the database, seven other conditions are the
@@ -152,103 +163,88 @@ def robotcar_seasons(root: Path, name: str) -> Dataset:
         poses = np.array([words[1:] for words in lines], np.float64).reshape(len(lines), 4, 4)
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
             raise ValueError("numbers that are no pose")
-    centers: dict[str, np.ndarray] = {}
-    for (image, *_), center in zip(lines, poses[:, :3, 3], strict=True):
-        image = PurePosixPath(image).with_suffix(".jpg").as_posix()
-        if not np.array_equal(centers.setdefault(image, center), center):
-            raise InputError(f"{path}: expected one pose of {image}, got another; get the file again")
-    sides = {}
-    for condition in (REFERENCE, *CONDITIONS):
-        names = sorted(image for image in centers if image.startswith(f"{condition}/rear/"))
-        if not names:
-            raise InputError(f"{path}: expected poses of {condition}/rear, got none; use the file of the data set")
-        sides[condition] = names, np.array([centers[image] for image in names])
-    database, places = sides.pop(REFERENCE)
+    images = (PurePosixPath(words[0]).with_suffix(".jpg").as_posix() for words in lines)
+    centers = dict(zip(images, poses[:, :3, 3], strict=True))
+    sides = {
+        condition: sorted(image for image in centers if image.startswith(f"{condition}/rear/"))
+        for condition in (REFERENCE, *CONDITIONS)
+    }
+    if empty := [condition for condition, names in sides.items() if not names]:
+        raise InputError(f"{path}: expected poses of {empty[0]}/rear, got none; use the file of the data set")
+    database = listed_images(root / "images", sides.pop(REFERENCE), path)
+    places = np.array([centers[image] for image in database.names])
     sequences = []
-    for condition, (names, positions) in sides.items():
-        distances = np.linalg.norm(positions[:, None] - places, axis=-1)
+    for condition, names in sides.items():
+        distances = np.linalg.norm(np.array([centers[image] for image in names])[:, None] - places, axis=-1)
         near = np.flatnonzero(distances.min(axis=1) <= 5.0).tolist()
         truth = FrameTruth(tuple((int(distances[query].argmin()),) for query in near), len(database))
         queries = listed_images(root / "images", [names[query] for query in near], path)
         sequences.append(QuerySequence(condition, queries, truth))
-    return Dataset(name, listed_images(root / "images", database, path), tuple(sequences))
+    return Dataset("robotcar_seasons", database, tuple(sequences))
 
 
-def pitts30k(root: Path, name: str) -> Dataset:
+def pitts30k(root: Path, name: str) -> Content:
     """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016).
 
     Database images are correct within a radius of the query, or within the lists' 25 m.
     """
     structures = [path for path in (root / f"datasets/{name}.mat", root / f"{name}.mat") if path.exists()]
-    if structures:
-        with (
-            reading(structures[0], mend=f"expected the structure dbStruct of {name}"),
-            structures[0].open("rb") as file,
-        ):
-            arrays = read_matlab(file, text=True)
-            names, positions = [], []
-            for images, xy in (("dbImageFns", "utmDb"), ("qImageFns", "utmQ")):
-                cells = [path for path in arrays if path.startswith(f"dbStruct.{images}.")]  # in order
-                names.append([str(arrays[path]) for path in cells])
-                positions.append(arrays[f"dbStruct.{xy}"].T.astype(np.float64))
-                require_positions(xy, positions[-1], len(cells))
-        database = listed_images(root, names[0], structures[0])
-        queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], structures[0])
-        return _dataset(name, database, queries, RadiusTruth(positions[1], positions[0]))
-    lists = [root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "gt_25m", "gt")]
-    database, queries, *truths = [path if path.exists() else None for path in lists]
-    truth = truths[0] or truths[1]
-    if database is None or queries is None or truth is None:
-        raise InputError(
-            f"{root}: expected datasets/{name}.mat, or {name}_dbImages.npy, {name}_qImages.npy and {name}_gt.npy, "
-            "found neither; get the whole data set"
-        )
-    return _dataset_of_lists(root, name, database, queries, truth)
+    if not structures:
+        truths = [path for path in (root / f"{name}_gt_25m.npy", root / f"{name}_gt.npy") if path.exists()]
+        if not truths:
+            raise InputError(
+                f"{root}: expected datasets/{name}.mat, or lists {name}_gt.npy ...; get the whole data set"
+            )
+        return content_of_lists(root, root / f"{name}_dbImages.npy", root / f"{name}_qImages.npy", truths[0])
+    names, positions = [], []
+    with reading(structures[0], mend=f"expected the structure dbStruct of {name}"), structures[0].open("rb") as file:
+        arrays = read_matlab(file, text=True)
+        for images, xy in (("dbImageFns", "utmDb"), ("qImageFns", "utmQ")):
+            names.append([str(text) for path, text in arrays.items() if path.startswith(f"dbStruct.{images}.")])
+            positions.append(arrays[f"dbStruct.{xy}"].T.astype(np.float64))
+            require_positions(xy, positions[-1], len(names[-1]))
+    database = listed_images(root, names[0], structures[0])
+    queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], structures[0])
+    return database, queries, RadiusTruth(positions[1], positions[0])
 
 
-def msls_val(root: Path, name: str) -> Dataset:
+def msls_val(root: Path) -> Content:
     """The validation part of Mapillary Street-Level Sequences (Warburg et al., CVPR 2020), without panoramas.
 
     Queries have a database image within 25 m, as in its own code.
     """
-    lists = [root / f"{name}_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
+    lists = [root / f"msls_val_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
     if any(path.exists() for path in lists):
-        return _dataset_of_lists(root, name, *lists)
+        return content_of_lists(root, *lists)
     flags = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
-    names, places = {}, {}
-    for side in ("database", "query"):
-        names[side], positions = [], []
-        for folder in (root / "train_val" / city / side for city in CITIES):
-            tables = {}
-            for each in ("raw", "postprocessed", "subtask_index"):
-                path = folder / f"{each}.csv"
-                with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
-                    lines = list(csv.DictReader(file))
-                tables[each] = {line.get("key", ""): line for line in lines}
-                if len(tables[each]) < len(lines):
-                    got = f"{len(tables[each])} in {len(lines)} lines"
-                    raise InputError(f"{path}: expected a different key in every line, got {got}")
-            raw, processed, tasks = tables.values()
-            if not raw.keys() == processed.keys() == tasks.keys():
-                raise InputError(f"{folder}: expected the same keys in raw, postprocessed and subtask_index.csv")
-            with reading(folder / "postprocessed.csv", mend="expected pano, all (True or False), easting, northing"):
-                for key, line in processed.items():
-                    if flags[tasks[key]["all"].lower()] and not flags[raw[key]["pano"].lower()]:
-                        names[side].append(f"train_val/{folder.parent.name}/{side}/images/{key}.jpg")
-                        positions.append([parse_number(line["easting"]), parse_number(line["northing"])])
-        places[side] = np.array(positions, np.float64).reshape(-1, 2)
-        require_positions(f"{root}: {side}", places[side], len(names[side]))
+    names, positions = {"database": [], "query": []}, {"database": [], "query": []}
+    for side, city in product(names, CITIES):
+        folder, tables = root / "train_val" / city / side, []
+        for table in ("postprocessed", "raw", "subtask_index"):
+            path = folder / f"{table}.csv"
+            with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
+                tables.append({line["key"]: line for line in csv.DictReader(file)})
+        mend = "expected equal keys in all three tables, and pano, all (True or False), easting, northing"
+        with reading(folder / "postprocessed.csv", mend=mend):
+            processed, raw, tasks = tables
+            for key, line in processed.items():
+                if flags[tasks[key]["all"].lower()] and not flags[raw[key]["pano"].lower()]:
+                    names[side].append(f"train_val/{city}/{side}/images/{key}.jpg")
+                    positions[side].append([parse_number(line["easting"]), parse_number(line["northing"])])
+    places = {side: np.array(xy, np.float64).reshape(-1, 2) for side, xy in positions.items()}
+    for side, xy in places.items():
+        require_positions(f"{root}: {side}", xy, len(names[side]))
     near = rows_within(places["query"], places["database"], 25.0)
     rows = [row for row, database_rows in enumerate(near) if len(database_rows)]
-    images = listed_images(root, names["database"], root / "train_val")
+    database = listed_images(root, names["database"], root / "train_val")
     queries = listed_images(root, [names["query"][row] for row in rows], root / "train_val")
-    return _dataset(name, images, queries, RadiusTruth(places["query"][rows], places["database"]))
+    return database, queries, RadiusTruth(places["query"][rows], places["database"])
 
 
-def _dataset_of_lists(
-    root: Path, name: str, database_list: Path, query_list: Path, truth_list: Path, selection_list: Path | None = None
-) -> Dataset:
-    """Data set from the lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
+def content_of_lists(
+    root: Path, database_list: Path, query_list: Path, truth_list: Path, selection_list: Path | None = None
+) -> Content:
+    """Content from the lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
 
     `selection_list` has the rows of `query_list` that are queries; None = all.
     """
@@ -259,26 +255,18 @@ def _dataset_of_lists(
     if len(rows) != len(names):
         raise InputError(f"{truth_list}: expected rows of {len(names)} queries, got {len(rows)}")
     truth = FrameTruth(tuple(rows), len(database), widened=False)
-    return _dataset(name, database, listed_images(root, names, query_list), truth)
+    return database, listed_images(root, names, query_list), truth
 
 
-def _dataset(name: str, database: ImageFolder, queries: ImageFolder, truth: Truth) -> Dataset:
-    return Dataset(name, database, (QuerySequence(name, queries, truth),))
-
-
-def listed_images(root: Path, names: Iterable[str], origin: Path) -> ImageFolder:
+def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder:
     """The images below `root` with the names of a list; `origin` is the list, for messages."""
-    names = tuple(names)
     if not names or len({*names}) < len(names):
         raise InputError(f"{origin}: expected every image once, got {len(names) - len({*names})} twice of {len(names)}")
-    for name in names:
-        if name.startswith("/") or ".." in name.split("/"):
-            raise InputError(f"{origin}: expected names below {root}, got {name}")
     missing = [name for name in names if not (root / name).is_file()]
     if missing:
         got = f"{len(missing):,} of the {len(names):,} images of {origin.name} are missing, the first is {missing[0]}"
         raise InputError(f"{root}: {got}; get the whole data set")
-    return ImageFolder(root, names)
+    return ImageFolder(root, tuple(names))
 
 
 def read_names(path: Path) -> list[str]:
@@ -297,14 +285,10 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         file.seek(0)
         lists = read_objects(file, "lists of rows") if is_pickle else np.lib.format.read_array(file, allow_pickle=False)
         per_query = [np.asarray(rows).reshape(-1) for rows in lists]
-        if num_database > 2 and all(len(rows) == num_database and set(rows) <= {0, 1} for rows in per_query):
-            raise InputError(f"{path}: expected the rows of each query's database images, got flags")
     for query, rows in enumerate(per_query):
-        if rows.size and rows.dtype.kind not in "iu":
-            raise InputError(f"{path}: expected lists of rows, got {rows.dtype}")
-        if rows.size and not 0 <= rows.min() <= rows.max() < num_database:
+        if rows.size and not (rows.dtype.kind in "iu" and 0 <= rows.min() <= rows.max() < num_database):
             expected = f"rows from 0 to {num_database - 1}"
-            raise InputError(f"{path}: query {query}: expected {expected}, got {rows.min()} to {rows.max()}")
+            raise InputError(f"{path}: query {query}: expected {expected}, got {rows.dtype} {shorten(str(rows))}")
     return [tuple(rows.tolist()) for rows in per_query]
 
 
@@ -330,10 +314,10 @@ _ENTRIES = (
         )
     ),
     Published("nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)", LAYOUT_27592,
-              27_592, {"nordland_27592": 27_592}, nordland, "https://github.com/QVPR/Patch-NetVLAD",
+              27_592, {"nordland_27592": 27_592}, nordland_27592, "https://github.com/QVPR/Patch-NetVLAD",
               ("nordland_27592", "nordland"), _SEASONS),
     Published("nordland_3450", "Nordland, the test part of Olid, Facil and Civera", LAYOUT_3450, 3450,
-              {"nordland_3450": 3450}, nordland, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
+              {"nordland_3450": 3450}, nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
               ("nordland_3450",), _SEASONS),
     Published("nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", LAYOUT_VPRBENCH,
               27_592, {"nordland_vprbench": 2760}, nordland_vprbench,
@@ -344,7 +328,7 @@ _ENTRIES = (
               ("robotcar_seasons", "RobotCar-Seasons")),
     *(
         Published(f"pitts30k_{part}", f"Pittsburgh30k, {part} part", PITTSBURGH_LAYOUT.format(part=part), 10_000,
-                  {f"pitts30k_{part}": queries}, pitts30k,
+                  {f"pitts30k_{part}": queries}, partial(pitts30k, name=f"pitts30k_{part}"),
                   "on request from its authors: https://github.com/Relja/netvlad", (f"pitts30k_{part}", "pitts30k"))
         for part, queries in (("val", 7608), ("test", 6816))
     ),

@@ -1,6 +1,6 @@
 """Compiled scores for programs in other languages: StableHLO, ONNX, and arrays to check them with.
 
-Read first: folders (the files of an export), programs (the functions that are exported), program_formats.
+Read first: programs (the functions that are exported), folders (the files of an export).
 """
 
 import lazy_loader

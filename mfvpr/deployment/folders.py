@@ -1,18 +1,24 @@
-"""Folders of exported programs: the program, arrays to check it with, and a description of both."""
+"""Exported programs as StableHLO and ONNX, in folders with arrays to check them; without calls into Python."""
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import logging
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import export as jax_export
+from jax.extend.core import jaxpr_as_fun
 
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array
-from mfvpr.deployment import program_formats
-from mfvpr.deployment.program_formats import PLATFORMS, TOLERANCE, deserialize, export_program, without_unused_inputs
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
 from mfvpr.evaluation.system import System
 from mfvpr.utils.errors import InputError
@@ -22,6 +28,8 @@ from mfvpr.utils.numerics import as_array
 
 FORMAT = "mfvpr exported program 1"
 DESCRIPTION, PROGRAM, MODEL, CHECK = "export.json", "program.stablehlo", "program.onnx", "check"
+PLATFORMS = ("cpu", "cuda")
+TOLERANCE = 1e-4  # of ONNX Runtime, which sums in another order: relative to outputs above 1, else absolute
 
 
 @dataclass(frozen=True)
@@ -99,17 +107,24 @@ def export(
             model, or its outputs differ; or the folder has files.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise InputError(f"{folder}: expected a new or an empty folder, got another; choose a new path")
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose a new path")
+    options = {"with_shift": with_shift, "with_confidence": with_confidence}
     with jax.enable_x64(False):
-        program = without_unused_inputs(
-            make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
-        )
+        program = without_unused_inputs(make_program(method, shapes, **options))
         content = bytes(export_program(program).serialize())
         inputs = check_inputs(program)
         values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
-        model, onnx_note = _model(program, inputs, outputs, required=onnx)
+        model, onnx_note = None, {"missing": "not requested" if onnx is False else "jax2onnx is not installed"}
+        if onnx or (onnx is None and find_spec("jax2onnx")):
+            try:
+                model, difference = to_onnx(program, inputs, outputs)
+                onnx_note = {"largest_difference": difference, "tolerance": TOLERANCE}
+            except InputError as error:
+                if onnx:
+                    raise
+                onnx_note = {"missing": str(error)}
     recipes: dict[str, Any] = {}
     for name, part in program.parameters.items():
         try:
@@ -128,10 +143,7 @@ def export(
         "left_out": program.left_out,
         "onnx": onnx_note,
     }
-    try:
-        (folder / CHECK).mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); choose another path") from error
+    (folder / CHECK).mkdir(parents=True)
     (folder / PROGRAM).write_bytes(content)
     if model is not None:
         (folder / MODEL).write_bytes(model)
@@ -157,12 +169,8 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     folder = Path(folder)
     require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
     require_file(folder / PROGRAM)
-    try:
-        description = json.loads(path.read_text(encoding="utf-8"))
-        is_current = description["format"] == FORMAT
-    except (ValueError, LookupError, TypeError):
-        is_current = False
-    if not is_current:
+    description = json.loads(path.read_text(encoding="utf-8"))
+    if description["format"] != FORMAT:
         raise InputError(f"{path}: expected the format {FORMAT!r}; export it again with this version")
     exported = deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
     inputs, outputs = (
@@ -172,23 +180,75 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     return ExportedProgram(folder, inputs, outputs, description, jax.jit(exported.call))
 
 
-def _model(
-    program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray], *, required: bool | None
-) -> tuple[bytes | None, dict[str, Any]]:
-    """The ONNX model, and how it was checked, or why there is none."""
-    if required is False or (required is None and not program_formats.has_jax2onnx()):
-        return None, {"missing": "not requested" if required is False else "jax2onnx is not installed"}
+def without_unused_inputs(program: Program) -> Program:
+    """The program without inputs that have no effect on its outputs."""
+    used = [program.inputs[index] for index in export_program(program).module_kept_var_idx]
+    unused = {each.name: (each.shape, each.dtype) for each in program.inputs if each not in used}
+
+    def function(arrays: dict[str, Array], form: Any) -> tuple[Array, ...]:
+        return program.function(arrays | {name: jnp.zeros(*like) for name, like in unused.items()}, form)
+
+    return replace(program, inputs=tuple(used), function=function)
+
+
+def export_program(program: Program) -> jax_export.Exported:
+    """Export for all platforms; an InputError names operations that the program cannot have."""
+    _require("flatbuffers", "export")
+    function = jax.jit(lambda *arrays: program.call(*arrays))
     try:
-        model = program_formats.to_onnx(program)
-        difference = largest_difference(program_formats.run_onnx(model, inputs), outputs)
-        if not difference <= TOLERANCE:
-            expected = f"outputs within {TOLERANCE:g} of JAX's"
-            raise InputError(f"onnx=True: expected {expected}, got a difference of {difference:g}; leave onnx out")
-    except InputError as error:
-        if required:
-            raise
-        return None, {"missing": str(error)}
-    return model, {"largest_difference": difference, "tolerance": TOLERANCE}
+        exported = jax_export.export(function, platforms=PLATFORMS)(*_shape_structs(program.inputs))
+        calls = {*re.findall(r"custom_call @([\w.]+)", exported.mlir_module())}
+    except InputError:
+        raise
+    except (jax.errors.JAXTypeError, NotImplementedError, ValueError) as error:
+        expected = f"code that JAX compiles for {' and '.join(PLATFORMS)}, without calls into Python"
+        mend = "use jax.numpy instead of NumPy and Python"
+        raise InputError(f"scorer: expected {expected}, got {_one_line(error)}; {mend}") from error
+    if calls:
+        got = f"{', '.join(sorted(calls))}; leave the operation out"
+        raise InputError(f"scorer: expected a program without calls into libraries, got {got}")
+    return exported
+
+
+def deserialize(content: bytes, where: str) -> jax_export.Exported:
+    """The serialized program; an InputError, which begins with `where`, if JAX cannot read it."""
+    _require("flatbuffers", "export")
+    try:
+        return jax_export.deserialize(bytearray(content))
+    except Exception as error:  # of flatbuffers, of MLIR, or of JAX's own checks
+        expected = f"a program that JAX {jax.__version__} reads"
+        raise InputError(f"{where}: expected {expected}, got {_one_line(error)}") from error
+
+
+def to_onnx(program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]) -> tuple[bytes, float]:
+    """The program as an ONNX model, and the largest difference of its outputs in ONNX Runtime from JAX's.
+
+    An InputError if jax2onnx or ONNX Runtime lacks an operation, or if the difference is above the tolerance.
+    """
+    _require("jax2onnx", "onnx=True")
+    structs = _shape_structs(program.inputs)
+    # jax2onnx traces functions of jax.numpy in its own way, which lacks options; a jaxpr has plain operations.
+    function = jaxpr_as_fun(jax.make_jaxpr(partial(program.call, form="loop"))(*structs))
+    names = {"model_name": "mfvpr", "input_names": [*inputs], "output_names": [*outputs]}
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            import jax2onnx
+            import onnxruntime
+
+            logging.getLogger("onnx_ir").setLevel(logging.ERROR)
+            model = jax2onnx.to_onnx(function, structs, **names).SerializeToString()
+            options = onnxruntime.SessionOptions()
+            options.log_severity_level = 3  # errors alone
+            session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+            values: Any = session.run([*outputs], inputs)
+    except Exception as error:  # of any kind: NotImplementedError, RuntimeError, AssertionError
+        expected = f"operations that jax2onnx converts, got {_one_line(error)}"
+        raise InputError(f"onnx=True: expected {expected}; leave onnx out") from error
+    difference = largest_difference(dict(zip(outputs, values, strict=True)), outputs)
+    if not difference <= TOLERANCE:
+        expected = f"outputs within {TOLERANCE:g} of JAX's"
+        raise InputError(f"onnx=True: expected {expected}, got a difference of {difference:g}; leave onnx out")
+    return model, difference
 
 
 def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
@@ -213,39 +273,33 @@ def check_inputs(program: Program) -> dict[str, np.ndarray]:
     """Inputs by name: candidates of one place, each less precise than the one before, the last without matches."""
     shapes = program.shapes
     rng, size = np.random.default_rng(0), np.asarray(shapes.image_size, np.float32)
-    lengths = shapes.candidates, shapes.keypoints
+    lengths, dimension = (shapes.candidates, shapes.keypoints), shapes.dimension or 1
     spread = 0.01 * (1 + np.arange(shapes.candidates))[:, None, None]  # of image size and descriptors
     points0 = rng.uniform(size=(shapes.keypoints, 2)) * size
     points1 = np.clip(points0 + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2)), 0, size)
-    unit = lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True)  # noqa: E731
-    descriptors0 = unit(rng.normal(size=(shapes.keypoints, shapes.dimension or 1)))
-    descriptors1 = unit(descriptors0 + spread * rng.normal(size=(*lengths, shapes.dimension or 1)))
-    mask = rng.uniform(size=lengths) < 0.9
+    descriptors0 = rng.normal(size=(shapes.keypoints, dimension))
+    descriptors0 /= np.linalg.norm(descriptors0, axis=-1, keepdims=True)
+    descriptors1 = descriptors0 + spread * rng.normal(size=(*lengths, dimension))
+    descriptors1 /= np.linalg.norm(descriptors1, axis=-1, keepdims=True)
+    mask, numbers = rng.uniform(size=lengths) < 0.9, np.arange(shapes.keypoints)
     mask[-1] = shapes.candidates == 1
-    numbers = np.broadcast_to(np.arange(shapes.keypoints), lengths)
-    scores0 = rng.uniform(0.1, 1, shapes.keypoints)
-    values = {
-        "points0": np.broadcast_to(points0, (*lengths, 2)),
-        "points1": points1,
-        "mask": mask,
+    of_matches = {
         "distance": rng.uniform(0, 1, lengths),
         "ratio": rng.uniform(0.5, 1, lengths),
-        "confidence": np.linspace(0, 1, lengths[0] * lengths[1]).reshape(lengths),
-        "scores0": scores0,
-        "scores1": rng.uniform(0.1, 1, lengths),
-        "image_size0": size,
-        "image_size1": np.broadcast_to(size, (shapes.candidates, 2)),
-        "index0": numbers,
-        "index1": numbers,
-        "count0": shapes.keypoints,
-        "count1": np.full(lengths[0], lengths[1]),
-        "keypoints0": points0,
-        "descriptors0": descriptors0,
-        "mask0": rng.uniform(size=shapes.keypoints) < 0.9,
-        "keypoints1": points1,
-        "descriptors1": descriptors1,
-        "mask1": mask,
+        "confidence": np.linspace(0, 1, mask.size).reshape(lengths),
+        "mask": mask,
     }
+    sides = {
+        "points": (points0, points1),
+        "keypoints": (points0, points1),
+        "descriptors": (descriptors0, descriptors1),
+        "scores": (rng.uniform(0.1, 1, shapes.keypoints), rng.uniform(0.1, 1, lengths)),
+        "mask": (rng.uniform(size=shapes.keypoints) < 0.9, mask),
+        "image_size": (size, size),
+        "index": (numbers, numbers),
+        "count": (shapes.keypoints, shapes.keypoints),
+    }
+    values = of_matches | {f"{name}{side}": array for name, pair in sides.items() for side, array in enumerate(pair)}
     return {
         each.name: np.array(np.broadcast_to(values[each.name], each.shape), each.dtype, order="C")
         for each in program.inputs
@@ -261,3 +315,16 @@ def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.nda
         difference = np.abs(arrays[name][finite] - values[finite]) / np.maximum(np.abs(values[finite]), 1)
         differences.append(float(np.max(difference, initial=0.0)))
     return max(differences)
+
+
+def _shape_structs(tensors: Sequence[Tensor]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in tensors]
+
+
+def _require(package: str, what: str) -> None:
+    if find_spec(package) is None:
+        raise InputError(f"{what}: expected the package {package}, got none; pip install 'mfvpr[export]'")
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

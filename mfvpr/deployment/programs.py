@@ -1,7 +1,7 @@
 """Functions of arrays that are exported: scores of matches, or of the features of a query and its candidates."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fields import whole
+from mfvpr.utils.fields import COUNT, POSITIVE, list_of
 
 Form = Literal["vectorized", "loop"]
 
@@ -38,17 +38,17 @@ FIELDS = {
 }
 """Axes, type and unit of the inputs of a scorer: the fields of `Matches`, those of the query without the axis C."""
 
+_FEATURES = {
+    "keypoints": ("K2", "float32", "px"),
+    "descriptors": ("KD", "float32", ""),
+    "scores": ("K", "float32", ""),
+    "mask": ("K", "bool", ""),
+    "image_size": ("2", "float32", "px"),
+}
 FEATURES = {
-    "keypoints0": ("K2", "float32", "px"),
-    "descriptors0": ("KD", "float32", ""),
-    "scores0": ("K", "float32", ""),
-    "mask0": ("K", "bool", ""),
-    "image_size0": ("2", "float32", "px"),
-    "keypoints1": ("CK2", "float32", "px"),
-    "descriptors1": ("CKD", "float32", ""),
-    "scores1": ("CK", "float32", ""),
-    "mask1": ("CK", "bool", ""),
-    "image_size1": ("C2", "float32", "px"),
+    f"{name}{side}": (first + axes, dtype, unit)
+    for side, first in (("0", ""), ("1", "C"))
+    for name, (axes, dtype, unit) in _FEATURES.items()
 }
 """Axes, type and unit of the inputs of a system: the fields of `Features` of the query (0) and the candidates (1)."""
 
@@ -72,14 +72,9 @@ class ExportShapes:
     dimension: int | None = None
 
     def __post_init__(self) -> None:
-        count = whole(1, 10**9)
-        count.check("candidates", self.candidates)
-        count.check("keypoints", self.keypoints)
-        (count | None).check("dimension", self.dimension)
-        size = np.asarray(self.image_size, np.float64)
-        if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
-            raise InputError(f"image_size={self.image_size!r}: expected (width, height) above 0, px")
-        object.__setattr__(self, "image_size", tuple(size.tolist()))
+        rules = {"candidates": COUNT, "keypoints": COUNT, "image_size": list_of(POSITIVE, 2), "dimension": COUNT | None}
+        for name, rule in rules.items():
+            rule.check(name, getattr(self, name))
 
 
 class Tensor(NamedTuple):
@@ -122,30 +117,27 @@ def make_program(
     """
     matcher: Any = None
     left_out: tuple[str, ...] = ()
+    table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
     scorers: dict[str, Scorer]
     if isinstance(method, System):
-        if with_confidence:
-            raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
         table, matcher, main = FEATURES, method.pipeline.matcher, method.headline
         shapes = replace(shapes, dimension=_dimension(method, shapes))
+        if with_confidence:
+            raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
         if main not in method.scorers:
             got = "a ranking that needs the retrieval or further queries; choose another with dataclasses.replace"
             raise InputError(f"final={main!r}: expected a scorer, got {got}")
-        scorers = {"scores": method.scorers[main]}
-        scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
+        others = {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
+        scorers = {"scores": method.scorers[main], **others}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
     else:
         scorers = {"scores": method}
-        table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
-    for name, scorer in scorers.items():
+    for scorer in scorers.values():
         if on_host(scorer):
-            kind = type(scorer).__name__
+            name = type(scorer).__name__
             raise InputError(
-                f"{kind}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
+                f"{name}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
             )
-        if not name.isidentifier():
-            got = name.removeprefix("scores_")
-            raise InputError(f"scorers: expected names of letters, digits and _, got {got!r}; rename the scorer")
     if with_shift and not isinstance(scorers["scores"], HistogramOfShifts):
         got = type(scorers["scores"]).__name__
         raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got {got}; leave with_shift out")
@@ -161,16 +153,12 @@ def make_program(
         return tuple(values.astype(jnp.float32) for values in (*scores, *shift))
 
     def score_matches(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        copies = {
-            name: jnp.broadcast_to(arrays[name], (shapes.candidates, *arrays[name].shape))
-            for name in ("image_size0", "count0")
-        }
+        of_query = {name: arrays[name] for name in ("image_size0", "count0")}
+        copies = {name: jnp.broadcast_to(each, (shapes.candidates, *each.shape)) for name, each in of_query.items()}
         return _over(score, Matches(**(arrays | copies)), form)
 
     def score_features(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        query, candidates = (
-            Features(**{field.name: arrays[f"{field.name}{side}"] for field in fields(Features)}) for side in "01"
-        )
+        query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in _FEATURES}) for side in "01")
         match: Callable[[Features], Matches] = partial(matcher, query)
         if form == "loop":
             return _over(lambda candidate: score(match(candidate)), candidates, form)
@@ -178,34 +166,29 @@ def make_program(
 
     outputs = {name: ("C", "float32", "") for name in scorers}
     outputs |= {"shift": ("C2", "float32", "px")} if with_shift else {}
-    parts = dict(scorers) if matcher is None else {**scorers, "matcher": matcher}
-    function = score_matches if matcher is None else score_features
-    return Program(shapes, _tensors(table, shapes), _tensors(outputs, shapes), function, parts, left_out)
+    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
+    inputs, outputs = (
+        tuple(
+            Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
+            for name, (axes, dtype, unit) in tensors.items()
+        )
+        for tensors in (table, outputs)
+    )
+    parts = scorers if matcher is None else {**scorers, "matcher": matcher}
+    return Program(shapes, inputs, outputs, score_features if matcher else score_matches, parts, left_out)
 
 
 def _dimension(system: System, shapes: ExportShapes) -> int:
     """Length of the descriptors; an InputError for features and matchers that a program cannot take."""
     extractor, matcher = system.pipeline.extractor, system.pipeline.matcher
-    if len(extractor.scales) != 1:
-        got = f"{len(extractor.scales)}; export a scorer alone"
-        raise InputError(f"{type(extractor).__name__}: expected local features of one scale, got {got}")
-    if isinstance(matcher, PairSource):
-        name = type(matcher).__name__
-        raise InputError(f"{name}: expected a matcher that JAX compiles, not on the host; export a scorer alone")
-    known = extractor.scales[0].dimension  # 0 = not known
-    dimension = shapes.dimension or known
-    if not dimension or known not in (0, dimension):
-        expected = known or "the length of the descriptors, which this extractor does not say"
-        raise InputError(f"dimension={shapes.dimension}: expected {expected}")
-    return dimension
-
-
-def _tensors(table: Mapping[str, tuple[str, str, str]], shapes: ExportShapes) -> tuple[Tensor, ...]:
-    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
-    return tuple(
-        Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
-        for name, (axes, dtype, unit) in table.items()
-    )
+    if len(extractor.scales) != 1 or isinstance(matcher, PairSource):
+        expected = "local features of one scale and a matcher that JAX compiles"
+        got = f"{len(extractor.scales)} scales of {type(extractor).__name__} and {type(matcher).__name__}"
+        raise InputError(f"system: expected {expected}, got {got}; export a scorer alone")
+    known = extractor.scales[0].dimension or shapes.dimension  # 0 = the extractor does not say
+    if not known or shapes.dimension not in (None, known):
+        raise InputError(f"dimension={shapes.dimension}: expected {known or 'the length of the descriptors'}")
+    return known
 
 
 def _over(function: Callable[[Any], tuple[Array, ...]], pairs: Any, form: Form) -> tuple[Array, ...]:

@@ -44,7 +44,7 @@ _EXACT = jax.lax.Precision.HIGHEST
 
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
 # on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
-# `python -m experiments.sequences --fit`.
+# `python -m experiments.sequences --fit` at commit 7f66579.
 STREETS = Confidence(5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
 
 

@@ -13,7 +13,6 @@ from mfvpr.core.types import INDICES, Features, Matches, Shortlist, per_match
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
-from mfvpr.io.containers import shorten
 from mfvpr.io.matches import numbered_matches, point_matches
 from mfvpr.matchers.batched_matching import Pair, join_candidates
 from mfvpr.matchers.match_set import QueryMatches
@@ -156,11 +155,8 @@ class _CalledPairs:
             raise InputError(f"{where}: expected {expected}, got {type(result).__name__}")
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
         except Exception as error:  # of NumPy for ragged lists, of any library for tensors that are not dense
-            reason = shorten(" ".join(str(error).split()), 160)
-            raise InputError(f"{where}: expected dense arrays, got others ({reason})") from error
+            raise InputError(f"{where}: expected dense arrays, got others ({' '.join(str(error).split())})") from error
         confidence = values[2] if len(values) == 3 else None
         if self.numbered:
             return numbered_matches(where, values[0], values[1], confidence, first, second)

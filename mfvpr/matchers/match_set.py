@@ -11,7 +11,6 @@ from jaxtyping import Float, Int, Num
 
 from mfvpr.core.types import Matches, per_match, per_pair
 from mfvpr.features.feature_set import few_capacities, pad_rows
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import available_cpus, repeat_last, round_up
 from mfvpr.utils.runtime import ordered_map
 
@@ -128,13 +127,6 @@ class Scales:
     match_sets: Sequence[MatchSet]
     weights: Sequence[float] | None = None
 
-    def __post_init__(self) -> None:
-        shapes = {match_set.counts.shape for match_set in self.match_sets}
-        if len(shapes) != 1:
-            raise InputError(f"scales: expected match sets of the same queries and candidates, got {sorted(shapes)}")
-        if self.weights is not None and len(self.weights) != (number := len(self.match_sets)):
-            raise InputError(f"scales: expected a weight for each of {number} scales, got {len(self.weights)}")
-
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Image sizes of all scales, see `MatchSet.image_sizes`."""
@@ -193,17 +185,11 @@ def batches(
 
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
-    """Number of queries, at least 1, with matches and scores that fit into BLOCK_BYTES."""
-    fitting = BLOCK_BYTES // max(block_bytes(match_set, num_settings, 1), 1)
-    return max(1, min(len(scales(match_set)[0]), fitting))
-
-
-def block_bytes(match_set: MatchSet | Scales, num_settings: int, num_queries: int) -> int:
-    """Approximate bytes to score some queries at the same time: matches, scores and rankings."""
-    padded = sum(slots(scale, settings=num_settings).sum(1) for scale in scales(match_set))
-    largest, num_candidates = np.sort(padded)[::-1][:num_queries].sum(), scales(match_set)[0].counts.shape[1]
-    score_bytes = (8 + 4 * len(scales(match_set))) * num_settings * num_queries * num_candidates
-    return int(2 * BYTES_PER_SLOT * largest) + score_bytes
+    """Number of queries, at least 1, with matches, scores and rankings that fit into about BLOCK_BYTES."""
+    num_queries, num_candidates = (sets := scales(match_set))[0].counts.shape
+    padded = sum(slots(scale, settings=num_settings).sum(1) for scale in sets)
+    of_query = 2 * BYTES_PER_SLOT * np.max(padded, initial=0) + (8 + 4 * len(sets)) * num_settings * num_candidates
+    return max(1, min(num_queries, BLOCK_BYTES // max(int(of_query), 1)))
 
 
 def split_pairs(matches: Matches) -> list[dict[str, np.ndarray]]:

@@ -1,27 +1,22 @@
 """Reports of a learning comparison: table, text, JSON values, learned weights, and figures."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from mfvpr.baselines.learned_weight import LearnedWeight, write_weight
+from mfvpr.baselines.learned_weight import write_weight
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.protocol import EvaluationProtocol
 from mfvpr.evaluation.statistics import mcnemar, path_test, recall_interval
-from mfvpr.report.plots import GRAY, MARK, PALE, panels, save_figure
+from mfvpr.report.plots import MARK, PALE, panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_interval, format_values
 from mfvpr.tuning.learning.comparison import Comparison
 from mfvpr.tuning.learning.training import Fit
-from mfvpr.utils.numerics import compiled
-
-SHOWN_QUERIES = 20  # whose matches the figure of the weights counts
-BINS = 12  # of these matches, by the value of an input
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -64,117 +59,56 @@ def comparison_text(comparison: Comparison) -> str:
 
 def comparison_json(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON values."""
-    protocol = comparison.protocol
-    first = next(comparison.rows())[1]
-
-    def by_threshold(values: Iterable[Any]) -> dict[str, Any]:
-        return dict(zip([f"{threshold:g}" for threshold in protocol.thresholds], values, strict=True))
-
-    rows = []
+    protocol, rows = comparison.protocol, []
+    names, first = [f"{threshold:g}" for threshold in protocol.thresholds], next(comparison.rows())[1]
     for name, hits, halves in comparison.rows():
-        tests = [
-            {"mcnemar": mcnemar(*pair)._asdict(), "path_test": path_test(*pair)._asdict()}
-            for pair in zip(hits, first, strict=True)
-        ]
-        parts = {}
-        for row in halves:
-            parts[row.half] = {"values": dict(row.values), "recall_at_1": row.hits.mean(axis=1).tolist()}
-            parts[row.half] |= {"steps": row.fitted.step, "history": row.fitted.history} if row.fitted else {}
-        sets = _by_set(protocol, hits.T)
-        rows.append(
-            {
-                "score": name,
-                "recall_at_1": by_threshold(hits.mean(axis=1).tolist()),
-                "interval": by_threshold(map(recall_interval, hits)),
-                "against_first": by_threshold(tests),
-                "by_set": {set_name: by_threshold(each.mean(axis=0).tolist()) for set_name, each in sets.items()},
-                "halves": parts,
-            }
-        )
-    return {
-        "unit": protocol.unit,
-        "thresholds": list(protocol.thresholds),
-        "queries": {
-            "reported": [half.report.tolist() for half in protocol.halves],
-            "chosen_on": [half.tune.tolist() for half in protocol.halves],
-        },
-        "rows": rows,
+        row: dict[str, Any] = {"score": name, "recall_at_1": {}, "interval": {}, "against_first": {}, "halves": {}}
+        row["by_set"] = {set_name: {} for set_name in protocol.reported_sets}
+        for threshold, ours, theirs in zip(names, hits, first, strict=True):
+            row["recall_at_1"][threshold] = float(ours.mean())
+            row["interval"][threshold] = recall_interval(ours)
+            tests = {"mcnemar": mcnemar(ours, theirs)._asdict(), "path_test": path_test(ours, theirs)._asdict()}
+            row["against_first"][threshold] = tests
+            for set_name, each in _by_set(protocol, ours).items():
+                row["by_set"][set_name][threshold] = float(each.mean())
+        for half in halves:
+            row["halves"][half.half] = {"values": dict(half.values), "recall_at_1": half.hits.mean(axis=1).tolist()}
+            if half.fitted:
+                row["halves"][half.half] |= {"steps": half.fitted.step, "history": half.fitted.history}
+        rows.append(row)
+    queries = {
+        "reported": [half.report.tolist() for half in protocol.halves],
+        "chosen_on": [half.tune.tolist() for half in protocol.halves],
     }
+    return {"unit": protocol.unit, "thresholds": list(protocol.thresholds), "queries": queries, "rows": rows}
 
 
 def write_weights(folder: Path, comparison: Comparison, provenance: Mapping[str, Any]) -> None:
     """Write every learned match weight by name, with how it was learned; see `mfvpr.baselines.learned_weight`."""
-    for name, weight in _weights(comparison).items():
-        write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
+    for name, fit in _fits(comparison).items():
+        if (weight := fit.parameters.get("weight")) is not None:
+            write_weight(folder / f"{re.sub(r'[^a-z]+', '_', name)}.json", weight, {**provenance, "training": name})
 
 
 def comparison_figures(comparison: Comparison) -> list[Figure]:
-    """Curves of the trainings, and the learned weights over their inputs."""
-    histories = {name: fit.history for name, fit in _fits(comparison).items()}
-    return [
-        ("curves.png", partial(_draw_curves, histories=histories)),
-        ("weights.png", partial(_draw_weights, comparison=comparison, weights=_weights(comparison))),
-    ]
+    """Curves of the trainings."""
+    return [("curves.png", partial(_draw_curves, fits=_fits(comparison)))]
 
 
 def _fits(comparison: Comparison) -> dict[str, Fit]:
     return {f"{row.half}: {row.name}": row.fitted for half in comparison.halves for row in half if row.fitted}
 
 
-def _weights(comparison: Comparison) -> dict[str, LearnedWeight]:
-    fits = _fits(comparison)
-    return {name: fit.parameters["weight"] for name, fit in fits.items() if "weight" in fit.parameters}
-
-
-def _draw_curves(path: Path, histories: Mapping[str, Sequence[tuple[int, float | None, float | None]]]) -> None:
+def _draw_curves(path: Path, fits: Mapping[str, Fit]) -> None:
     """Draw loss and validation over the steps, one panel for each training, whose history has None where unknown."""
-    figure, axes = panels(len(histories), 3.4, 2.6)
-    for panel, (name, history) in zip(axes, histories.items(), strict=True):
-        for place, label, color in ((1, "loss", PALE), (2, "validation", MARK)):
-            points = [(row[0], row[place]) for row in history if row[place] is not None]
-            panel.plot(*zip(*points, strict=True), label=label, color=color, marker=".", markersize=4)
+    figure, axes = panels(len(fits), 3.4, 2.6)
+    for panel, (name, fit) in zip(axes, fits.items(), strict=True):
+        steps, *columns = np.array(fit.history, float).T  # None becomes NaN
+        for values, label, color in zip(columns, ("loss", "validation"), (PALE, MARK), strict=True):
+            known = np.isfinite(values)
+            panel.plot(steps[known], values[known], label=label, color=color, marker=".", markersize=4)
         panel.set_title(name, fontsize=9)
         panel.set_xlabel("step", fontsize=8)
         panel.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     save_figure(figure, path)
-
-
-def _draw_weights(path: Path, comparison: Comparison, weights: Mapping[str, LearnedWeight]) -> None:
-    """Draw the mean match weight over each input, in bins of equally many matches of some queries reported on.
-
-    A dotted line is the share of these matches that belong to a correct candidate.
-    """
-    protocol, queries = comparison.protocol, np.concatenate([half.report for half in comparison.protocol.halves])
-    shown = queries[np.linspace(0, len(queries) - 1, min(SHOWN_QUERIES, len(queries))).astype(int)]
-    positives = protocol.positives[protocol.main].take(shown).contains(comparison.candidates.indices[shown])
-    first, query_matches = next(iter(weights.values())), [comparison.match_set[query] for query in shown]
-    inputs = np.concatenate([np.asarray(_raw(first, matches))[matches.mask] for matches in query_matches])
-    counts = np.concatenate([matches.mask.sum(axis=1) for matches in query_matches])
-    correct, by_training = np.repeat(positives.reshape(-1), counts), {}
-    for name, weight in weights.items():
-        weighed = [np.asarray(_weigh(weight, matches))[matches.mask] for matches in query_matches]
-        by_training[name] = np.concatenate(weighed)
-    figure, axes = panels(len(first.names), 3.2, 2.6)
-    for panel, name, values in zip(axes, first.names, inputs.T, strict=True):
-        edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
-        bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
-        members = [bin_of == used for used in np.unique(bin_of)]
-        centers = [values[member].mean() for member in members]
-        for label, weight in by_training.items():
-            panel.plot(centers, [weight[member].mean() / weight.mean() for member in members], label=label, marker=".")
-        panel.set_title(name, fontsize=9)
-        panel.grid(alpha=0.3)
-        share = panel.twinx()
-        share.plot(centers, [100 * correct[member].mean() for member in members], color=GRAY, linestyle=":")
-        share.tick_params(labelsize=7, labelcolor=GRAY)
-    axes[0].legend(fontsize=7)
-    axes[0].set_ylabel("weight / mean weight", fontsize=8)
-    figure.suptitle("dotted: % of these matches that belong to a correct candidate", fontsize=9)
-    save_figure(figure, path)
-
-
-_weigh = compiled(jax.vmap(lambda weight, matches: weight(matches), in_axes=(None, 0)))
-_raw = compiled(
-    jax.vmap(lambda weight, matches: weight.center[None] + weight.scale[None] * weight.inputs(matches), (None, 0))
-)

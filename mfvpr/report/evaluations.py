@@ -26,13 +26,11 @@ from mfvpr.evaluation.confidence import (
 )
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
-from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report.runs import file_names
-from mfvpr.report.tables import Table
+from mfvpr.report.tables import Table, table_of
 from mfvpr.utils.errors import InputError
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
-SHARES = tuple(share / 20 for share in range(21))  # of queries that are re-ranked
 _UNITS: Mapping[str, Unit] = {"tolerance": "frames", "radius": "m"}  # of a threshold, by its name in rows
 
 
@@ -42,14 +40,14 @@ class EvaluationReport:
 
     Attributes:
         ranked: rankings of all sequences.
-        thresholds: distances within which a prediction is correct, sorted; empty = those that the programs have by
-            default. There are none without ground truth.
+        thresholds: distances within which a prediction is correct, sorted; empty = the default of the programs, or none
+            without ground truth.
         ks: depths of recall, sorted.
         confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
             confidence that was fitted on the other half.
         least_confidence: below which the prediction is `NO_PLACE`; None = no prediction is refused.
-        lacking: by sequence, why there is too little evidence for predictions of the system that decides, which are
-            `NO_PLACE` as well, see `mfvpr.evaluation.evidence`; None = not tested.
+        lacking: by sequence, why evidence is lacking for predictions of the system that decides, which are then
+            `NO_PLACE`, see `mfvpr.evaluation.evidence`; None = not tested.
     """
 
     ranked: RankedDataset
@@ -101,11 +99,12 @@ class EvaluationReport:
             parts = dict(zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True))
             if len(parts) > 1:
                 parts |= zip(MEANS, (recall.mean, recall.pooled), strict=True)
-            for (sequence, values), place in itertools.product(parts.items(), range(len(self.thresholds))):
-                row: dict[str, Any] = {"system": system, "decides": system == self.headline}
-                row |= {"sequence": sequence} if len(parts) > 1 else {}
-                row |= {name: self.thresholds[place] for name, unit in _UNITS.items() if unit == truth.unit}
-                rows.append(row | {"recall_at": dict(zip(self.ks, values[place].tolist(), strict=True))})
+            for sequence, by_threshold in parts.items():
+                for threshold, values in zip(self.thresholds, by_threshold.tolist(), strict=True):
+                    row: dict[str, Any] = {"system": system, "decides": system == self.headline}
+                    row |= {"sequence": sequence} if len(parts) > 1 else {}
+                    row |= {name: threshold for name, unit in _UNITS.items() if unit == truth.unit}
+                    rows.append(row | {"recall_at": dict(zip(self.ks, values, strict=True))})
         return rows
 
     @cached_property
@@ -188,8 +187,8 @@ class EvaluationReport:
             reasons[~(self.probabilities[system] >= self.least_confidence)] = "low confidence"
         reasons[np.concatenate([ranked.rows[:, 0] < 0 for ranked in self.ranked.systems[system]])] = "no candidates"
         if self.lacking is not None and system == self.headline:
-            lacking = np.array([*itertools.chain(*self.lacking)], object)
-            reasons = np.where(lacking == None, reasons, lacking)  # noqa: E711
+            for query, reason in enumerate(itertools.chain(*self.lacking)):
+                reasons[query] = reason or reasons[query]
         return reasons
 
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
@@ -223,12 +222,9 @@ def sequence_folder(run: Path, sequences: Sequence[str], place: int) -> Path:
 
 
 def recall_table(rows: Iterable[Mapping[str, Any]]) -> Table:
-    """Recall in % from rows of `EvaluationReport.rows`, which may have a "data set", too.
+    """Recall in % from rows of `EvaluationReport.rows`, which may have a "data set", too; InputError without recalls.
 
     R@first k at every threshold, and all ks at the middle one; a line for each data set, system, and sequence.
-
-    Raises:
-        InputError: no row has recalls.
     """
     names, groups = ("data set", "system", "sequence"), dict[tuple[str | None, ...], list[Mapping[str, Any]]]()
     for row in rows:
@@ -239,24 +235,20 @@ def recall_table(rows: Iterable[Mapping[str, Any]]) -> Table:
     lines = []
     for texts, group in groups.items():
         first, *deeper = group[0]["recall_at"]
-        cells = [(row, first) for row in group] + [(group[len(group) // 2], k) for k in deeper]
         line = {name: text for name, text in zip(names, texts, strict=True) if text is not None}
-        for row, k in cells:
+        for row, k in [(row, first) for row in group] + [(group[len(group) // 2], k) for k in deeper]:
             words = [threshold_words(unit, row[name]) for name, unit in _UNITS.items() if name in row]
             line[f"R@{k}{''.join(words)}"] = f"{100 * row['recall_at'][k]:.1f}"
         lines.append(line)
-    known = dict.fromkeys(name for line in lines for name in line)
-    header = sorted(known, key=lambda name: names.index(name) if name in names else len(names))
-    text_columns = len({*header} & {*names})
-    return Table(header, [[line.get(name, "") for name in header] for line in lines], text_columns)
+    return table_of(lines, names)
 
 
 def confidence_table(evaluation: EvaluationReport) -> Table:
-    """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; counts of queries.
+    """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; all in percent.
 
-    All in percent but the counts, which need `least_confidence`. "ECE" is the expected calibration error of the queries
-    as they are, "by chance" that of a perfectly calibrated confidence. "ECE with absent" counts each query once more
-    without the images of its place, as the fits do.
+    "ECE" is the expected calibration error of the queries as they are, "by chance" that of a perfectly calibrated
+    confidence. "ECE with absent" counts each query once more without the images of its place, as the fits do. With
+    `least_confidence`, counts of queries follow.
     """
     header = [f"{name} by {by}" for by in ("score", "confidence") for name in ("AP", "R@100P", "R@99P")]
     header += ["ECE", "by chance", "ECE with absent"]
@@ -279,20 +271,3 @@ def confidence_table(evaluation: EvaluationReport) -> Table:
     if evaluation.least_confidence is not None:
         header += ["correct", "incorrect", "refused", "of these correct"]
     return Table(["system", *header], rows)
-
-
-def recalls_by_share(evaluation: EvaluationReport) -> dict[str, Float[np.ndarray, " shares"]]:
-    """Recall at 1, by `SHARES`, of the systems that re-rank the queries with the lowest confidence of retrieval.
-
-    It is empty where the confidence of retrieval is not known.
-    """
-    if RETRIEVAL not in evaluation.probabilities:
-        return {}
-    unsure = np.argsort(np.nan_to_num(evaluation.probabilities[RETRIEVAL], nan=-1.0), kind="stable")
-    by_retrieval = evaluation.hits(RETRIEVAL)[unsure].astype(int)
-    counts = np.round(np.array(SHARES) * len(unsure)).astype(int)
-    recalls = {}
-    for name in (name for name in evaluation.ranked.systems if name != RETRIEVAL):
-        gains = np.concatenate([[0], np.cumsum(evaluation.hits(name)[unsure] - by_retrieval)])
-        recalls[name] = (by_retrieval.sum() + gains[counts]) / len(unsure)
-    return recalls

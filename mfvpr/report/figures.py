@@ -20,12 +20,11 @@ from mfvpr.core.types import Matches
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation.confidence import reliability
 from mfvpr.evaluation.stages import Explanation, explain
 from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.plots import panels, reliability_figure, save_figure
+from mfvpr.report.plots import panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, path_inside, printable
@@ -35,19 +34,16 @@ _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as 
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
 _GRAY = 150  # of an image that is not at hand
-_TITLE_LENGTH, _CAPTION_LENGTH, _NAME_LENGTH = 140, 100, 40  # characters that fit; of an image's name in a title
-_MAP_NAME_LENGTH = 80  # characters of a name or a place of a map
-_PAIRS, _PAIRS_IN_A_ROW = 12, 2  # of a contact sheet; at least two of each sequence
-_SIDE, _WIDTH = 320, 3.2  # of an image on the sheet: px of the longer side, inches
-_SHEET_CAPTION_LENGTH = 44  # characters
+_TITLE_LENGTH, _CAPTION_LENGTH, _NAME_LENGTH = 140, 100, 48  # characters that fit; of an image's name in a title
+_PAIRS = 12  # of a contact sheet; at least two of each sequence
+_SIDE = 320  # px of the longer side of an image on the sheet
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A database image beside the query, at the size that the points refer to, and its caption.
 
-    `matches` are of this pair, `[K, ...]`, NumPy; `explanation` is of the matches, see
-    `mfvpr.evaluation.stages.explain`. Both are None where the image was not matched.
+    `matches` `[K, ...]` of this pair (NumPy) and their `explanation` are None if the image was not matched.
     """
 
     image: UInt8[np.ndarray, "height width 3"]
@@ -121,14 +117,13 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     direction = explanation.direction.replace("_", " ")
     axes.set_xlabel(f"shift x, px ({direction})\nsquare: tallest bin, cross: refined peak", fontsize=8)
     axes.set_ylabel("shift y, px")
-    words = "no votes"
     if explanation.score > 0:
-        corner = explanation.shift - half
+        corner, (x, y) = explanation.shift - half, explanation.peak
         axes.add_patch(Rectangle(corner, 2 * half, 2 * half, fill=False, edgecolor="cyan", linewidth=1.4))
-        axes.plot(*explanation.peak, marker="+", color="cyan", markersize=8)
-        x, y = explanation.peak
-        words = f"score {explanation.score:.4g}, peak at ({x:.1f}, {y:.1f}) px"
-    axes.set_title(f"histogram of shifts: {words}", fontsize=9)
+        axes.plot(x, y, marker="+", color="cyan", markersize=8)
+        axes.set_title(f"histogram of shifts: score {explanation.score:.4g}, peak at ({x:.1f}, {y:.1f}) px", fontsize=9)
+    else:
+        axes.set_title("histogram of shifts: no votes", fontsize=9)
     return image
 
 
@@ -139,10 +134,7 @@ def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.nd
 
 
 def query_figures(report: EvaluationReport, shown: int | Sequence[int]) -> list[Figure]:
-    """The paper's figure for a few queries, correct and incorrect ones, spread over each sequence.
-
-    `shown` is a number of queries, or their rows.
-    """
+    """The paper's figure for so many queries of each sequence, correct and incorrect ones, or for the rows `shown`."""
     figures: list[Figure] = []
     for place in range(len(report.sequences)):
         drawings, folder = SequenceFigures(report, place), report.folder(Path(), place).name
@@ -179,24 +171,19 @@ class SequenceFigures:
             chosen |= dict.fromkeys(queries[spread].tolist(), word)
         return chosen
 
-    def title(self, query: int, verdict: str) -> str:
-        """The score, whether the prediction is correct within the threshold, and both names."""
-        truth, prediction = self._sequence.truth, self._database.names[self._ranked.rows[query, 0]]
-        within = "" if truth is None else " at" + threshold_words(truth.unit, self._report.threshold)
-        names = f"{_short(self._sequence.images.names[query])} -> {_short(prediction)}"
-        note = f" (no place: {reason})" if (reason := self._reasons[query]) else ""
-        return f"{self._report.headline}, {verdict}{within}: {names}{note}"
-
     def draw(self, path: Path, query: int, verdict: str) -> None:
         """Draw the prediction, and below an incorrect one a correct one."""
         candidates = [self._candidate(query, 0, verdict)]
         candidates += self.correct_candidates(query) if verdict == "incorrect" else []
-        sequence, prediction = self._sequence, self._database.names[self._ranked.rows[query, 0]]
-        values = self._report.headline, sequence.name, verdict, sequence.images.names[query], prediction
-        about, original = dict(zip(ABOUT, values, strict=True)), sequence.images.read(query)
-        image = self._resize(original)
-        aspect = pixel_aspect_of(original, image)
-        histogram_figure(path, image, candidates, title=self.title(query, verdict), pixel_aspect=aspect, about=about)
+        sequence, headline, reason = self._sequence, self._report.headline, self._reasons[query]
+        name, prediction = sequence.images.names[query], self._database.names[self._ranked.rows[query, 0]]
+        within = "" if sequence.truth is None else " at" + threshold_words(sequence.truth.unit, self._report.threshold)
+        note = f" (no place: {reason})" if reason else ""
+        title = f"{headline}, {verdict}{within}: {_short(name)} -> {_short(prediction)}{note}"
+        about = dict(zip(ABOUT, (headline, sequence.name, verdict, name, prediction), strict=True))
+        original = sequence.images.read(query)
+        aspect = pixel_aspect_of(original, image := self._resize(original))
+        histogram_figure(path, image, candidates, title=title, pixel_aspect=aspect, about=about)
 
     def correct_candidates(self, query: int) -> list[Candidate]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
@@ -223,8 +210,7 @@ class SequenceFigures:
 
     def _resize(self, image: np.ndarray) -> np.ndarray:
         extractor = self._report.ranked.system.pipeline.extractor
-        size = extractor.image_size
-        return image if size is None else resize(image, size, extractor.interpolation)
+        return image if extractor.image_size is None else resize(image, extractor.image_size, extractor.interpolation)
 
 
 def _short(name: str) -> str:
@@ -245,72 +231,48 @@ def localization_figure(
     `image` is RGB. `root` is the folder of the map's images, by their names; an image that cannot be read is drawn
     gray, as are all without a folder. An InputError if the candidate's name leads out of the folder.
     """
-    prediction, extractor, matches = localization.prediction, known.extractor, localization.matches
-    width, height = extractor.image_size
-    candidate = Candidate(np.full((height, width, 3), _GRAY, np.uint8), "no candidate")
+    prediction, matches = localization.prediction, localization.matches
+    size, interpolation = known.extractor.image_size, known.extractor.interpolation
+    candidate = Candidate(np.full((size[1], size[0], 3), _GRAY, np.uint8), "no candidate")
     if matches is not None:
         best = prediction.alternatives[0].name
         shown, note = candidate.image, " (its image is not at hand)"
         if root is not None:
             file = path_inside(root, best)
             with suppress(InputError):  # the map keeps features, not images
-                shown, note = resize(read_image(file), extractor.image_size, extractor.interpolation), ""
+                shown, note = resize(read_image(file), size, interpolation), ""
         scorers = known.system.scorers.values()
         histogram = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), HistogramOfShifts())
         p = "" if prediction.confidence is None else f", confidence {prediction.confidence:.2f}"
-        caption = f"{clip_middle(best, _MAP_NAME_LENGTH)}{note}, score {prediction.score:.5g}{p}"
+        caption = f"{_short(best)}{note}, score {prediction.score:.5g}{p}"
         candidate = Candidate(shown, caption, matches, explain(histogram, matches))
-    query = resize(image, extractor.image_size, extractor.interpolation)
+    query = resize(image, size, interpolation)
     place = f"no place ({prediction.reason})" if prediction.place is None else str(prediction.place)
-    title = f"{clip_middle(name, _MAP_NAME_LENGTH)} -> {clip_middle(place, _MAP_NAME_LENGTH)}"
-    about = {"image": name, "place": str(prediction.place)}
+    title, about = f"{_short(name)} -> {_short(place)}", {"image": name, "place": str(prediction.place)}
     histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
 
 
-def reliability_figures(report: EvaluationReport) -> list[Figure]:
-    """Reliability of the confidences, with ground truth; other curves of confidences are on the page."""
-    if not report.thresholds or not report.probabilities:
-        return []
-    bins = {name: reliability(values, report.hits(name)) for name, values in report.probabilities.items()}
-    return [("reliability.png", partial(reliability_figure, reliabilities=bins))]
-
-
-def with_longest_side(image: UInt8[np.ndarray, "_ _ 3"], side: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Resize an image so that its longer side has so many pixels."""
-    scale = side / max(image.shape[:2])
-    return resize(image, (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))))
-
-
 def contact_sheet(path: Path, dataset: Dataset) -> None:
-    """Write a figure of pairs, evenly spread over each sequence; the name replaces an image that cannot be read.
-
-    Without ground truth, queries stand alone.
-    """
-    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[tuple[np.ndarray | None, str]]]()
-
-    def read(folder: ImageFolder, row: int, sequence: str) -> tuple[np.ndarray | None, str]:
-        try:
-            return with_longest_side(folder.read(row), _SIDE), f"{sequence} {folder.names[row]}".strip()
-        except InputError:
-            return None, f"{folder.names[row]} cannot be read"
-
+    """Write a figure of pairs, evenly spread over each sequence: a query, and the place that the ground truth names."""
+    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[tuple[ImageFolder, int]]]()
     for sequence in dataset.sequences:
         for query in np.unique(np.linspace(0, len(sequence.images) - 1, each).round().astype(int)).tolist():
             place = None if sequence.truth is None else sequence.truth.place(query)
-            places = [] if place is None else [read(dataset.database, place, "")]
-            pairs.append([read(sequence.images, query, sequence.name), *places])
-    shapes = [image.shape for pair in pairs for image, _ in pair if image is not None]
-    height = _WIDTH * float(np.median([rows / columns for rows, columns, _ in shapes] or [0.75]))
-    rows, columns = -(-len(pairs) // _PAIRS_IN_A_ROW), 2 * _PAIRS_IN_A_ROW
-    figure, axes = panels(columns * rows, _WIDTH, 0.3 + height + 0.5 / rows, columns)
+            pairs.append([(sequence.images, query), *([] if place is None else [(dataset.database, place)])])
+    figure, axes = panels(2 * len(pairs), 3.2, 2.6)
     figure.suptitle(f"{dataset.name}: query | the place that the ground truth names", fontsize=11, parse_math=False)
     for panel in axes:
         panel.set_axis_off()
     for number, pair in enumerate(pairs):
-        for panel, (image, caption) in zip(axes[2 * number : 2 * number + 2], pair, strict=False):
-            if image is not None:
-                panel.imshow(image)
-            panel.set_title(printable(clip_middle(caption, _SHEET_CAPTION_LENGTH)), fontsize=7, parse_math=False)
         if len(pair) < 2:
             axes[2 * number + 1].text(0.5, 0.5, "no place", ha="center")
+        for panel, (folder, row) in zip(axes[2 * number :], pair, strict=False):
+            panel.set_title(_short(f"{folder.root.name}/{folder.names[row]}"), fontsize=7, parse_math=False)
+            try:
+                image = folder.read(row)
+                scale = _SIDE / max(image.shape[:2])
+                size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+                panel.imshow(resize(image, size))
+            except InputError:
+                panel.text(0.5, 0.5, "cannot be read", ha="center")
     save_figure(figure, path, dpi=80)

@@ -1,7 +1,6 @@
-"""Canvas and colors of all figures, and the figure of calibration."""
+"""Canvas and colors of all figures."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mfvpr.evaluation.confidence import Reliability
-from mfvpr.utils.files import clip_middle, printable, replacing, require_replaceable
+from mfvpr.utils.files import replacing, require_replaceable
 
 COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
 _FIRST = "#8a8f98"  # of what all others are compared with
 _DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
-_TITLE_LENGTH = 34  # characters that fit above a panel
-PALE, MARK, GRAY = "#2fa8ff", "#e8482c", "#888888"
+PALE, MARK = "#2fa8ff", "#e8482c"
 _SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 
 
@@ -51,19 +48,3 @@ def color_and_dash(place: int) -> tuple[str, str]:
     if place == 0:
         return _FIRST, "solid"
     return COLORS[(place - 1) % len(COLORS)], _DASHES[(place - 1) // len(COLORS) % len(_DASHES)]
-
-
-def reliability_figure(path: Path, reliabilities: Mapping[str, Reliability]) -> None:
-    """Draw a panel for each system: how often predictions of a probability are correct, areas by their number."""
-    figure, axes = panels(len(reliabilities), 2.6, 2.6)
-    for place, (panel, (name, bins)) in enumerate(zip(axes, reliabilities.items(), strict=True)):
-        panel.plot([0, 1], [0, 1], color="gray", linewidth=0.8)
-        sizes = 200 * bins.count / max(bins.count.sum(), 1) + 4
-        panel.scatter(bins.probability, bins.correct, s=sizes, alpha=0.8, color=color_and_dash(place)[0])
-        title = f"{clip_middle(printable(name), _TITLE_LENGTH)}\nECE {100 * bins.calibration_error:.1f} %"
-        panel.set_title(title, fontsize=8, parse_math=False)
-        panel.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-        panel.set_xlabel("confidence", fontsize=8)
-        panel.set_ylabel("correct", fontsize=8)
-        panel.grid(alpha=0.3)
-    save_figure(figure, path, bbox_inches="tight")  # titles may be wider than their panel

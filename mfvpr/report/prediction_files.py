@@ -31,11 +31,8 @@ _FRAME = "camera"  # header.frame_id
 class LocalizedImage:
     """A query with its prediction.
 
-    Attributes:
-        name: of the query.
-        place: any JSON value; None = no place.
-        candidates: names of database images and their scores, best first; empty without a place.
-        cells: of the table of shifts, by column.
+    `place` is any JSON value, None = no place. `candidates` are names of database images and their scores, best first;
+    empty without a place. `cells` are of the table of shifts, by column.
     """
 
     name: str
@@ -58,10 +55,9 @@ def write_candidates(
 
     Other layouts have `prefixes` before the names of queries and database images.
     """
-    names = []
-    for side, prefix in zip((queries, database), prefixes, strict=True):
-        paths = [os.path.abspath(path) for path in side.paths] if layout == "preds" else side.names
-        names.append([prefix + path for path in paths])
+    names = [[prefix + name for name in side.names] for side, prefix in zip((queries, database), prefixes, strict=True)]
+    if layout == "preds":
+        names = [[os.path.abspath(path) for path in side.paths] for side in (queries, database)]
     correct = None if positives is None else [positives.of(row).tolist() for row in range(len(queries))]
     write_shortlist(path, shortlist, *names, layout=layout, positives=correct)
 
@@ -117,47 +113,33 @@ def shortlist_of(images: Sequence[LocalizedImage], database: Sequence[str]) -> S
 
 def read_lines(path: Path) -> list[LocalizedImage]:
     """Read the lines of `mfvpr localize`; an image that could not be read has no place, and its error as reason."""
-
-    def image_of(line: Mapping[str, Any]) -> LocalizedImage:
-        if "error" in line:
-            return LocalizedImage(line["image"], cells={"reason": line["error"]})
-        low, high = line["shift_interval"] or [[None, None]] * 2
-        numbers = [line["confidence"], *(line["shift"] or [None] * 2), *low, *high, line["image_width"]]
-        cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
-        if line["place"] is None:
-            return LocalizedImage(line["image"], cells=cells | {"reason": line["reason"]})
-        candidates = [(each["name"], each["score"]) for each in line["alternatives"]]
-        return LocalizedImage(line["image"], line["place"], candidates, cells)
-
-    with reading(path, mend="expected lines of mfvpr localize"):
-        lines = path.read_text(encoding="utf-8").split("\n")
     images = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            try:
-                images.append(image_of(json.loads(line)))
-            except (AttributeError, LookupError, TypeError, ValueError, RecursionError):
-                words = f"expected a line of mfvpr localize, got {shorten(line)!r}"
-                raise InputError(f"{path}: line {number}: {words}") from None
+    with reading(path, mend="expected lines of mfvpr localize"):
+        for line in filter(str.strip, path.read_text(encoding="utf-8").split("\n")):
+            values = json.loads(line)
+            if "error" in values:
+                images.append(LocalizedImage(values["image"], cells={"reason": values["error"]}))
+                continue
+            low, high = values["shift_interval"] or [[None, None]] * 2
+            numbers = [values["confidence"], *(values["shift"] or [None] * 2), *low, *high, values["image_width"]]
+            cells = {name: str(number) for name, number in zip(_NUMBERS, numbers, strict=True) if number is not None}
+            candidates = [(each["name"], each["score"]) for each in values["alternatives"]]
+            if values["place"] is None:
+                cells, candidates = cells | {"reason": values["reason"]}, []
+            images.append(LocalizedImage(values["image"], values["place"], candidates, cells))
     return images
 
 
 def read_run_images(folder: Path, queries: Sequence[str]) -> list[LocalizedImage]:
     """Localized images of a sequence of an evaluation, from the files in its folder; refused queries have no place."""
-    candidates, cells = dict[str, list[tuple[str, float]]](), dict[str, dict[str, str]]()
-    known = {*queries}
-    with reading(folder / "predictions.csv", mend="expected the folder of an evaluation"):
+    candidates, cells = ({query: [] for query in queries}, {query: {} for query in queries})
+    with reading(folder / "predictions.csv", mend="expected the folder of an evaluation, of this data set"):
         for row in read_csv(folder / "predictions.csv"):
-            if row["query"] not in known:
-                raise InputError(f"{shorten(row['query'])}: expected a query of the data set, which has changed")
             if row["database"] != NO_PLACE:
-                candidates.setdefault(row["query"], []).append((row["database"], float(row["score"])))
-    for name in ("top_predictions.csv", "shifts.csv"):
-        for row in read_csv(folder / name) if (folder / name).exists() else ():
-            row["image_width"] = row.get("width", "")
-            cells.setdefault(row["query"], {}).update({cell: row[cell] for cell in _CELLS if row.get(cell)})
-    images = []
-    for query in queries:
-        place = candidates[query][0][0] if query in candidates else None
-        images.append(LocalizedImage(query, place, candidates.get(query, ()), cells.get(query, {})))
-    return images
+                candidates[row["query"]].append((row["database"], float(row["score"])))
+        for path in (folder / "top_predictions.csv", folder / "shifts.csv"):
+            for row in read_csv(path) if path.exists() else ():
+                row["image_width"] = row.get("width", "")
+                cells[row["query"]] |= {name: row[name] for name in _CELLS if row.get(name)}
+    places = {query: names[0][0] if names else None for query, names in candidates.items()}
+    return [LocalizedImage(query, places[query], candidates[query], cells[query]) for query in queries]

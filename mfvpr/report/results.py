@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, rank_dataset
 from mfvpr.evaluation.system import System
-from mfvpr.report import pages
 from mfvpr.report.evaluations import EvaluationReport, recall_table
+from mfvpr.report.pages import write_comparison
+from mfvpr.report.pages import write_report as write_page
 from mfvpr.report.prediction_files import CandidateLayout, write_candidates
 from mfvpr.report.run_files import save_run
 from mfvpr.report.runs import claim_run_folder, file_names, write_table
-from mfvpr.report.tables import Table, data_frame
+from mfvpr.report.tables import Table
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import Runtime
@@ -60,13 +61,11 @@ def evaluate(
     Args:
         data: a data set, or several by name.
         system: finds, matches, scores and ranks candidates; or several by name.
-        cache: where features and matches are kept; None = features in memory. All systems share it. With a folder, they
-            share matches as well.
+        cache: where all systems keep features, and with a folder also matches; None = features in memory.
         runtime: devices, memory, progress and messages; None = those of the cache.
 
     Raises:
-        InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
-            or a scorer; one line says which, and how to fix it.
+        InputError: images or features that cannot be used, or an invalid result of an extractor, retrieval or scorer.
     """
     cache = FeatureCache() if cache is None else cache
     if not isinstance(cache, FeatureCache):
@@ -74,8 +73,6 @@ def evaluate(
     datasets = data if isinstance(data, Mapping) else {data.name: data}
     systems = system if isinstance(system, Mapping) else {system.headline: system}
     pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
-    if not pairs:
-        raise InputError("evaluate: expected at least one data set and one system, got none")
     ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
     return Result(dict(zip(pairs, ranked, strict=True)), cache)
 
@@ -85,7 +82,6 @@ class Result:
     """Rankings of data sets by systems, the result of `mfvpr.evaluate`.
 
         print(result.table())
-        result.save("run")
         result.write_report("report.html")
 
     `thresholds` are largest distances of a correct prediction in the unit of the ground truth, `ks` depths of recall.
@@ -106,10 +102,8 @@ class Result:
     def only(self) -> RankedDataset:
         """Rankings of the only data set by the only system; InputError if there are several."""
         if len(self.parts) > 1:
-            raise InputError(
-                f"result: expected one data set and one system, got {len(self.parts)} pairs; choose one of parts: "
-                f"{', '.join(map(str, self.parts))}"
-            )
+            expected = f"expected one data set and one system, got {len(self.parts)} pairs"
+            raise InputError(f"result: {expected}; choose one of parts: {', '.join(map(str, self.parts))}")
         return next(iter(self.parts.values()))
 
     def table(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> Table:
@@ -118,12 +112,10 @@ class Result:
         Data sets without ground truth are left out; an InputError if there is no other.
         """
         several_data, several_systems = (len(names) > 1 for names in self._names)
-        rows = []
-        for row in self._rows(thresholds, ks):
-            system = row["system"] if several_systems else row["score"]
-            dropped = {name: row[name] for name in row if name != "data set" or several_data}
-            if row["decides"] or not several_systems:
-                rows.append(dropped | {"system": system})
+        rows = [row for row in self._rows(thresholds, ks) if row["decides"] or not several_systems]
+        for row in rows:
+            row["system"] = row["system"] if several_systems else row["score"]
+            row["data set"] = row["data set"] if several_data else None
         return recall_table(rows)
 
     def to_latex(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> str:
@@ -131,12 +123,14 @@ class Result:
         return self.table(thresholds, ks).latex()
 
     def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
-        """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold."""
+        """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold; needs pandas."""
+        from pandas import DataFrame
+
         rows = []
         for row in self._rows(thresholds, ks):
-            recall = {f"R@{k}": value for k, value in row.pop("recall_at").items()}
-            rows.append(row | recall)
-        return data_frame(rows)
+            recall_at = row.pop("recall_at")
+            rows.append(row | {f"R@{k}": recall for k, recall in recall_at.items()})
+        return DataFrame(rows)
 
     @cached_property
     def predictions(self) -> list[TopPrediction]:
@@ -146,18 +140,16 @@ class Result:
             database = report.ranked.dataset.database.names
             for place, ranked in enumerate(report.ranked.systems[report.headline]):
                 sequence, correct = report.sequences[place], report.is_correct(report.headline, place)
-                for query, (row, score) in enumerate(zip(ranked.rows[:, 0], ranked.scores[:, 0], strict=True)):
-                    top = (database[row], float(score)) if row >= 0 else (None, math.nan)
+                for query, (name, row) in enumerate(zip(sequence.images.names, ranked.rows[:, 0], strict=True)):
+                    top = (database[row], float(ranked.scores[query, 0])) if row >= 0 else (None, math.nan)
                     is_correct = None if correct is None else bool(correct[query, 0])
-                    name = sequence.images.names[query]
                     predictions.append(TopPrediction(*names, sequence.name, name, *top, is_correct))
         return predictions
 
     def save(self, folder: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> list[Path]:
-        """Write the files of `mfvpr evaluate` but its figures, for `mfvpr report`, and return the run folders.
+        """Write the files of `mfvpr evaluate` but its figures into a new or empty folder, and return the run folders.
 
-        Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table. A folder
-        that is not empty raises an `InputError`.
+        Each of several data sets and systems has a run folder `folder/DATASET/SYSTEM`, beside a joint table.
         """
         folders, several, reports = list[Path](), len(self.parts) > 1, self._reports(thresholds, ks)
         dataset_files, system_files = map(file_names, self._names)
@@ -187,10 +179,7 @@ class Result:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""
         with tempfile.TemporaryDirectory() as root:
             folders = self.save(Path(root) / "run", thresholds, ks)
-            if len(folders) > 1:
-                pages.write_comparison(folders, Path(path))
-            else:
-                pages.write_report(folders[0], Path(path))
+            write_page(folders[0], Path(path)) if len(folders) == 1 else write_comparison(folders, Path(path))
 
     @property
     def _names(self) -> tuple[list[str], list[str]]:

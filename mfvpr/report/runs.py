@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.datasets.ground_truth import threshold_words
-from mfvpr.report.tables import Table, format_values, read_csv
+from mfvpr.report.tables import Table, format_values, read_csv, table_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import lock_folder, write_text
 from mfvpr.utils.fingerprints import fingerprint, versions
@@ -31,17 +31,11 @@ Figure = tuple[str, Callable[[Path], Any]]  # name of the file, and what draws i
 
 @contextmanager
 def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
-    """Make and lock a new or empty folder, until the block or the process ends.
+    """Make and lock a new or empty folder, until the block or the process ends; it is removed if it is still empty.
 
-    An empty folder is removed at the end, with the parents that were made for it.
-
-    Args:
-        folder: of the run.
-        numbered: take `folder-2`, `folder-3`, ... if the folder exists.
-        own: only runs write into the folder; files of a killed run are removed.
-
-    Raises:
-        InputError: the folder cannot be made or written to, is not empty, or another run uses it.
+    If `numbered`, `folder-2`, `folder-3`, ... stand in for a folder that exists. If only runs write into the folder
+    (`own`), files of a killed run are removed. An InputError if the folder cannot be written to, is not empty, or
+    another run uses it.
     """
     first, above = folder, [parent for parent in folder.absolute().parents if not parent.exists()]
     if folder.is_symlink() or folder.is_file():
@@ -101,18 +95,15 @@ def commit(place: Path) -> str | None:
     return output.strip() or None
 
 
-def write_about(
-    folder: Path, settings: Mapping[str, Any], ground_truth: Mapping[str, Any], command: str | None = None
-) -> None:
+def write_about(folder: Path, settings: Mapping[str, Any], truth: Mapping[str, Any], command: str | None) -> None:
     """Write `run.json`: how a run was made."""
-    about = {"command": command, "settings": settings, "ground_truth": ground_truth}
+    about = {"command": command, "settings": settings, "ground_truth": truth}
     write_json(folder / "run.json", {**about, "commit": commit(Path()), "versions": versions()})
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write readable JSON, valid for all names of files."""
-    text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
-    write_text(path, re.sub("[\ud800-\udfff]", lambda surrogate: f"\\u{ord(surrogate[0]):04x}", text) + "\n")
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def write_table(folder: Path, table: Table, heading: str, *, name: str = "table") -> None:
@@ -141,15 +132,13 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
     with lock_folder(multirun, None):
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
         jobs = sorted([*known, job], key=lambda job: job["job"])
-        names = dict.fromkeys(name for job in jobs for name in job["overrides"])
-        differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1 and name != "out"]
-        columns = list(dict.fromkeys(name for job in jobs for row in job["rows"] for name in row))
+        names = dict.fromkeys(name for job in jobs for name in job["overrides"] if name != "out")
+        differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1]
         lines = []
-        for job in jobs:
-            settings = [job["overrides"].get(name, "") for name in differing]
-            for row in job["rows"]:
-                lines.append([str(job["job"]), *settings, *(row.get(name, "") for name in columns), job["run"]])
-        table = Table(["job", *differing, *columns, "run"], lines, text_columns=len(differing) + 2)
+        for each in jobs:
+            settings = {name: each["overrides"].get(name, "") for name in differing}
+            lines += [{"job": str(each["job"])} | settings | row | {"run": each["run"]} for row in each["rows"]]
+        table = table_of(lines, ["job", *differing, "system", "sequence"])
         write_table(multirun, table, f"{len(jobs)} jobs")
         write_json(multirun / LAST, {"jobs": jobs})
 

@@ -5,15 +5,11 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%_#${}"}
@@ -48,7 +44,7 @@ class Table:
         return "".join(f"| {' | '.join(row)} |\n" for row in escaped)
 
     def csv(self) -> str:
-        """Comma-separated, quoted where needed."""
+        """Comma-separated lines that end in \\n; every cell with an end of a line is quoted."""
         return _csv([self.header, *self.rows])
 
     def latex(self) -> str:
@@ -59,13 +55,12 @@ class Table:
         return "\n".join([*body, r"\end{tabular}", ""])
 
 
-def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
-    """Rows by column as a `DataFrame`; InputError if pandas is not installed."""
-    try:
-        import pandas
-    except ImportError:
-        raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
-    return pandas.DataFrame(rows)
+def table_of(rows: Sequence[Mapping[str, str]], text_columns: Sequence[str]) -> Table:
+    """Table of rows by column, those with text first; cells that a row lacks are empty."""
+    known = dict.fromkeys(name for row in rows for name in row)
+    texts = [name for name in text_columns if name in known]
+    header = list(dict.fromkeys([*texts, *known]))
+    return Table(header, [[row.get(name, "") for name in header] for row in rows], len(texts))
 
 
 def read_table(path: Path) -> Table:
@@ -109,9 +104,7 @@ def format_number(value: Any) -> str:
 
 def format_value(value: Any) -> str:
     """A parameter's value in a cell."""
-    if value is None:
-        return "none"
-    return f"{value:g}" if isinstance(value, float | np.floating) else str(value)
+    return "none" if value is None else f"{value:g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def format_values(values: Mapping[str, Any]) -> str:
@@ -121,11 +114,9 @@ def format_values(values: Mapping[str, Any]) -> str:
 
 def format_interval(interval: tuple[float, float]) -> str:
     """An interval of fractions, in %."""
-    low, high = interval
-    return f"[{100 * low:.1f}, {100 * high:.1f}]"
+    return f"[{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
 
 
 def format_estimate(estimate: tuple[float, tuple[float, float]]) -> str:
     """A fraction with its interval, in %."""
-    recall, interval = estimate
-    return f"{100 * recall:.1f} {format_interval(interval)}"
+    return f"{100 * estimate[0]:.1f} {format_interval(estimate[1])}"

@@ -185,13 +185,11 @@ def _whitening(
         pack=lambda whitening: {"mean": whitening.mean, "components": whitening.components},
         unpack=lambda arrays: Whitening(arrays["mean"], arrays["components"], own_origin),
     )
-    whitening = files.get(key)
-    if whitening is None:
-        is_damaged = key in files
-        if is_damaged:
+    if (whitening := files.get(key)) is None:
+        if is_damaged := key in files:
             cache.warn(f"{files.path(key)}: is damaged; learned again")
-        whitening = learn()
-        files.update({key: whitening}, once=not is_damaged)  # the first of several counts: bits may differ
-        cache.log(f"{name} of {whitening.dimension} dimensions in {files.folder}")
-        whitening = files.get(key) or whitening
+        files.update({key: learn()}, once=not is_damaged)  # the first of several counts: bits may differ
+        whitening = files.get(key)
+        cache.log(f"{name} in {files.folder}")
+    assert whitening is not None
     return whitening

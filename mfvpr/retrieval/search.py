@@ -19,6 +19,7 @@ SHARE = 1 / 16  # of the free memory, for the similarities that exist at the sam
 ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it
 ROWS_SHARE = 1 / 4  # of an accelerator's free memory, for the database rows there
 BLOCK = 128  # database rows, of which an accelerator first looks at the largest similarity
+MAX_SAMPLES = 4096  # descriptors, evenly spread over the database, that a whitening is learned from
 
 Queries = Float[np.ndarray, "queries dimensions"]
 Database = Float[np.ndarray, "database dimensions"]
@@ -40,12 +41,6 @@ class ExactSearch:
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
-        if queries.shape[1] != database.shape[1] or not len(queries) or not len(database):
-            expected, got = "at least one on both sides, of as many numbers", f"{queries.shape} and {database.shape}"
-            raise InputError(f"global descriptors: expected {expected}, got shapes {got} (database)")
-        if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
-            expected = f"rows for {len(queries)} queries and {len(database)} database images"
-            raise InputError(f"excluded: expected {expected}, got {len(excluded)} and {excluded.num_database}")
         device = device_of(())
         num_rows = ROWS
         if device.platform != "cpu":  # as many as fit, since every part costs a wait
@@ -80,24 +75,18 @@ class WhitenedSearch:
 
     Attributes:
         dimension: D', number of components.
-        max_samples: maximum number of descriptors to learn from, evenly spread over the database.
         whitening: the learned components; None = `shortlist` learns them from the database.
     """
 
     dimension: int
-    max_samples: int = 4096
     whitening: Whitening | None = None
-
-    def __post_init__(self) -> None:
-        if self.dimension < 1:
-            raise InputError(f"whitening: dimension={self.dimension}: expected at least 1")
 
     def fit(self, database: Database) -> "WhitenedSearch":
         """Search with the principal components of a database; itself if they were learned."""
         if self.whitening is not None:
             return self
         usable = database[np.isfinite(database).all(axis=1)]
-        rows = np.linspace(0, len(usable) - 1, min(len(usable), self.max_samples)).astype(int)
+        rows = np.linspace(0, len(usable) - 1, min(len(usable), MAX_SAMPLES)).astype(int)
         fitted = fit_whitening(usable[rows].astype(np.float64), self.dimension)
         single = Whitening(fitted.mean.astype(np.float32), fitted.components.astype(np.float32))
         return replace(self, whitening=single)

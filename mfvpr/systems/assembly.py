@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mfvpr import features
-from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, SUFFIX, named_weight
+from mfvpr.baselines.learned_weight import SUFFIX, WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
 from mfvpr.core import Scorer
@@ -168,7 +168,7 @@ def _matching() -> dict[str, dict[str, Any]]:
 def _scorers() -> dict[str, dict[str, Any]]:
     """Settings of each scorer; a match weight may also be one that is named, or a file."""
     all_known = {name: settings_of(scorer) for name, scorer in SCORERS.items()}
-    rule = one_of(*NAMED_WEIGHTS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
+    rule = one_of(*WORDS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
     for known in all_known.values():
         if "weight" in known:
             known["weight"] = replace(known["weight"], rule=rule, note="a list: a scorer of each")
@@ -432,7 +432,7 @@ def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
     return {
-        name: {**values, "weight_content": fingerprint(recipe_of(NAMED_WEIGHTS[values["weight"]]))}
+        name: {**values, "weight_content": fingerprint(recipe_of(named_weight(values["weight"])))}
         if values.get("weight", "fs") not in WEIGHTS
         else {**values}
         for name, values in expand_weights(settings).items()

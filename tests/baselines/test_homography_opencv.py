@@ -1,4 +1,4 @@
-"""OpenCV's homography: the scores of plain calls of OpenCV, in all functions of the library."""
+"""Scorers on the host: OpenCV's homography beside plain calls of OpenCV, and scorers of users that break the rules."""
 
 from dataclasses import replace
 
@@ -7,17 +7,29 @@ import jax
 import numpy as np
 import pytest
 
+import mfvpr
 from mfvpr import OpenCvHomography, score_candidates, score_grid
+from mfvpr.core.types import Shortlist
+from mfvpr.core.types import per_match as per_match_of
 from mfvpr.evaluation import stages
+from mfvpr.matchers import MatchSet
 from mfvpr.tuning import sweeps
 from mfvpr.utils import InputError
 from tests.baselines.test_homography import plane_points
-from tests.builders import make_matches, per_match
-from tests.core.test_host import BATCH, CANDIDATES, MATCHES, POINTS
+from tests.builders import make_matches, per_match, stack
 from tests.scorers import pair_of
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.optimized
+
+COUNTS = (60, 120, 20)
+POINTS = [plane_points(seed, *case) for seed, case in enumerate(zip(COUNTS, (0.5, 0.2, 0.8), strict=True))]
+PAIRS = [make_matches(points0, points1, capacity=128, index0=np.arange(len(points0))) for points1, points0 in POINTS]
+BATCH = stack(PAIRS)
+LINES = {name: values[BATCH.mask] for name, values in per_match_of(BATCH).items()}
+ROW = replace(BATCH, mask=np.ones(200, bool), image_size0=BATCH.image_size0[0], **LINES)
+MATCHES = MatchSet.of([ROW], np.array([COUNTS]))
+CANDIDATES = Shortlist(np.arange(3)[None], np.array([[0.3, 0.2, 0.1]], np.float32), np.ones((1, 3), bool))
 
 
 def count_inliers(estimator, threshold=8.0, iterations=2000):
@@ -58,9 +70,7 @@ def test_jax_cannot_look_into_it(trace):
         trace(lambda points, matches: OpenCvHomography()(replace(matches, points0=points)))(matches.points0, matches)
 
 
-@pytest.mark.parametrize(
-    ("field", "number"), [("threshold", 0.0), ("threshold", np.nan), ("confidence", 1.0), ("max_iterations", 0.0)]
-)
+@pytest.mark.parametrize(("field", "number"), [("threshold", 0.0), ("confidence", 1.0), ("max_iterations", 0.0)])
 def test_numbers_that_opencv_would_replace_raise(field, number):
     with pytest.raises(InputError, match=f"{field}=.*: expected a number"):
         score_candidates(OpenCvHomography(**{field: number}), BATCH)
@@ -80,3 +90,47 @@ def test_few_matches_and_broken_ones():
         assert float(OpenCvHomography()(replace(matches, mask=2 * matches.mask.astype(np.uint8)))) == 4
     assert float(OpenCvHomography()(make_matches(points0, points1, confidence=[1, 1, 0.5, 0]))) == 3
     assert np.isnan(OpenCvHomography()(make_matches(points0, points1, confidence=np.full(4, np.nan))))
+
+
+@mfvpr.value
+class Host:
+    """Scores by `answer` from the masks."""
+
+    shift: float = 0.0
+
+    def __call__(self, matches):
+        return np.float32(0)
+
+    def score_pairs(self, matches):
+        return answer(np.asarray(matches.mask))
+
+
+def answer(masks):
+    return masks.sum(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda _: 1.0, r"\d+ pairs, got an array"),
+        (lambda masks: masks[:, :1], r"\d+ pairs, got an array"),
+        (lambda masks: masks.sum(axis=1) * 1j, "real numbers.* got complex"),
+    ],
+)
+def test_a_real_number_for_each_pair_is_expected(monkeypatch, wrong, words):
+    monkeypatch.setitem(globals(), "answer", wrong)
+    for score in (
+        lambda scorer: score_candidates(scorer, BATCH),
+        lambda scorer: score_grid(scorer, BATCH, max_distance=[9.0]),
+        lambda scorer: sweeps.rank_settings(scorer, [{"max_distance": 9.0}], MATCHES, CANDIDATES),
+    ):
+        with pytest.raises(InputError, match=rf"Host\.score_pairs: .*{words}"):
+            score(Host())
+
+
+def test_a_class_that_is_no_value_raises():
+    class Plain(OpenCvHomography):
+        pass
+
+    with pytest.raises(InputError, match=r"Plain: .*score_pairs.*decorate"):
+        score_candidates(Plain(), BATCH)

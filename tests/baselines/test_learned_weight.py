@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from mfvpr import AggregatedScore, HistogramOfShifts, InputError, UnitWeight, score_candidates
-from mfvpr.baselines.learned_weight import ABSOLUTE, INPUTS, RELATIVE, LearnedWeight
+from mfvpr import AggregatedScore, HistogramOfShifts, UnitWeight, score_candidates
+from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
 from mfvpr.core.weights import match_weights
 from tests.builders import double, make_matches, per_match, random_matches, stack
 from tests.scorers import pair_of
@@ -110,16 +110,6 @@ def test_whole_pairs_of_padding_may_hold_anything(names):
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradient))
 
 
-def test_a_constant_input_and_no_match_at_all_divide_by_1():
-    constant = make_matches([(10, 20), (30, 40)], [(1, 2), (3, 5)], scores0=[0.1, 0.1], ratio=[0.3, 0.9])
-    weight = LearnedWeight.create(KEY, constant, names=("scores0", "ratio"))
-    assert weight.scale[0] == 1
-    assert weight.scale[1] == pytest.approx(0.3)
-    without_matches = LearnedWeight.create(KEY, make_matches([], [], ratio=[], capacity=3))
-    assert np.all(without_matches.center == 0)
-    assert np.all(without_matches.scale == 1)
-
-
 @both
 def test_values_equal_the_loops(names):
     matches, weight = pair_of(pairs(2)), random_weight(names)
@@ -146,20 +136,6 @@ def test_relative_inputs_are_those_of_other_units():
     np.testing.assert_allclose(weigh(weight, other)[:40], expected, rtol=1e-5)
     wider = pair_of(pairs(7, capacity=100))
     np.testing.assert_allclose(weigh(weight, wider)[:40], expected, rtol=1e-6)
-
-
-def test_inputs_by_name():
-    assert {*RELATIVE, *ABSOLUTE} == {*INPUTS}
-    for names in ((), ("ratio", "ratio"), "ratio", ("ratio", "depth")):
-        with pytest.raises(InputError, match=r"LearnedWeight: expected different names of ratio, .*got"):
-            LearnedWeight.create(KEY, pairs(), names=names)
-
-
-@pytest.mark.parametrize("bias", [-1e4, -90.0, 1e4])
-def test_always_above_0_and_finite(bias):
-    weights = weigh(replace(random_weight(), output_bias=np.float32(bias)), pair_of(pairs()))
-    assert np.all(weights > 0)
-    assert np.all(np.isfinite(weights))
 
 
 def test_statistics_have_no_gradient():

@@ -14,9 +14,10 @@ import mfvpr
 from mfvpr import HistogramOfShifts, InputError
 from mfvpr.baselines.learned_weight import (
     ABSOLUTE,
-    NAMED_WEIGHTS,
     RELATIVE,
+    WORDS,
     LearnedWeight,
+    named_weight,
     provenance,
     read_weight,
     write_weight,
@@ -29,7 +30,7 @@ from tests.programs import results, shared, small, typed
 pytestmark = pytest.mark.thorough
 
 MATCHES = random_matches(np.random.default_rng(0), 30)
-LEARNED = [name for name in NAMED_WEIGHTS if name not in WEIGHTS]
+LEARNED = [name for name in WORDS if name not in WEIGHTS]
 PROVENANCE = {"command": "by hand", "seeds": [1, 2]}
 WEIGHT = replace(LearnedWeight.create(jax.random.key(1), MATCHES, 3), output=np.float32([1, -2, 0.5]))
 
@@ -57,12 +58,8 @@ def test_to_the_last_bit(file, names):
     "change",
     [
         {"format": "mfvpr match weight 0"},
-        {"inputs": ["ratio"]},
         {"inputs": ["ratio", "x", "x0", "x1", "y0"]},
-        {"scale": [1, 1, 0, 1, 1]},
         {"hidden": [[0] * 3] * 4},
-        {"output": [1, "a", 2]},
-        {"output_bias": [1]},
         {"center": None},
     ],
 )
@@ -72,24 +69,10 @@ def test_damaged_files_raise(file, change):
         read_weight(file)
 
 
-def test_missing_files_and_other_json_raise(tmp_path):
-    (tmp_path / "text.json").write_text("[]")
-    for name, reason in (("none.json", "got nothing"), ("text.json", "")):
-        with pytest.raises(InputError, match=f"{name}: .*mfvpr learn.*{reason}"):
-            read_weight(tmp_path / name)
-
-
-def test_names():
-    assert len(NAMED_WEIGHTS) == len([*NAMED_WEIGHTS])
-    assert {name: NAMED_WEIGHTS[name] for name in [*NAMED_WEIGHTS][: len(WEIGHTS)]} == WEIGHTS
-    for name in ("heavy", "../weighting", None, ("fs",), 1):
-        assert name not in NAMED_WEIGHTS
-
-
 @pytest.mark.parametrize("name", LEARNED)
 def test_weights_of_the_package_have_a_provenance(name):
-    weight = NAMED_WEIGHTS[name]
-    assert weight is NAMED_WEIGHTS[name]
+    weight = named_weight(name)
+    assert weight is named_weight(name)
     assert weight.names == RELATIVE
     weights = np.asarray(weight(MATCHES))[np.asarray(MATCHES.mask)]
     assert (weights > 0).all()
@@ -104,12 +87,12 @@ def test_the_file_of_a_user(file, monkeypatch):
     scorer = scorers({"method": "histogram", "weight": str(file)})["histogram"]
     jax.tree.map(np.testing.assert_array_equal, scorer.weight, WEIGHT)
     assert float(scorer(MATCHES)) == float(HistogramOfShifts(weight=WEIGHT)(MATCHES)) > 0
-    assert NAMED_WEIGHTS[str(file)] is scorer.weight
+    assert named_weight(str(file)) is scorer.weight
     monkeypatch.setenv("HOME", str(file.parent))
-    jax.tree.map(np.testing.assert_array_equal, NAMED_WEIGHTS["~/mine.json"], WEIGHT)
+    jax.tree.map(np.testing.assert_array_equal, named_weight("~/mine.json"), WEIGHT)
     write_weight(file, replace(WEIGHT, output_bias=np.float32(7)), {})
     os.utime(file, ns=(1, 1))
-    assert float(NAMED_WEIGHTS[str(file)].output_bias) == 7 != float(scorer.weight.output_bias)
+    assert float(named_weight(str(file)).output_bias) == 7 != float(scorer.weight.output_bias)
 
 
 @pytest.fixture
@@ -139,18 +122,6 @@ def test_programs_rank_by_a_file_as_by_the_equal_word(run, file, tmp_path):
         lines = (tmp_path / str(number) / "predictions" / "histogram.csv").read_text().splitlines()
         rankings.append([line.split(",")[:3] for line in lines])
     assert rankings[0] == rankings[1] != rankings[2]
-
-
-def test_a_file_of_other_content_is_another_setting_of_a_confidence(run, tmp_path):
-    warnings = []
-    for number, weight in enumerate((WEIGHT, WEIGHT, replace(WEIGHT, output=np.float32([3, 0, 1])))):
-        file = tmp_path / f"{number}.json"
-        write_weight(file, weight, {})
-        confidence = [f"confidence={tmp_path}/0/confidence.json"] if number else []
-        code, _, stderr = run("evaluate", *weighted_histogram(file, tmp_path / str(number)), *confidence)
-        assert code == 0, stderr
-        warnings.append("other settings of scorer" in stderr)
-    assert warnings == [False, False, True]
 
 
 def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):

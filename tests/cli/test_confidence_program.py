@@ -65,9 +65,6 @@ def test_a_run_says_how_sure_its_answers_are(evaluate):
     assert 0 < origin["absent_queries"] <= np.isfinite(absent).sum()
     average_precision = precision_recall(probability, hits["histogram"]).average_precision
     assert table["histogram"]["AP by confidence"] == f"{100 * average_precision:.1f}"
-    shares = csv_rows(out / "rerank_share.csv")
-    for line, system in ((shares[0], "retrieval"), (shares[-1], "histogram")):
-        assert line["histogram"] == f"{100 * hits[system].mean():.1f}"
 
 
 def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):

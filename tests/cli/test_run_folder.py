@@ -58,29 +58,6 @@ def test_predictions_are_long_and_agree_with_the_recall(evaluated):
     assert (evaluated / "predictions.csv").read_bytes() == (evaluated / "predictions" / "histogram.csv").read_bytes()
 
 
-@pytest.mark.parametrize("system", ["retrieval", "histogram", "histogram_retrieval"])
-def test_failures_are_the_wrong_first_answers(evaluated, system):
-    ranked = {}
-    for line in csv_rows(evaluated / "predictions" / f"{system}.csv"):
-        ranked.setdefault(line["query"], []).append(line)
-    incorrect = {query: lines for query, lines in ranked.items() if lines[0]["correct"] == "0"}
-    failures = csv_rows(evaluated / "failures" / f"{system}.csv")
-    assert [line["query"] for line in failures] == list(incorrect)
-    assert 0 < len(failures) < QUERIES
-    assert {bool(line["rank"]) for line in failures} == {True, False} or system != "retrieval"
-    for line in failures:
-        lines = incorrect[line["query"]]
-        assert line["prediction"] == lines[0]["database"]
-        first = next((line for line in lines if line["correct"] == "1"), None)
-        if first is None:
-            assert [line[name] for name in ("rank", "correct_image", "score", "margin")] == [""] * 4
-        else:
-            assert (line["rank"], line["correct_image"], line["score"]) == (
-                first["rank"], first["database"], first["score"])  # fmt: skip
-            margin = float(lines[0]["score"]) - float(first["score"])
-            assert float(line["margin"]) == pytest.approx(margin, abs=1e-5)
-
-
 def test_gains_are_what_the_predictions_say_of_each_query(evaluated):
     gains, hits = csv_rows(evaluated / "gains.csv"), {}
     assert [line["place"] for line in gains] == [*map(str, range(QUERIES))]
@@ -120,16 +97,13 @@ def test_results_heading_and_tables_say_what_made_them(evaluated):
         assert (row["queries"], row["database"], row["candidates"]) == (QUERIES, QUERIES, CANDIDATES)
         assert {"data", "features", "retrieval", "scores"} <= {*row["seconds"]}
         assert {"mfvpr", "jax", "numpy"} <= {*row["versions"]}
-        assert {*map(len, row["data_fingerprint"].values())} == {16}
     assert next(row for row in entries if row["system"] == "histogram")["parameters"]["sigma"] == 22.5
     truth = entries[0]["ground_truth"]
     assert (truth["kind"], truth["unit"], truth["thresholds"]) == ("index", "frames", [0, 1])
-    heading, _, *table = (evaluated / "table.md").read_text().splitlines()
-    latex = (evaluated / "table.tex").read_text()
-    assert latex.startswith(f"% {heading}\n")
+    heading, *_ = (evaluated / "table.md").read_text().splitlines()
+    assert heading == entries[0]["description"]
     for line in csv_rows(evaluated / "table.csv"):
-        assert f"| {' | '.join(line.values())} |" in table
-        assert f"{' & '.join(line.values())} \\\\\n" in latex
+        assert f"{' & '.join(line.values())} \\\\\n" in (evaluated / "table.tex").read_text()
 
 
 def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
@@ -140,13 +114,10 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
     stdout, _ = succeed("evaluate", *small(root), "scorer=count", "figures=0", "out=a b")
     assert stdout.endswith("results: a b\nreport: a b/report.html\n")
     content = json.loads((tmp_path / "a b" / "run.json").read_text())
-    assert content["command"].startswith("mfvpr evaluate dataset=folder dataset.database=")
     assert content["command"].endswith(" scorer=count figures=0 'out=a b'")
-    expected = composed(*small(root), "scorer=count", "figures=0", "out='a b'")
-    assert content["settings"] == expected | {"cluster": {}}
+    assert content["settings"] == composed(*small(root), "scorer=count", "figures=0", "out='a b'") | {"cluster": {}}
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert content["commit"] == head.stdout.strip()
-    assert {"mfvpr", "jax", "python"} <= content["versions"].keys()
     subprocess.run(["git", "add", "."], cwd=tmp_path, check=True)
     assert runs.commit(tmp_path) == content["commit"] + "-dirty"
     assert runs.commit(Path("/")) is None
@@ -242,45 +213,23 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
 # --- what goes wrong at the end ----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def limited(monkeypatch):
+def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, monkeypatch):
     """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
     before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), jobs.write_results
 
-    def limit(size):
-        def limited(*arguments, **named):
-            resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-            try:
-                write_results(*arguments, **named)
-            finally:  # at once: the log of the tests is a file, too
-                resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    def limited(*arguments, **named):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+        try:
+            write_results(*arguments, **named)
+        finally:  # at once: the log of the tests is a file, too
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-        monkeypatch.setattr(jobs, "write_results", limited)
-
-    return limit
-
-
-def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, limited):
-    limited(2000)
+    monkeypatch.setattr(jobs, "write_results", limited)
     code, stdout, stderr = call("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
     assert code == 2
     assert "\nhistogram + retrieval " in stdout
-    last = stderr.splitlines()[-1]
-    assert last.startswith(f"error: {tmp_path}/out: the results cannot be written (File too large)")
-    assert "with out=DIR" in last
-    assert "Traceback" not in stderr
+    assert stderr.splitlines()[-1].startswith(f"error: {tmp_path}/out: the results cannot be written (File too large)")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, succeed, limited):
-    limited(30_000)
-    stdout, stderr = succeed("evaluate", *small(root), *LINES, f"out={tmp_path}/out")
-    assert stdout.endswith(f"results: {tmp_path}/out\nreport: {tmp_path}/out/report.html\n")
-    warnings = [line for line in stderr.splitlines() if line.startswith(f"warning: {tmp_path}/out/figures/incorrect_")]
-    assert len(warnings) == 2
-    assert all("not drawn ([Errno 27] File too large" in line for line in warnings)
-    assert (tmp_path / "out" / "predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
-    assert not [path for path in (tmp_path / "out").rglob(".*")]
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):

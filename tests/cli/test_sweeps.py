@@ -56,7 +56,7 @@ def test_the_best_setting_is_honestly_named(swept):
     assert [*result.chosen] == ["first_half", "second_half"]
     hits = outcome.protocol.reported_hits(outcome.rows, outcome.chosen)[1]
     assert result.interval == statistics.estimate(hits)
-    assert repr(result).startswith("Sweep(folder, MyScorer: 6 settings of sigma, weight; best sigma = ")
+    assert repr(result).startswith("Sweep(folder, MyScorer: 6 settings; best sigma = ")
     assert len(repr(result)) < 200
 
 

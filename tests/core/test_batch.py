@@ -16,7 +16,6 @@ from mfvpr import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     HistogramOfShifts,
-    InputError,
     MatchCount,
     UnitWeight,
     filter_matches,
@@ -27,7 +26,7 @@ from mfvpr.core import batch as batch_module
 from mfvpr.core import histogram
 from mfvpr.core.batch import by_capacity
 from tests.builders import random_matches, stack
-from tests.scorers import FOREIGN, Strongest, Wrapped, title
+from tests.scorers import Strongest, Wrapped
 
 pytestmark = pytest.mark.thorough
 
@@ -118,12 +117,8 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
     [
         (HistogramOfShifts(), {"sgma": [1.0]}, "sigma"),
         (HistogramOfShifts(), {"sigma": [-3.0, 10.0]}, "expected a"),
-        (AnchorPoints(), {"tolerance": [np.nan]}, "expected a"),
         (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
-        (HistogramOfShifts(), {}, "at least one axis"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
-        (AnchorPoints(), {"sigma": [1.0]}, "window, tolerance"),
-        (AnchorPoints(), {"weight": [1.0]}, "weight=1.0: expected one of fs, .* UnitWeight"),
         (AnchorPoints(), {"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
         (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
     ],
@@ -142,14 +137,6 @@ def test_parameters_of_parts_are_axes_by_dotted_names(matches):
         np.testing.assert_allclose(row, score_candidates(scorer, matches), rtol=2e-6)
 
 
-@pytest.mark.parametrize("scorer", FOREIGN, ids=title)
-def test_foreign_scorers_are_gridded_as_they_score(matches, scorer):
-    scores = score_grid(scorer, matches, max_distance=[0.7, 1.5])
-    for row, limit in zip(scores, (0.7, 1.5), strict=True):
-        near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
-        np.testing.assert_allclose(row, score_candidates(scorer, near), rtol=2e-6)
-
-
 @pytest.mark.parametrize("count", [4, 20])
 def test_a_plain_function_may_close_over_traced_values(count):
     """Few candidates at once, or as many as would be shared by the cores."""
@@ -166,11 +153,3 @@ def test_a_plain_function_may_close_over_traced_values(count):
     sigmas = jnp.array([10.0, 20.0])
     twice = jax.jit(lambda t: t * score_grid(scaled, pairs, sigma=sigmas))(2.0)
     np.testing.assert_allclose(jnp.sum(twice), 2 * expected, rtol=1e-5)
-
-
-def test_scores_are_real_and_indices_of_weights_are_no_axis():
-    matches = stack([random_matches(np.random.default_rng(0), 9)])
-    with pytest.raises(InputError, match="expected real numbers as scores, got complex64"):
-        score_candidates(lambda pair: jnp.sum(pair.distance).astype(jnp.complex64), matches)
-    with pytest.raises(ValueError, match=r"no numeric parameter 'weight\.index'"):
-        score_grid(HistogramOfShifts(), matches, weight=["fs", "unit"], **{"weight.index": [0, 1]})

@@ -1,6 +1,5 @@
 """Products of bfloat16 that are checked, against checked products of all pairs in NumPy."""
 
-import re
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -14,8 +13,6 @@ import mfvpr
 from mfvpr.core import checked
 from mfvpr.core.matching import match, match_prepared
 from mfvpr.core.nearest import ready
-from mfvpr.core.types import per_match
-from mfvpr.matchers.matcher import match_pairs
 from tests.builders import make_features, stack, unit
 
 pytestmark = [pytest.mark.optimized, pytest.mark.thorough]
@@ -194,31 +191,6 @@ def test_sums_are_checked_where_bfloat16_loses_nothing():
     assert wrong > 0  # or no sum had to be checked
 
 
-def test_too_many_second_neighbors_are_not_settled():
-    rng = np.random.default_rng(0)
-    query, near = unit(rng.normal(size=(2, DIMENSIONS)))
-    crowd = unit(near + 1e-6 * rng.normal(size=(checked.MOST_CHECKS + 4, DIMENSIONS)))
-    pair = features_of(query[None]), features_of([query, *crowd])
-    for with_second in (False, True):
-        assert mutual_neighbors(*pair, with_second=with_second)[1] == (not with_second)
-
-
-@pytest.mark.parametrize("with_ratio", [False, True])
-@pytest.mark.parametrize("noise", [0, 1e-4])
-def test_too_many_close_products_are_left_to_float32(noise, with_ratio):
-    """Equal descriptors, where the first index wins, and nearly equal ones."""
-    query, candidate = make_pair("random")
-    for side in (query, candidate):
-        side.descriptors[side.mask] = unit(query.descriptors[:1] + noise * side.descriptors[side.mask])
-    matches = rounded_once(query, stack([candidate]), with_ratio)
-    in_single = mfvpr.match_candidates(query, stack([candidate]), with_ratio=with_ratio, product="float32")
-    mask = np.asarray(in_single.mask)
-    assert (mask.sum() > 5) if noise else (np.flatnonzero(mask[0]).tolist() == [0])
-    np.testing.assert_array_equal(matches.mask, mask)
-    for name, values in per_match(in_single).items():
-        np.testing.assert_array_equal(np.asarray(getattr(matches, name))[mask], np.asarray(values)[mask])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*KINDS, "equal", "three times", "all padding", "few"])
 def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
@@ -241,38 +213,6 @@ def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
     rounded = round_query(query).rounded, checked.round_candidate(ready(candidate))
     _, settled = jax.jit(partial(checked.mutual_neighbors, with_second=False))(*rounded)
     assert settled == (kind not in ("twins", "near twins", "equal", "three times"))
-
-
-@pytest.mark.parametrize("kind", ["infinite", "far too long", "rounded to infinity", "overflow"])
-def test_numbers_out_of_range_match_as_in_float32(kind):
-    rng = np.random.default_rng(1)
-    # So few that all can be checked.
-    query, candidate = make_features(rng, 14, dimension=256), make_features(rng, 12, capacity=15, dimension=256)
-    candidate.descriptors[:12] = unit(query.descriptors[:12] + 0.03 * rng.normal(size=(12, 256)))
-    candidate.descriptors[12:] = 5 * query.descriptors.sum(axis=0)  # padding
-    if kind == "infinite":
-        candidate.descriptors[11, 5] = np.inf
-    elif kind == "far too long":
-        query.descriptors[3] *= 1e20
-    elif kind == "rounded to infinity":
-        query.descriptors[3, 0] = 3.4e38
-    else:
-        query.descriptors[3], candidate.descriptors[:2] = 1.1513e18, np.array([[1.1513e18], [0.5757e18]])
-    batch = stack([candidate])
-    rounded = rounded_once(query, batch, True)
-    in_single = mfvpr.match_candidates(query, batch, with_ratio=True, product="float32")
-    mask = np.asarray(in_single.mask)
-    assert mask.sum() >= 2
-    np.testing.assert_array_equal(rounded.mask, mask)
-    for name, values in per_match(in_single).items():
-        np.testing.assert_array_equal(np.asarray(getattr(rounded, name))[mask], np.asarray(values)[mask])
-
-
-def test_no_pair_of_conversions_hides_what_rounding_takes_away():
-    query, _ = make_pair("random")
-    program = str(jax.make_jaxpr(checked.round_candidate)(query))
-    conversions = re.findall(r"(f32|bf16)\[[\d,]+\] = convert_element_type", program)
-    assert set(conversions) == {"bf16"}  # XLA may leave out a conversion to bfloat16 and back
 
 
 def test_other_devices_than_a_cpu_take_float32(monkeypatch):
@@ -319,8 +259,3 @@ def test_bfloat16_is_taken_for_long_descriptors_where_it_is_faster(monkeypatch):
     assert choose(long) == "float32"
     with pytest.raises(ValueError, match=r"expected cross_check=mutual, chunk_size=1.*leave product out"):
         checked.choose_product("bfloat16", long, long, "none", 2)
-    with pytest.raises(ValueError, match="product='half': expected one of bfloat16, float32"):
-        mfvpr.NearestNeighborMatcher(product="half")
-    pairs = np.zeros((2, 2), np.int32)
-    with pytest.raises(ValueError, match="chunk_size=1"):
-        match_pairs(*[stack([long])] * 2, pairs, 2, mfvpr.NearestNeighborMatcher(product="bfloat16", chunk_size=2))

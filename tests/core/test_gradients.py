@@ -55,7 +55,6 @@ RELATIVES = [
     VisualPhrases(length=3, cell_size=90.0),
     LostScore(),
     LostScore(form="unweighted", mirrored=True),
-    LostScore(form="described"),
 ]
 NUMBERS = ("bin_size", "sigma", "tolerance", "temperature", "weight")  # the window moves whole cells
 PER_MATCH = ("points0", "points1", "distance", "scores0", "scores1", "ratio", "confidence")
@@ -154,12 +153,3 @@ def test_the_window_moves_in_whole_cells():
     _, (of_scorer, _) = gradients(AnchorPoints(6, 4.0, temperature=0.5), fields_of(matches, PER_MATCH), matches)
     assert of_scorer.window == 0.0
     assert of_scorer.tolerance > 0.0
-
-
-def test_matches_that_are_constants_under_a_jit_are_scored():
-    """A parameter is traced there, the matches are not."""
-    matches = random_matches(np.random.default_rng(0), 20)
-    constants = jax.tree.map(jnp.asarray, matches)
-    score = jax.jit(lambda sigma: HistogramOfShifts(sigma=sigma)(constants))
-    np.testing.assert_allclose(score(10.0), HistogramOfShifts(sigma=10.0)(matches), rtol=1e-5)
-    assert np.isfinite(jax.jit(jax.grad(score))(10.0))

@@ -1,7 +1,6 @@
 """The histogram with every option, in grids and pair by pair; its smooth maximum, and the peak between bins."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import numpy as np
@@ -12,14 +11,12 @@ from mfvpr import (
     FeatureScoreWeight,
     HistogramOfShifts,
     UnitWeight,
-    filter_matches,
     score_candidates,
     score_grid,
 )
 from mfvpr.core.histogram import climb, smooth_maximum
 from mfvpr.utils import InputError
 from tests.builders import SIZE, make_matches, random_matches, stack
-from tests.scorers import pair_of
 
 pytestmark = pytest.mark.thorough
 
@@ -56,17 +53,6 @@ def test_a_grid_equals_pair_by_pair(matches, options):
         np.testing.assert_allclose(row, expected, rtol=2e-6, atol=1e-6)
 
 
-def test_a_grid_with_weights_and_distances_equals_pair_by_pair(matches):
-    weights, limits = [FeatureScoreWeight(), DescriptorDistanceWeight(), UnitWeight()], [0.3, 0.9, 1.5]
-    got = score_grid(HistogramOfShifts(), matches, sigma=[8.0, 40.0], weight=weights, max_distance=limits)
-    for j, weight in enumerate(weights):
-        for k, limit in enumerate(limits):
-            near = jax.vmap(partial(filter_matches, max_distance=limit))(matches)
-            for i, sigma in enumerate((8.0, 40.0)):
-                expected = score_candidates(HistogramOfShifts(sigma=sigma, weight=weight), near)
-                np.testing.assert_allclose(got[i, j, k], expected, rtol=2e-6)
-
-
 def test_a_weight_that_is_no_number_spoils_its_own_score_only(matches):
     spoiled = replace(matches, scores0=np.where(matches.mask, np.nan, matches.scores0))
     got = score_grid(HistogramOfShifts(bin_size=5.0), spoiled, weight=[FeatureScoreWeight(), UnitWeight()])
@@ -87,15 +73,6 @@ def test_numbers_without_meaning_score_nan(matches, options):
     scorer = HistogramOfShifts(**{"max_bins": 45} | {name: options[name] for name in options if name not in traced})
     got = jax.jit(lambda traced: score_candidates(replace(scorer, **traced), matches))(traced)
     np.testing.assert_array_equal(np.isnan(got), matches.mask.any(1))
-
-
-@pytest.mark.parametrize(("options", "bins"), [({"bin_size": 1e8}, (1, 1)), ({"shift_range": (0.0, 30.0)}, (1, 4))])
-def test_there_is_always_a_bin(matches, options, bins):
-    scorer = HistogramOfShifts(**options)
-    assert np.isfinite(score_candidates(scorer, matches)).all()
-    got = scorer.histogram(pair_of(matches))
-    assert (len(got.centers_x), len(got.centers_y)) == (max(bins), max(bins))
-    assert np.isfinite(got.scores).sum() == bins[0] * bins[1]
 
 
 def test_matches_agree_within_two_deviations_along_both_axes():

@@ -65,22 +65,6 @@ def draws(scorers, temperatures):
     return given(matches, st.sampled_from(scorers), st.sampled_from(temperatures))
 
 
-def test_points_outside_of_an_image_are_at_its_border():
-    matches = random_matches(np.random.default_rng(0), 16, capacity=16)
-    border = replace(
-        matches,
-        points0=np.where(matches.points0 < 90, 0, matches.points0).astype(np.float32),
-        points1=np.where(matches.points1 > 250, SIZE, matches.points1).astype(np.float32),
-    )
-    outside = replace(
-        border,
-        points0=np.where(border.points0 == 0, np.float32(-40), border.points0),
-        points1=np.where(border.points1 == SIZE, np.float32(SIZE + 99), border.points1),
-    )
-    scorer = replace(ANCHORS[0], temperature=0.3)
-    assert score(scorer, outside) == score(scorer, border) != score(scorer, matches)
-
-
 @pytest.mark.optimized
 @draws(HISTOGRAMS, [1e-6, 0.01, 0.3, 10.0, 1e3])
 def test_histogram_agrees_with_the_loop(matches, scorer, temperature):

@@ -108,22 +108,14 @@ def test_what_has_just_been_written_is_not_trusted(folder, cache, monkeypatch):
     assert all(name in record(cache).read_text() for name in ("0.png", "1.png", "2.png"))
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda content: b"",
-        lambda content: content[: len(content) // 2],
-        lambda content: b"\xff" + content,
-    ],
-)
-def test_damaged_records_cost_time_only(folder, cache, damage):
+def test_damaged_records_cost_time_only(folder, cache):
     settle()
     first = fingerprint(folder, cache)
     intact = record(cache).read_bytes()
-    assert damage(intact) != intact
-    record(cache).write_bytes(damage(intact))
-    assert fingerprint(folder, cache) == first
-    assert record(cache).read_bytes() == intact
+    for damaged in (b"", intact[: len(intact) // 2], b"\xff" + intact):
+        record(cache).write_bytes(damaged)
+        assert fingerprint(folder, cache) == first
+        assert record(cache).read_bytes() == intact
 
 
 def test_files_that_cannot_be_read_are_left_to_whoever_reads_images(folder, cache):

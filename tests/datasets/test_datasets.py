@@ -1,16 +1,17 @@
-"""Folders of images, and what is no image."""
+"""Folders of images, what is no image, and queries that are database images."""
 
-import json
 import os
+import shutil
 import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from mfvpr import InputError, datasets
 from mfvpr.datasets import IndexFile, image_folder
-from mfvpr.utils.files import printable, write_text
+from mfvpr.datasets.contents import contents, own_rows
 from tests.builders import fill
 from tests.io.checks import one_line_error
 
@@ -69,47 +70,84 @@ def test_what_is_no_image_is_ignored(tmp_path):
     assert image_folder(folder).names == ("0.png", "a.png/2.png")
 
 
-@contextmanager
-def as_nobody():
-    """Without the rights of root, who may read everything."""
-    if os.geteuid() != 0:
-        yield
-        return
-    os.seteuid(65534)
+@pytest.fixture
+def nobody():
+    """Without the rights of root, who may read everything; in a folder of theirs, since pytest's own is closed."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        yield Path(name), lambda user: os.geteuid() in (0, 65534) and os.seteuid(user)
+        if os.geteuid() == 65534:
+            os.seteuid(0)
+
+
+@pytest.mark.parametrize("closed", ["root", "root/sub", "root/0.png"])
+def test_unreadable_folders_and_files_are_errors(nobody, closed):
+    place, become = nobody
+    root = fill(place / "root", ["0.png", "sub/1.png"])
+    (place / closed).chmod(0)
     try:
-        yield
+        become(65534)
+        with pytest.raises(InputError, match=f"{closed}: .*Permission denied"):
+            image_folder(root).read(0)
     finally:
-        os.seteuid(0)
-
-
-@pytest.mark.parametrize("closed", ["root", "root/sub"])
-def test_unreadable_folders_and_files_are_errors(closed):
-    with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's own is closed to others
-        place = Path(name)
-        place.chmod(0o755)
-        fill(place / "root", ["0.png", "sub/1.png"])
-        (place / closed).chmod(0)
-        try:
-            with as_nobody(), pytest.raises(InputError, match=f"{closed}: .*Permission denied"):
-                image_folder(place / "root")
-        finally:
-            (place / closed).chmod(0o755)
-        (place / "root" / "0.png").chmod(0)
-        with as_nobody(), pytest.raises(InputError, match=r"0\.png: cannot be read .Permission denied."):
-            image_folder(place / "root").read(0)
+        become(0)
+        (place / closed).chmod(0o755)
 
 
 def test_names_that_are_not_utf8(tmp_path):
     folder = fill(tmp_path / "db", ["0.png"])
     (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
-    (name,) = image_folder(folder).names
     assert image_folder(folder).read(0).shape == (4, 4, 3)
-    assert printable(name) == "caf\\udce9.png"
-    assert printable("café 日本") == "café 日本"
-    write_text(tmp_path / "a.csv", f"{name},1\n")
-    assert (tmp_path / "a.csv").read_text(encoding="utf-8") == "caf\\udce9.png,1\n"
-    write_text(tmp_path / "a.json", json.dumps([name], ensure_ascii=False))
-    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == [name]  # the very name
     (tmp_path / "gt.csv").write_bytes(b"query,database\ncaf\xe9.png,0\n")  # as a shell writes it
     truth = datasets.folder(folder, folder, ground_truth=IndexFile(tmp_path / "gt.csv")).truth
     assert truth.place(0) == 0
+
+
+# Queries that are database images
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    for row in range(6):
+        Image.new("RGB", (4, 4), (row, 0, 0)).save(folder / f"{row}.png")
+    return folder
+
+
+def dataset_and_own_rows(database, queries, ground_truth="none"):
+    dataset = datasets.folder(database, queries, ground_truth=ground_truth)
+    return dataset, own_rows(contents(dataset.queries), contents(dataset.database))
+
+
+def test_the_same_images_are_known_by_content(sequence, tmp_path):
+    assert dataset_and_own_rows(sequence, sequence)[1] == tuple((row,) for row in range(6))
+    other = tmp_path / "other"
+    other.mkdir()
+    for name, source in (("b.png", "4.png"), ("a.png", "1.png")):
+        shutil.copy(sequence / source, other / name)
+    Image.new("RGB", (4, 4), (99, 0, 0)).save(other / "c.png")
+    shutil.copy(sequence / "1.png", sequence / "5.png")  # the robot stood still
+    assert dataset_and_own_rows(sequence, other)[1] == ((1, 5), (4,), ())
+    (sequence / "6.png").symlink_to("nowhere")
+    assert dataset_and_own_rows(sequence, sequence)[1][6] == ()  # files that cannot be read are not the same
+
+
+def test_neighbors_are_neither_candidates_nor_correct(sequence):
+    dataset, rows = dataset_and_own_rows(sequence, sequence, "order")
+    for neighbors in (0, 1):
+        allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
+        reduced = dataset.only.without_neighbors(6, rows, neighbors)
+        np.testing.assert_array_equal(reduced.excluded.dense(), ~allowed)
+        expected = dataset.truth.positives(2).dense() & allowed
+        np.testing.assert_array_equal(reduced.truth.positives(2).dense(), expected)
+    assert not reduced.truth.positives(1).rows.size  # all correct images are excluded
+    assert dataset_and_own_rows(sequence, sequence)[0].only.without_neighbors(6, rows, 0).truth is None
+
+
+def test_two_sequences_have_no_neighbors(sequence, tmp_path):
+    (tmp_path / "other").mkdir()
+    Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
+    dataset, rows = dataset_and_own_rows(sequence, tmp_path / "other")
+    with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
+        dataset.only.without_neighbors(6, rows, 2)

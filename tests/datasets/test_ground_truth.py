@@ -1,7 +1,6 @@
 """Ground truth of every kind, and its faults."""
 
 import json
-import os
 
 import numpy as np
 import pytest
@@ -19,11 +18,10 @@ from mfvpr.datasets import (
     RadiusTruth,
 )
 from mfvpr.datasets.ground_truth import threshold_words
-from mfvpr.evaluation import evaluation_protocol
 from mfvpr.utils.files import write_text
 from tests import oracles
 from tests.builders import fill
-from tests.io.checks import memory_below, one_line_error
+from tests.io.checks import one_line_error
 
 
 @pytest.fixture
@@ -113,11 +111,8 @@ def test_labels(folders, tmp_path):
     ("database", "words"),
     [
         ("0.png,x\n1.png,x\n", "of all 3 images, got 2; the first without is 2.png"),
-        (
-            "0.png,x\n1.png,x\n0.png,x\n2.png,x\n",
-            "entry 3: expected the path of an image, each once, got '0.png' again",
-        ),
-        ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: expected the path of an image, each once, got '9.png'"),
+        ("0.png,x\n1.png,x\n0.png,x\n2.png,x\n", "entry 3: expected the path of one image, each once, got '0.png'"),
+        ("0.png,x\n1.png,x\n2.png,x\n9.png,x\n", "entry 4: expected the path of one image, each once, got '9.png'"),
     ],
 )
 def test_wrong_labels_are_errors_of_one_line(folders, tmp_path, database, words):
@@ -128,7 +123,7 @@ def test_wrong_labels_are_errors_of_one_line(folders, tmp_path, database, words)
 
 def test_a_name_in_two_folders_needs_its_path(tmp_path):
     both = fill(tmp_path / "both", ["left/0.png", "right/0.png"])
-    with pytest.raises(InputError, match=r"expected the path of an image"):
+    with pytest.raises(InputError, match="expected the path of one image"):
         datasets.folder(both, both, ground_truth=labels(tmp_path, "0.png,x\n", "left/0.png,x\nright/0.png,y\n"))
     full = "left/0.png,x\nright/0.png,y\n"
     truth = datasets.folder(both, both, ground_truth=labels(tmp_path, full, full)).truth
@@ -143,24 +138,6 @@ def test_many_labels_are_a_loop_over_all_pairs():
         is_correct = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
         np.testing.assert_array_equal(positives.of(query), np.flatnonzero(is_correct))
         np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
-
-
-@pytest.mark.slow
-def test_nordland_takes_a_few_megabytes():
-    """A matrix of 27,592 frames on each side takes 761 MB."""
-    number, tolerance = 27_592, 10
-    truth = FrameTruth(tuple((row,) for row in range(number)), number)
-    frames = np.arange(number)[:, None]
-    rankings = np.stack([frames, frames - tolerance, frames - tolerance - 1])
-    with memory_below(60e6):
-        protocol = evaluation_protocol(truth, [tolerance], "both")
-        recall, difference = protocol.recall(rankings), protocol.positives[0] - protocol.places
-    [positives] = protocol.positives
-    assert positives.counts.sum() == number * (2 * tolerance + 1) - tolerance * (tolerance + 1)
-    np.testing.assert_array_equal(positives.of(5000), np.arange(4990, 5011))
-    assert [len(half.tune) for half in protocol.halves] == [number // 2 - 2 * tolerance] * 2
-    np.testing.assert_array_equal(recall, [[1], [1 - tolerance / number], [0]])
-    assert not difference.rows.size
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))
@@ -197,29 +174,29 @@ def test_excluded_images_are_not_correct():
     [
         ("missing.csv", None, "got nothing"),
         ("gt.csv", f"query,database\n0,0\n1,{5000 * '1'}\n", "(5000 characters)'"),
-        ("gt.json", f"[[0, [{4000 * '1'}]], [1, []]]", "(4000 characters)'"),
         ("gt.txt", "x", "named .csv, .npz, .json"),
         ("gt.csv", "", "no header"),
         ("gt.csv", "query,database\n0,0\n", "of all 2 images, got 1; the first without is b.png"),
         ("gt.csv", "query,database\n0,0\n1,3\n", "a number from 0 to 2, got '3'"),
         ("gt.csv", "query,database\n0,0\nzz.png,0\n", "got 'zz.png'"),
-        ("gt.npz", "no archive", "cannot be read"),
-        ("gt.npz", {"query": np.array([{"a": 1}], object), "database": np.array([0])}, "Object arrays"),
+        ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
         ("gt.json", '{"00": 1, "11": 1}', "expected [[query, [database, ...]], ...]"),
         ("gt.json", '[[0, "12"], [1, "0"]]', "expected [[query, [database, ...]], ...]"),
-        ("gt.npz", {"utmQ": np.full((2, 2), np.nan), "utmDb": np.zeros((3, 2))}, "at most 1e+09 m, got nan"),
+        ("gt.npz", "no archive", "cannot be read"),
+        ("gt.npz", {"query": np.array([{"a": 1}], object), "database": np.array([0])}, "Object arrays"),
+        (
+            "gt.npz",
+            {"utmQ": np.full((2, 2), np.nan), "utmDb": np.zeros((3, 2))},
+            "at most 1e+09 m, got [2, 2] up to nan",
+        ),
         ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [2, 2]"),
         ("gt.npz", {"query": np.arange(2), "database": np.arange(3)}, "cannot be read"),
         ("gt.npz", {"other": np.zeros(2)}, "got neither"),
-        ("gt.csv", "query,database,query\n0,0,1\n1,1,0\n", "got query,database,query"),
-        ("gt.csv", os.mkfifo, "got a pipe"),
     ],
 )
 def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, content, words):
     path = tmp_path / name
-    if callable(content):
-        content(path)
-    elif isinstance(content, dict):
+    if isinstance(content, dict):
         np.savez(path, **content)
     elif content is not None:
         path.write_text(content)
@@ -230,5 +207,5 @@ def test_wrong_index_files_are_errors_of_one_line(folders, tmp_path, name, conte
 @pytest.mark.parametrize("name", ["plain.png", "@a@b@.png", "@1.png", "@nan@1@.png", "@5@-1e10@.png", "@1_0@5@.png"])
 def test_names_without_coordinates_are_errors(tmp_path, name):
     folder = fill(tmp_path / "db", [name])
-    with pytest.raises(InputError, match=r"easting"):
+    with pytest.raises(InputError, match=r"easting|positions in names: expected"):
         datasets.folder(folder, folder, ground_truth="utm")

@@ -72,41 +72,16 @@ def test_rankings_are_looked_up(matrix, seed, several):
     np.testing.assert_array_equal(Positives.from_matrix(matrix).contains(rows), expected)
 
 
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        (np.zeros((3, 1), int), r"rows: .*\[..., 2 queries, k\], got \[3, 1\]"),
-        (np.zeros(2, int), r"got \[2\]"),
-        (np.array([[0], [4]]), r"rows: .*below 4, got int64 .*4"),  # it would be a row of the next query
-        (np.zeros((2, 1)), "got float64"),
-    ],
-)
-def test_rankings_of_other_data_are_errors(rows, words):
-    with pytest.raises(InputError, match=words):
+@pytest.mark.parametrize("rows", [np.zeros((3, 1), int), np.zeros(2, int), np.array([[0], [4]]), np.zeros((2, 1))])
+def test_rankings_of_other_data_are_errors(rows):
+    with pytest.raises(InputError, match=r"rows: expected whole numbers \[..., 2 queries, k\] below 4, got "):
         Positives.from_rows([[0], [0, 1]], 4).contains(rows)
-
-
-@pytest.mark.parametrize(
-    ("rows", "offsets", "words"),
-    [
-        ([2, 0], [0, 2, 2], r"rows that ascend .*from_rows"),
-        ([0, 4], [0, 1, 2], r"rows from 0 to 3.*offsets .*0 to 2"),
-        ([0, 1], [0, 1, 1], r"offsets .*0 to 2"),
-        ([0, 1], [0, 3, 2], "offsets that grow"),
-    ],
-)
-def test_rows_and_offsets_must_have_their_form(rows, offsets, words):
-    with pytest.raises(InputError, match=words):
-        Positives(np.array(rows, np.int32), np.array(offsets), 4)
 
 
 def test_values_that_do_not_fit_are_errors():
     got = Positives.from_rows([[0], [0, 1]], 4)
-    for rows in ([[4]], [[0], [-1]], [[2**32]]):
-        with pytest.raises(InputError, match=r"positives: .*4 images, got"):
-            Positives.from_rows(rows, 4)
-    for rows in ([[0.5]], np.eye(2, dtype=bool)):
-        with pytest.raises(InputError, match=r"whole numbers, got .*from_matrix"):
+    for rows in ([[4]], [[0], [-1]], [[2**32]], [[0.5]], np.eye(2, dtype=bool)):
+        with pytest.raises(InputError, match=r"positives: .*4 images, got .*from_matrix"):
             Positives.from_rows(rows, 4)
     with pytest.raises(ValueError, match="inconsistent shape"):
         got | Positives.from_rows([[0], [0]], 5)

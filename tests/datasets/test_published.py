@@ -51,7 +51,7 @@ def test_ssm_vprs_are_right_around_the_named_image(ssm, name):
     assert dataset.truth.thresholds(tolerances=[1, 2, 5], radius=25) == [1, 2, 5]
 
 
-@pytest.mark.parametrize(("side", "number"), [("Reference", 5), ("Live", 1), ("Reference", 0)])
+@pytest.mark.parametrize(("side", "number"), [("Reference", 5), ("Live", 0)])
 def test_a_gap_is_an_error_because_the_table_counts_numbers(ssm, side, number):
     next((ssm / side).glob(f"*{number:04d}.*")).unlink()
     check_error("gardens_point", ssm, f"{ssm / side}: expected images numbered from 0 without gaps")
@@ -105,17 +105,9 @@ def test_faults_of_robotcar(tmp_path):
     check_error("robotcar_seasons", tmp_path, "1 of the 1 images of robotcar_v2_train.txt are missing")
     write_poses(tmp_path, {name: center for name, center in centers.items() if "rain" not in name})
     check_error("robotcar_seasons", tmp_path, "expected poses of night-rain/rear, got none")
-    identity = np.eye(4)
-    identity[:3, 3] = 7
-    transposed, scaled = (" ".join(map(str, m.ravel())) for m in (identity.T, 10 * identity))
-    for line, words in (
-        ("dawn/rear/1.jpg 1 2 3", "expected lines of a name and the 16 numbers"),
-        ("dawn/rear/1.jpg " + "nan " * 16, "expected lines of a name and the 16 numbers"),
-        (f"dawn/rear/1.jpg {transposed}", "the last 0 0 0 1"),
-        (f"dawn/rear/1.jpg {scaled}", "the last 0 0 0 1"),
-    ):
-        (tmp_path / "robotcar_v2_train.txt").write_text(f"\n{line}\n")
-        check_error("robotcar_seasons", tmp_path, words)
+    for numbers in ("1 2 3", "nan " * 16, "1 0 0 0 0 1 0 0 0 0 1 0 7 7 7 1"):  # the last is transposed
+        (tmp_path / "robotcar_v2_train.txt").write_text(f"\ndawn/rear/1.jpg {numbers}\n")
+        check_error("robotcar_seasons", tmp_path, "the 16 numbers of a pose by rows, the last 0 0 0 1")
 
 
 # Nordland
@@ -251,13 +243,11 @@ class Hostile:
 @pytest.mark.parametrize(
     ("truth", "words"),
     [
-        (objects(np.array([3]), np.array([0])), "query 0: expected rows from 0 to 2, got 3 to 3"),
-        (objects(np.array([-1]), np.array([0])), "expected rows from 0 to 2, got -1"),
+        (objects(np.array([3]), np.array([0])), "query 0: expected rows from 0 to 2, got int64 [3]"),
+        (objects(np.array([-1]), np.array([0])), "expected rows from 0 to 2, got int64 [-1]"),
         (objects(np.array([0])), "expected rows of 2 queries, got 1"),
-        (objects(np.array([0.5]), np.array([0])), "expected lists of rows, got float64"),
+        (objects(np.array([0.5]), np.array([0])), "expected rows from 0 to 2, got float64"),
         (objects(Hostile(), np.array([0])), "nothing was executed"),
-        (np.array(["a", "b"]), "expected lists of rows, got <U1"),
-        (np.eye(2, 3, dtype=int), "got flags"),
     ],
 )
 def test_lists_that_are_no_rows(pittsburgh, truth, words):
@@ -278,28 +268,20 @@ def msls(tmp_path):
     """Per city three database images, 100 m apart, one of them a panorama, and four query images, one of them used."""
     for city, first in (("cph", 0), ("sf", 1e6)):
         for side, images in (
-            ("database", [(0, False, True), (100, True, True), (200, False, True)]),
-            ("query", [(24, False, True), (101, False, True), (1, True, True), (2, False, False)]),
+            ("database", [("d0", 0, False, True), ("d1", 100, True, True), ("d2", 200, False, True)]),
+            (
+                "query",
+                [("q0", 24, False, True), ("q1", 101, False, True), ("q2", 1, True, True), ("q3", 2, False, False)],
+            ),
         ):
             folder = tmp_path / "train_val" / city / side
-            keys = [f"{side[0]}{row}" for row in range(len(images))]
-            east, pano, task = zip(*images, strict=True)
-            put(folder, *(f"images/{key}.jpg" for key in keys))
-            write_table(
-                folder / "raw.csv",
-                ["key", "lon", "lat", "ca", "captured_at", "pano"],
-                [(key, 0, 0, 0, 0, is_pano) for key, is_pano in zip(keys, pano, strict=True)],
-            )
-            write_table(
-                folder / "postprocessed.csv",
-                ["key", "easting", "northing", "unique_cluster", "night"],
-                [(key, first + x, 5e6, 0, False) for key, x in zip(keys, east, strict=True)],
-            )
-            write_table(
-                folder / "subtask_index.csv",
-                ["key", "all", "s2w"],
-                [(key, is_task, False) for key, is_task in zip(keys, task, strict=True)],
-            )
+            put(folder, *(f"images/{key}.jpg" for key, *_ in images))
+            for table, header, lines in (
+                ("raw", ["key", "lon", "pano"], [(key, 0, is_pano) for key, _, is_pano, _ in images]),
+                ("postprocessed", ["key", "easting", "northing"], [(key, first + x, 5e6) for key, x, _, _ in images]),
+                ("subtask_index", ["key", "all", "s2w"], [(key, is_task, False) for key, _, _, is_task in images]),
+            ):
+                write_table(folder / f"{table}.csv", header, lines)
     return tmp_path
 
 
@@ -312,15 +294,13 @@ def test_msls_of_tables(msls):
     assert rows(dataset, 25) == [[0], [2]]
 
 
-@pytest.mark.parametrize(("yes", "no"), [("TRUE", "FALSE"), ("true", "false"), ("1", "0")])
+@pytest.mark.parametrize(("yes", "no"), [("TRUE", "FALSE"), ("1", "0")])
 def test_msls_tables_have_flags_of_any_form_and_are_joined_by_their_keys(msls, yes, no):
-    for table in ("raw", "subtask_index"):
-        for path in msls.glob(f"train_val/*/*/{table}.csv"):
-            header, *lines = path.read_text().replace("True", yes).replace("False", no).splitlines()
-            path.write_text("\n".join([header, *lines[::-1]]))
-    dataset = published_dataset("msls_val", msls)
-    assert sorted(name[-6:] for name in dataset.database.names) == ["d0.jpg"] * 2 + ["d2.jpg"] * 2
-    assert [name[-6:] for name in dataset.queries.names] == ["q0.jpg"] * 2
+    names = published_dataset("msls_val", msls).database.names
+    for path in [*msls.glob("train_val/*/*/raw.csv"), *msls.glob("train_val/*/*/subtask_index.csv")]:
+        header, *lines = path.read_text().replace("True", yes).replace("False", no).splitlines()
+        path.write_text("\n".join([header, *lines[::-1]]))
+    assert published_dataset("msls_val", msls).database.names == names
 
 
 def test_msls_of_lists(msls):
@@ -336,23 +316,23 @@ def test_msls_of_lists(msls):
     assert dataset.queries.names == (queries[0], queries[2])
     assert rows(dataset, 0) == [[1, 3], [0]]
     np.save(msls / "msls_val_qIdx.npy", np.array([0, 3]))
-    check_error("msls_val", msls, "expected rows from 0 to 2, got 3")
+    check_error("msls_val", msls, "expected rows from 0 to 2, got int64 [3]")
     np.save(msls / "msls_val_qIdx.npy", np.array([0]))
     check_error("msls_val", msls, "expected rows of 1 queries, got 2")
 
 
 def test_faults_of_msls(msls):
-    check_error("msls_val", msls / "train_val", "raw.csv: expected a table")
-    table = msls / "train_val/sf/query/postprocessed.csv"
-    text = table.read_text()
-    for content, words in (
-        ("".join(text.splitlines(keepends=True)[:-1]), "expected the same keys"),
-        (text.replace("q3", "q2"), "got 3 in 4 lines"),
-        (text.replace("easting", "east"), "expected pano, all (True"),
-        (text.replace("5000000.0", "nan"), "expected positions"),
+    check_error("msls_val", msls / "train_val", "postprocessed.csv: expected a table")
+    for table, before, after, words in (
+        ("subtask_index", "q3", "q4", "expected equal keys"),
+        ("postprocessed", "easting", "east", "and pano, all (True"),
+        ("postprocessed", "5000000.0", "nan", "expected positions"),
     ):
-        table.write_text(content)
+        path = msls / f"train_val/sf/query/{table}.csv"
+        text = path.read_text()
+        path.write_text(text.replace(before, after))
         check_error("msls_val", msls, words)
+        path.write_text(text)
 
 
 # All

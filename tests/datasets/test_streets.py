@@ -2,7 +2,6 @@
 
 import csv
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -47,24 +46,16 @@ def seasons(tmp_path_factory):
 
 
 @pytest.mark.slow
-def check_other_drawings(draw, folder, num_frames, tmp_path):
+@pytest.mark.parametrize(("kind", "num_frames"), [("streets", FRAMES), ("seasons", SEASONS_FRAMES)])
+def test_a_seed_decides_all_bytes(request, tmp_path, kind, num_frames):
     """The same seed gives the same bytes, and each file of another seed differs."""
-    draw(tmp_path / "again", num_frames=num_frames, image_size=SIZE)
-    draw(tmp_path / "other", seed=1, num_frames=num_frames, image_size=SIZE)
-    first, other = contents(folder), contents(tmp_path / "other")
+    options = {"seasons": kind == "seasons", "num_frames": num_frames, "image_size": SIZE}
+    draw_streets(tmp_path / "again", **options)
+    draw_streets(tmp_path / "other", seed=1, **options)
+    first, other = contents(request.getfixturevalue(kind)), contents(tmp_path / "other")
     assert first == contents(tmp_path / "again")
     assert first.keys() == other.keys()
     assert all(first[name] != other[name] for name in first)
-
-
-@pytest.mark.slow
-def test_a_seed_decides_all_bytes_of_the_street(streets, tmp_path):
-    check_other_drawings(draw_streets, streets, FRAMES, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_seed_decides_all_bytes_of_the_seasons(seasons, tmp_path):
-    check_other_drawings(partial(draw_streets, seasons=True), seasons, SEASONS_FRAMES, tmp_path)
 
 
 def check_ground_truth(path, num_frames):

@@ -28,12 +28,6 @@ def written(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def folder(written, tmp_path):
-    """A copy that may be damaged."""
-    return shutil.copytree(written, tmp_path / "histogram")
-
-
 def inputs_of(program):
     return {each.name: np.load(program.folder / "check" / f"{each.name}.npy") for each in program.inputs}
 
@@ -63,20 +57,10 @@ def test_the_description_has_inputs_units_capacities_parameters_versions_and_pla
     assert len([path for path in written.rglob("*") if path.is_file()]) == 1 + 1 + 7 + 2
 
 
-def test_a_program_takes_arrays_of_jax_and_other_libraries(written):
-    program = mfvpr.load_exported(written)
-    inputs = inputs_of(program)
-    expected = program(**inputs)
-    assert {name: values.shape for name, values in expected.items()} == {"scores": (3,), "shift": (3, 2)}
-    for name, values in program(**{name: jnp.asarray(array) for name, array in inputs.items()}).items():
-        np.testing.assert_array_equal(values, expected[name])
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"points0": np.zeros((3, 21, 2), np.float32)}, r"points0: expected float32 \[3, 20, 2\], got .* \[3, 21, 2\]"),
-        ({"points0": np.zeros((3, 20, 2))}, r"points0: expected float32 \[3, 20, 2\], got float64"),
         ({"mask": np.zeros((3, 20), np.uint8)}, r"mask: expected bool \[3, 20\], got uint8"),
         ({"ratio": np.zeros((3, 20))}, r"inputs: expected points0, points1, .*, got .*ratio"),
     ],
@@ -93,7 +77,6 @@ def test_wrong_inputs_are_refused(written, change, message):
     ("name", "size"),
     [
         ("image_size0", [0, 0]),
-        ("image_size0", [-320, 240]),
         ("image_size0", [np.nan, 240]),
         ("image_size0", [240, 320]),
         ("image_size1", [[320, 240], [240, 320], [320, 240]]),
@@ -108,7 +91,8 @@ def test_image_sizes_that_cannot_be_right_are_refused(written, name, size):
 def test_sizes_of_padding_may_be_anything(written):
     program = mfvpr.load_exported(written)
     inputs = inputs_of(program)
-    expected = program(**inputs)
+    expected = program(**{name: jnp.asarray(array) for name, array in inputs.items()})  # of JAX, as of NumPy
+    assert {name: values.shape for name, values in expected.items()} == {"scores": (3,), "shift": (3, 2)}
     inputs["image_size1"][-1] = inputs["points1"][-1] = np.nan  # the last candidate has no matches
     assert program(**inputs)["scores"].tolist() == expected["scores"].tolist()
 
@@ -123,7 +107,6 @@ def test_a_system_checks_the_keypoints_of_both_images(tmp_path):
 
 DAMAGE = {
     "no folder": (shutil.rmtree, r"export\.json: expected a folder of mfvpr\.export with this file, got nothing"),
-    "no program": (lambda folder: (folder / "program.stablehlo").unlink(), "stablehlo: expected a file, got nothing"),
     "another program": (
         lambda folder: (folder / "program.stablehlo").write_bytes(b"no program"),
         r"program\.stablehlo: expected a program that JAX .* reads, got",
@@ -136,8 +119,8 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damaged_and_foreign_folders_are_refused_in_one_line(folder, damage):
-    change, message = DAMAGE[damage]
+def test_damaged_and_foreign_folders_are_refused_in_one_line(written, tmp_path, damage):
+    folder, (change, message) = shutil.copytree(written, tmp_path / "histogram"), DAMAGE[damage]
     change(folder)
     with pytest.raises(InputError, match=message) as error:
         mfvpr.load_exported(folder)
@@ -148,14 +131,12 @@ def test_a_program_is_written_to_a_new_or_an_empty_folder(tmp_path):
     (tmp_path / "empty").mkdir()
     program = mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
     assert program(mask=np.ones((3, 20), bool))["scores"].tolist() == [20, 20, 20]
-    (tmp_path / "file").touch()
-    for name in ("empty", "file", "file/below"):
-        with pytest.raises(InputError, match=name):
-            mfvpr.export(tmp_path / name, mfvpr.MatchCount(), SHAPES, onnx=False)
+    with pytest.raises(InputError, match="empty: expected a new or an empty folder"):
+        mfvpr.export(tmp_path / "empty", mfvpr.MatchCount(), SHAPES, onnx=False)
 
 
 def test_without_jax2onnx_the_description_says_so_and_a_request_fails(tmp_path, monkeypatch):
-    monkeypatch.setattr(folders.program_formats, "find_spec", lambda name: None if name == "jax2onnx" else name)
+    monkeypatch.setattr(folders, "find_spec", lambda name: None if name == "jax2onnx" else name)
     program = mfvpr.export(tmp_path / "count", mfvpr.MatchCount(), SHAPES)
     assert program.description["onnx"] == {"missing": "jax2onnx is not installed"}
     with pytest.raises(InputError, match=r"onnx=True: expected the package jax2onnx.*pip install 'mfvpr\[export\]'"):

@@ -10,8 +10,13 @@ import pytest
 import mfvpr
 from mfvpr import ExportShapes, Features, InputError, Matches
 from mfvpr.baselines import SCORERS
-from mfvpr.deployment.folders import check_inputs, largest_difference
-from mfvpr.deployment.program_formats import deserialize, export_program, without_unused_inputs
+from mfvpr.deployment.folders import (
+    check_inputs,
+    deserialize,
+    export_program,
+    largest_difference,
+    without_unused_inputs,
+)
 from mfvpr.deployment.programs import make_program
 from mfvpr.evaluation import Fusion
 from mfvpr.features import Aggregated, Scale, Sift, VladFitting
@@ -63,18 +68,6 @@ def test_a_scorer_gives_the_scores_of_score_candidates(scorer):
     assert largest_difference(outputs, expected) <= 1e-5
     assert outputs["scores"][0] > 0
     assert outputs["scores"][-1] == 0  # without matches
-
-
-@pytest.mark.slow
-@pytest.mark.optimized
-def test_a_program_has_the_bits_of_the_jitted_function():
-    for method in (HISTOGRAM, make_system({"count": mfvpr.MatchCount(), "histogram": HISTOGRAM}, final="histogram")):
-        program = make_program(method, SHAPES, with_shift=True)
-        inputs, outputs = outputs_of(method, with_shift=True)
-        jax.clear_caches()
-        expected = jax.jit(lambda *arrays: program.call(*arrays))(*inputs.values())  # noqa: B023
-        for values, each in zip(outputs.values(), expected, strict=True):
-            np.testing.assert_array_equal(values, np.asarray(each))
 
 
 def test_a_system_matches_and_scores_by_all_scorers_the_deciding_one_first():
@@ -140,10 +133,6 @@ def call_lapack(matches):
     return jnp.linalg.svd(matches.points0, compute_uv=False)[0] + jnp.linalg.eigh(jnp.eye(2))[0][0]
 
 
-def use_numpy(matches):
-    return np.float32(np.asarray(matches.mask).sum())
-
-
 def branch_in_python(matches):
     return 1.0 if matches.mask[0] else 0.0
 
@@ -153,8 +142,7 @@ def branch_in_python(matches):
     [
         (call_python, "without calls into Python, got .*callback"),
         (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
-        (use_numpy, "code that JAX compiles for cpu and cuda, .* got TracerArrayConversionError.*use jax.numpy"),
-        (branch_in_python, "code that JAX compiles for cpu and cuda, .* got TracerBoolConversionError"),
+        (branch_in_python, "code that JAX compiles for cpu and cuda, .* got TracerBoolConversionError.*use jax.numpy"),
         (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
         (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, .*score_pairs"),
     ],
@@ -176,18 +164,15 @@ COUNT = {"count": mfvpr.MatchCount()}
 @pytest.mark.parametrize(
     ("system", "options", "message"),
     [
-        (lambda: make_system({}), {}, "final='retrieval': expected a scorer"),
         (
             lambda: make_system(COUNT, fused={"count": Fusion()}, final="count + retrieval"),
             {},
             r"final='count \+ retrieval': expected a scorer, got a ranking that needs the retrieval",
         ),
-        (lambda: make_system(COUNT | {"a/b": mfvpr.MatchCount()}), {}, "names of letters.*got 'a/b'"),
-        (lambda: make_system(COUNT | {"cv": mfvpr.OpenCvHomography()}), {}, "OpenCvHomography: expected a scorer"),
         (
             lambda: make_system(COUNT, extractor=TwoScales()),
             {},
-            "TwoScales: expected local features of one scale, got 2",
+            "system: expected local features of one scale.*got 2 scales of TwoScales",
         ),
         (lambda: make_system(COUNT), {"with_shift": True}, "with_shift=True: expected a HistogramOfShifts.*MatchCount"),
         (lambda: make_system(COUNT), {"shapes": replace(SHAPES, dimension=64)}, "dimension=64: expected 128"),
@@ -199,16 +184,7 @@ def test_systems_that_cannot_be_exported_are_refused(system, options, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "number"),
-    [
-        ("candidates", 0),
-        ("keypoints", 2.5),
-        ("dimension", -1),
-        ("image_size", (320,)),
-        ("image_size", (320, 0)),
-    ],
-)
+@pytest.mark.parametrize(("name", "number"), [("candidates", 0), ("dimension", -1), ("image_size", (320, 0))])
 def test_shapes_out_of_bounds_are_refused(name, number):
     with pytest.raises(InputError, match=f"{name}=.*: expected"):
         replace(SHAPES, **{name: number})

@@ -22,7 +22,7 @@ from mfvpr.evaluation import (
     write_confidences,
 )
 from mfvpr.evaluation.confidence import absent_ranking, chance_calibration_error
-from mfvpr.report.evaluations import EvaluationReport, recalls_by_share
+from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.utils import InputError
 
 
@@ -128,17 +128,6 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
     assert "\n" not in str(refusal.value)
     with pytest.raises(InputError, match="got nothing"):
         read_confidences(tmp_path / "none.json")
-
-
-def test_queries_without_an_answer_are_reranked_first():
-    """Then those that retrieval is the least sure of."""
-    probabilities, correct = np.linspace(0.99, 0.01, 20), {"retrieval": np.zeros(20, bool), "it": np.zeros(20, bool)}
-    probabilities[3] = np.nan
-    correct["it"][3] = correct["retrieval"][19] = True
-    evaluation: Any = SimpleNamespace(
-        hits=correct.__getitem__, probabilities={"retrieval": probabilities}, ranked=SimpleNamespace(systems=correct)
-    )
-    np.testing.assert_allclose(recalls_by_share(evaluation)["it"][:4], [0.05, 0.1, 0.05, 0.05])
 
 
 def test_halves_of_drives_there_and_back_share_no_place():

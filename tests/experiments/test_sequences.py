@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.sequences import ANY, STEADY, drives, mean_descriptors, standardized, trajectories
+from experiments.sequences import ANY, STEADY, drives, standardized, trajectories
 
 
 def similarities(places, rows, seed=0):
@@ -32,11 +32,3 @@ def test_trajectories_find_a_drive_at_their_speeds_only():
         assert (values.argmax(axis=1) == places).mean() < 0.8
         if loses is not None:
             assert (trajectories(values, loses, 10).argmax(axis=1) == places).mean() < 0.2
-
-
-def test_mean_descriptors_see_the_last_images():
-    rng = np.random.default_rng(0)
-    database = rng.normal(size=(60, 8))
-    queries = database + rng.normal(size=(60, 8))
-    alone = (queries @ database.T).argmax(axis=1) == np.arange(60)
-    assert (mean_descriptors(queries, database).argmax(axis=1) == np.arange(60)).mean() > alone.mean()

@@ -54,9 +54,7 @@ def _computed(clone: str, channels: int, rows: int, checkpoint: Mapping) -> dict
     aggregator.load_state_dict({key.removeprefix(prefix): checkpoint[key] for key in checkpoint if prefix in key})
     aggregator.double().eval()
     pixels = torch.from_numpy(images()).double().permute(0, 3, 1, 2)
-    backbone = "backbone.model"
-    layers = tuple(f"{backbone}.layer{place}" for place in (1, 2, 3))
-    maps = resnet(lambda key: checkpoint[key].double(), pixels, f"{backbone}.conv1", f"{backbone}.bn1", layers)
+    maps = resnet(lambda key: checkpoint[key].double(), pixels)
     faint = torch.from_numpy(faint_maps()).double().permute(0, 3, 1, 2)
     width = channels * rows
     golden = {f"{width}/descriptors": aggregator(maps), f"{width}/faint": aggregator(faint)}

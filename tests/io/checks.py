@@ -1,6 +1,5 @@
-"""Expectations of many tests: errors of one line, and little memory."""
+"""Expectations of many tests: errors of one line."""
 
-import tracemalloc
 from contextlib import contextmanager
 
 import pytest
@@ -16,14 +15,3 @@ def one_line_error(message=None, *words):
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 400
     assert all(word in str(error.value) for word in words)
-
-
-@contextmanager
-def memory_below(limit):
-    """Expects that Python and NumPy never hold more than `limit` bytes."""
-    tracemalloc.start()
-    try:
-        yield
-        assert tracemalloc.get_traced_memory()[1] < limit
-    finally:
-        tracemalloc.stop()

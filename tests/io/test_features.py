@@ -5,8 +5,6 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mfvpr import InputError
 from mfvpr.io import open_features, write_features
@@ -59,19 +57,11 @@ def test_hloc_reads_what_is_written(tmp_path):
         assert group["image_size"][()].tolist() == [640, 480]
 
 
-names = st.text(st.characters(exclude_categories=["Cc"], exclude_characters="/\\"), min_size=1, max_size=8).filter(
-    lambda text: text.strip(".") == text
-)
-
-
-@settings(max_examples=20)
-@given(st.lists(names, min_size=1, max_size=3, unique=True))
-def test_any_name(tmp_path_factory, drawn):
-    folder, written = tmp_path_factory.mktemp("names"), feature(0, count=3)
-    paths = [f"sub/{name}" for name in drawn]
+def test_any_name(tmp_path):
+    paths = [f"sub/{name}" for name in ("a b", "é.jpg", "\udcff.png", "日本", "@1@2@", "a.b.c")]
     for file in ("f.h5", "f.npz"):
-        write_features(folder / file, paths, [(row, written) for row in range(len(paths))])
-        assert open_features(folder / file, paths).counts.tolist() == [3] * len(paths)
+        write_features(tmp_path / file, paths, [(row, feature(0, count=3)) for row in range(len(paths))])
+        assert open_features(tmp_path / file, paths).counts.tolist() == [3] * len(paths)
 
 
 @pytest.mark.parametrize("file", PATHS)
@@ -206,7 +196,8 @@ def spoiled(part, value, row=3):
         (lambda p: p | {"descriptors": np.zeros((16, 30), np.uint8)}, "floating-point .*got uint8"),
         (lambda p: p | {"scores": p["scores"][1:]}, r"expected 30 keypoints with scores .* got 30, 29 and \[30, 16\]"),
         (lambda p: p | {"image_size": np.array([640, 0])}, r"image_size: expected .*got \[640\.0, 0\.0\]"),
-        (spoiled("keypoints", 700), r"keypoints .*640 x 480 .*got \(700, 700\)"),
+        (spoiled("keypoints", (646, 200)), r"keypoints .*640 x 480 .*got \(646, 200\)"),
+        (spoiled("keypoints", (300, 484)), r"keypoints .*640 x 480 .*got \(300, 484\)"),
     ],
 )
 def test_arrays_that_cannot_be_used(path, change, message):
@@ -216,18 +207,11 @@ def test_arrays_that_cannot_be_used(path, change, message):
         list(open_features(path, ["a.jpg", "a/b.jpg"]).read())
 
 
-@pytest.mark.parametrize(
-    ("point", "is_inside"),
-    [((645, 200), True), ((-6, 483), True), ((646, 200), False), ((-7, 200), False), ((300, 484), False)],
-)
-def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point, is_inside):
+@pytest.mark.parametrize("point", [(645, 200), (-6, 483)])
+def test_keypoints_may_lie_a_hundredth_of_the_image_outside(path, point):
     """640 x 480 pixels: as float16 rounds them, and as detectors extrapolate."""
     append_hloc(path, "a.jpg", spoiled("keypoints", point)(hloc_parts(feature(1))))
-    if is_inside:
-        assert read_one(path, "a.jpg").keypoints[3].tolist() == list(point)
-    else:
-        with pytest.raises(InputError, match="expected keypoints"):
-            read_one(path, "a.jpg")
+    assert read_one(path, "a.jpg").keypoints[3].tolist() == list(point)
 
 
 def test_lengths_of_descriptors(path):

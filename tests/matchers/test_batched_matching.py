@@ -17,14 +17,13 @@ import pytest
 import mfvpr
 from mfvpr import Matches
 from mfvpr.core import filter_matches
-from mfvpr.core.types import Shortlist, per_match, per_pair
+from mfvpr.core.types import Shortlist, per_match
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import rank_shortlist
 from mfvpr.features import FeatureSet, InMemory
-from mfvpr.matchers import MatchSet, NearestNeighborMatcher
+from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched
-from mfvpr.matchers.batched_matching import QUERIES
-from mfvpr.matchers.match_set import batches, shapes, slots, split_pairs, split_rows
+from mfvpr.matchers.match_set import batches, shapes, slots, split_rows
 from mfvpr.storage.packing import round_as_stored
 from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
@@ -174,18 +173,6 @@ def test_features_that_are_read_on_demand_are_matched_as_those_in_memory():
     assert max(stored[1].source.reads.values()) > 1
 
 
-@pytest.mark.parametrize("number", [0, 1, QUERIES, QUERIES + 1])
-def test_any_number_of_queries(number):
-    """Other queries do not change the matches of a query."""
-    (queries, database), candidates = sets(), shortlist_of()
-    subset = FeatureSet(InMemory({row: queries[row] for row in range(number)}, number), {})
-    few = jax.tree.map(lambda leaf: leaf[:number], candidates)
-    if number == 0:
-        assert stages.match(subset, database, few).counts.shape == candidates.indices[:0].shape
-        return
-    assert_same(stages.match(subset, database, few), stages.match(queries, database, candidates).take(range(number)))
-
-
 def test_nothing_to_match():
     """Images without keypoints, and queries without candidates."""
     queries, database = sets()
@@ -273,25 +260,6 @@ def match_set():
     return stages.match(*sets(), shortlist_of())
 
 
-def test_a_querys_matches_are_padded_to_the_capacity(match_set):
-    assert match_set.capacity % 64 == 0
-    assert match_set.counts.max() <= match_set.capacity
-    for query in (0, 1, 3, 2):
-        padded = match_set[query]
-        assert padded.mask.sum(axis=1).tolist() == match_set.counts[query].tolist()
-        flat = match_set.matches[query]
-        for name, values in per_match(padded).items():
-            np.testing.assert_array_equal(values[padded.mask], per_match(flat)[name])
-            assert not values[~padded.mask].any()
-        for name, values in per_pair(padded).items():
-            of_query = getattr(flat, name)
-            expected = np.broadcast_to(of_query, values.shape) if name.endswith("0") else of_query
-            np.testing.assert_array_equal(values, expected)
-        for place, row in enumerate(split_pairs(padded)):
-            for name, values in row.items():
-                np.testing.assert_array_equal(values, per_match(padded)[name][place][padded.mask[place]])
-
-
 def test_batches_have_every_pair_with_matches_once(match_set):
     part = range(3, 15)
     counts = match_set.counts[3:15]
@@ -312,23 +280,3 @@ def test_batches_have_every_pair_with_matches_once(match_set):
             np.testing.assert_array_equal(matches.image_size1[number], of_query.image_size1[candidate])
     np.testing.assert_array_equal(seen, counts.reshape(-1) > 0)
     assert (slots(match_set) >= match_set.counts).all()
-
-
-def test_image_sizes_are_all_combinations():
-    def of_query(width):
-        return Matches(
-            *(np.zeros((0, 2), np.float32),) * 2,
-            *(np.zeros(0, np.float32),) * 3,
-            np.zeros(0, bool),
-            np.array([width, 9], np.float32),
-            np.array([[5, 6], [7, 8]], np.float32),
-        )
-
-    sizes0, sizes1 = MatchSet.of([of_query(width) for width in (3, 4, 3)], np.zeros((3, 2), int)).image_sizes
-    assert {(*a, *b) for a, b in zip(sizes0.tolist(), sizes1.tolist(), strict=True)} == {
-        (3, 9, 5, 6),
-        (3, 9, 7, 8),
-        (4, 9, 5, 6),
-        (4, 9, 7, 8),
-    }
-    assert len(sizes0) == 4

@@ -58,8 +58,3 @@ def test_a_capacity_is_worth_what_it_saves():
     capacities, counts = np.array([8, 16]), np.array([8, 7, 0, 16, 5])
     assert prune_capacities(capacities, counts, 3 * 8).tolist() == [8, 16]
     assert prune_capacities(capacities, counts, 3 * 8 + 1).tolist() == [16]
-
-
-def test_empty_rows_make_no_capacity_smaller():
-    for empty in (0, 50):
-        assert few_capacities(np.array([0] * empty + [100, 100, 200]), (0.5, 1.0), 32).tolist() == [128, 224]

@@ -105,14 +105,6 @@ def test_order_and_batch_do_not_matter():
             np.testing.assert_allclose(getattr(mixed, name), getattr(alone, name)[order0], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("counts", [(0, 0), (0, 5), (5, 0)])
-def test_images_without_a_single_slot(counts):
-    features0, features1 = (make_features(np.random.default_rng(4), count) for count in counts)
-    matches = soft(features0, features1, temperature=0.1)
-    assert matches.points1.shape == (counts[0], 2)
-    assert not matches.mask.any()
-
-
 @pytest.mark.parametrize("kind", ["empty query", "empty candidate", "identical", "one"])
 def test_degenerate_images_have_finite_gradients(kind):
     rng = np.random.default_rng(5)
@@ -132,14 +124,6 @@ def test_degenerate_images_have_finite_gradients(kind):
     gradients = jax.jit(jax.grad(total, argnums=range(5)))
     for temperature in (1e-6, 0.1):
         assert all(np.isfinite(gradient).all() for gradient in gradients(temperature, *inputs))
-
-
-def test_a_temperature_not_above_zero_gives_no_number():
-    features = make_features(np.random.default_rng(6), 4)
-    for temperature in (0.0, -0.1):
-        matches = soft(features, features, temperature=temperature)
-        assert np.isnan(matches.confidence).all()
-        assert np.isnan(matches.distance).all()
 
 
 @given(feature_pairs(), st.sampled_from(["mutual", "opencv_legacy", "none"]))

@@ -5,12 +5,9 @@ import pytest
 from PIL import Image
 
 from mfvpr import InputError
-from mfvpr.evaluation import reliability
-from mfvpr.report import figures, plots
+from mfvpr.report import figures
 
-SYSTEMS = ["retrieval", *(f"histogram + anchor + sum + retrieval {number}" for number in range(10))]
 QUERY = np.zeros((90, 90, 3), np.uint8)
-P, RIGHT = np.linspace(0, 1, 20), np.arange(20) % 3 > 0
 
 
 def pixels(path):
@@ -44,9 +41,3 @@ def test_images_are_drawn_in_the_shape_they_were_taken_in(tmp_path):
     half = columns[columns < np.mean(columns)]  # the two images stand side by side
     rows_of_images = [row for row in np.unique(rows) if (rows == row).sum() > 100]
     assert len(rows_of_images) / (half.max() - half.min()) == pytest.approx(aspect, rel=0.1)
-
-
-def test_titles_of_panels_are_not_cut_off(tmp_path):
-    plots.reliability_figure(tmp_path / "a.png", {name: reliability(P, RIGHT) for name in SYSTEMS[:4]})
-    image = pixels(tmp_path / "a.png")
-    assert {*np.concatenate([image[:, 0], image[:, -1], image[0], image[-1]]).tolist()} == {255}

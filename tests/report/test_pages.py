@@ -15,10 +15,10 @@ import pytest
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test, recall_interval
 from mfvpr.report import pages
-from mfvpr.report.pages import read_run, write_comparison, write_report
+from mfvpr.report.pages import Run, write_comparison, write_report
 from mfvpr.utils import InputError
 from tests.programs import typed
-from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, change_json, write_run
+from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, write_run
 
 pytestmark = pytest.mark.thorough
 
@@ -165,28 +165,12 @@ def test_answers_are_pictures_and_rows(page, several, run):
     assert len([row for row in several.rows if len(row) == 7 and row[1] in TWO]) == 60
 
 
-def test_own_folders_are_the_title_of_a_page_unless_they_have_a_name(tmp_path, monkeypatch):
-    titles = []
-    monkeypatch.setattr(pages, "write_page", lambda path, title, **parts: titles.append(title))
-    for name in ("folder", "my street"):
-        folder = write_run(tmp_path / name, sequences=(name,))
-        dataset = {"name": name, "queries": "/data/street/night", "database": "/data/street/day"}
-        change_json(folder / "run.json", lambda about, dataset=dataset: about | {"settings": {"dataset": dataset}})
-        write_report(folder)
-    assert titles == ["street/night in street/day", "my street"]
-
-
-def test_too_many_answers_are_left_to_the_files(run, tmp_path, monkeypatch):
+def test_without_ground_truth_there_are_answers_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "MOST_PREDICTIONS", 7)
-    text = write_report(run, tmp_path / "page.html").read_text("utf-8")
-    assert "The first 7; 23 more are in the run" in text
-
-
-def test_without_ground_truth_there_are_answers_alone(tmp_path):
     page = Parsed(write_report(write_run(tmp_path / "run", truth=False)))
-    assert [*page.charts] == ["seconds"]
-    assert {row[4] for row in page.rows if len(row) == 6 and row[0] in SYSTEMS} == {"best"}
-    assert "no ground truth: rankings only" in "".join(page.text)
+    assert page.charts == {}
+    assert [row[4] for row in page.rows if len(row) == 6 and row[0] in SYSTEMS] == ["best"] * 7
+    assert "It has the first 7" in "".join(page.text)
 
 
 def test_runs_are_compared_query_by_query(tmp_path):
@@ -199,6 +183,9 @@ def test_runs_are_compared_query_by_query(tmp_path):
     [row] = [row for row in page.rows if row and row[0] == f"a: {HEADLINE}"]
     assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", *(f"{value:.2g}" for value in (test.p_value, *path))]
     assert [bar["x"] for bar in page.charts["intervals"]["data"]] == [[80.0, 50.0]]
+    assert [row[:2] for row in page.rows if row[0] in ("a", "b")][2:] == [
+        [run, system] for run in "ab" for system in SYSTEMS
+    ]
     assert "Not comparable" not in "".join(page.text)
     assert len(page.scripts) == 3
 
@@ -207,36 +194,27 @@ def test_runs_are_compared_query_by_query(tmp_path):
     ("changes", "reason"),
     [
         ({"data_fingerprint": {"database": "1"}}, "other images"),
-        ({"truth": False}, "a run has no ground truth"),
         ({"sequences": TWO}, "other queries"),
-        ({"ground_truth": {"kind": "order", "files": [], "exclude_neighbors": None, "unit": "m",
-                           "thresholds": [25]}}, "another ground truth (unit, thresholds)"),
-        ({"ground_truth": {"kind": "order", "files": [], "exclude_neighbors": None, "unit": "frames",
-                           "thresholds": TOLERANCES, "fingerprint": "1"}}, "another ground truth (fingerprint)"),
+        ({"ground_truth": {"kind": "order", "unit": "m", "thresholds": [25]}}, "another ground truth"),
     ],
-)  # fmt: skip
+)
 def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
     runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **changes)]
-    assert pages.why_not(*map(read_run, runs)) == reason
+    assert pages.why_not(*map(Run, runs)) == reason
     write_comparison(runs, tmp_path / "page.html")
     page = Parsed(tmp_path / "page.html")
-    assert ["a", "b", reason] in page.rows
-    assert not [row for row in page.rows if row[0] == f"a: {HEADLINE}"]
+    assert [row for row in page.rows if row[0] == f"a: {HEADLINE}"] == [[f"a: {HEADLINE}", f"b: {HEADLINE}", reason]]
 
 
-def test_the_program_says_where_the_page_is(run, tmp_path, monkeypatch, capsys):
+def test_the_program_says_where_the_page_is_or_what_is_wrong(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     again = write_run(tmp_path / "again")
-    for arguments, page in (([run], f"{run}/report.html"), ([run, again], "comparison.html"),
-                            ([run, "--out", "a.html"], "a.html")):  # fmt: skip
+    for arguments, page in (([run], f"{run}/report.html"), ([run, again, "--out", "a.html"], "a.html")):
         assert typed(monkeypatch, capsys, "report", *arguments) == (0, f"report: {page}\n", "")
-    assert {path.name for path in tmp_path.iterdir()} == {"again", "comparison.html", "a.html"}
-
-
-def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypatch, capsys):
+    assert {path.name for path in tmp_path.iterdir()} == {"again", "a.html"}
     figure = shutil.copytree(run, tmp_path / "figure")
     (figure / "figures" / "correct_0009.png").write_bytes(b"no image")
-    for folders in ([tmp_path / "none"], [figure], [run, run], [run, run.parent / "." / "one"]):
+    for folders in ([tmp_path / "none"], [figure], [run, run.parent / "." / "one"]):
         code, stdout, stderr = typed(monkeypatch, capsys, "report", *folders)
         assert (code, stdout, stderr.count("\n")) == (2, "", 1)
         assert stderr.startswith(f"error: {folders[0]}")
@@ -245,9 +223,9 @@ def test_folders_that_are_no_runs_are_errors_of_one_line(run, tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("results.json", '{"settings": []}', "ValueError"),
-        ("run.json", "{", "JSONDecode"),
-        ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "'place'"),
+        ("results.json", '{"settings": []}', "not enough values"),
+        ("run.json", "{", "Expecting property name"),
+        ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "place"),
         ("predictions/histogram.csv", "query,rank\na,1,1\n", "histogram.csv: expected lines of 2"),
     ],
 )
@@ -255,7 +233,7 @@ def test_damaged_files_are_errors_of_one_line(tmp_path, name, text, words):
     (write_run(tmp_path / "run") / name).write_text(text)
     with pytest.raises(InputError, match=words) as error:
         write_report(tmp_path / "run")
-    assert str(error.value).startswith(f"{tmp_path}/run: expected the run folder of an evaluation of this version")
+    assert "expected the run folder of an evaluation of this version" in str(error.value)
 
 
 def test_the_library_and_its_evaluation_wait_for_no_optional_package():

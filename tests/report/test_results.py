@@ -14,7 +14,7 @@ from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
 from mfvpr.evaluation import DriveFilter, Fusion
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.report.pages import read_run
+from mfvpr.report.pages import Run
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils import InputError
 from tests.programs import composed, csv_rows
@@ -50,14 +50,11 @@ def test_one_result_has_all_data_sets_and_systems(result, dataset, systems):
     expected = [("one", system, "") for system in systems] + [("two", system, p) for system in systems for p in parts]
     assert [tuple(row[:3]) for row in table.rows] == expected
     assert table.rows[0][3:] == table.rows[5][3:]  # the sequences are the parts of the one
-    assert str(table) in f"{table}"
     assert result.to_latex([0], [1]).count(" \\\\\n") == 11
     alone = mfvpr.evaluate(dataset, systems["mine"]).table([0, 1], [1, 5])
     assert [row[0] for row in alone.rows] == ["retrieval", "histogram", "my + count", "my + count + retrieval"]
     assert alone.rows[-1][1:] == table.rows[1][3:]
     assert repr(result) == "Result(one, two; paper, mine)"
-    for short in (result.parts["one", "paper"], dataset, dataset.database, dataset.only):
-        assert len(repr(short)) < 200
     with pytest.raises(InputError, match=r"expected one data set .* got 4"):
         result.only  # noqa: B018
 
@@ -100,7 +97,7 @@ def test_a_run_folder_says_which_predictions_a_sequence_changes(dataset, systems
     assert lines == expected
     assert lines
     result.write_report(tmp_path / "report.html")
-    assert "with the other queries" in (tmp_path / "report.html").read_text()
+    assert "that the other queries of a drive change" in (tmp_path / "report.html").read_text()
 
 
 def test_predictions_are_those_of_the_score_that_decides(result, dataset):
@@ -121,15 +118,11 @@ def test_predictions_are_those_of_the_score_that_decides(result, dataset):
 def test_a_saved_result_is_a_run_folder(result, dataset, tmp_path):
     folders = result.save(tmp_path / "all")
     assert folders[1] == tmp_path / "all" / "one" / "mine"
-    run = read_run(folders[1])
+    run = Run(folders[1])
     assert (run.headline, run.thresholds) == ("my + count + retrieval", [1, 2, 5])
     assert [row["scorer"] for row in run.results[::3]] == ["none", "histogram", "my + count", "my + count"]
-    assert run.results[-1]["parameters"] == {
-        "name": "half_count",
-        "c": None,
-        "retrieval_score": "cosine",
-        "weights": {},
-    }
+    expected = {"name": "half_count", "c": None, "retrieval_score": "cosine", "weights": {}}
+    assert run.results[-1]["parameters"] == expected
     assert (tmp_path / "all" / "table.csv").read_text() == result.table().csv()
     with pytest.raises(InputError, match="expected a new or empty run folder"):
         result.save(tmp_path / "all")
@@ -139,10 +132,7 @@ def test_a_saved_result_is_a_run_folder(result, dataset, tmp_path):
     assert "queries worth one" in (tmp_path / "one.html").read_text("utf-8")
 
 
-def test_pandas_is_needed_by_its_frames_alone(result, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(InputError, match=r"pip install 'mfvpr\[pandas\]'"):
-        result.to_pandas()
+def test_frames_have_a_row_for_each_ranking_and_sequence(result, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=list))
     rows = result.to_pandas([1], [1, 5])
     assert len(rows) == (3 + 4) * 5  # rankings of both systems; a sequence, or two with their means

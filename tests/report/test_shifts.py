@@ -78,13 +78,6 @@ def test_shifts_are_those_of_the_middle_of_the_query_in_either_direction(directi
     assert np.isnan([*shifts[1], *intervals[1].ravel()]).all()
 
 
-def test_the_refined_shift_stays_in_the_range_of_shifts():
-    points = np.random.default_rng(0).uniform(100, 200, (30, 2))
-    matches = make_matches(points, points + [23.0, 3.0])
-    scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, shift_range=(20.0, 10.0))
-    np.testing.assert_allclose(scorer.dominant_shift(matches, refine=True), [20, 3], atol=0.01)
-
-
 def test_refused_answers_have_no_shift(root, tmp_path):
     evaluation.evaluate(settings_of(*small(root), *STEERING, f"out={tmp_path}/first"))
     confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.25", f"out={tmp_path}/out")

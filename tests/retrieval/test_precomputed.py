@@ -76,7 +76,7 @@ def read_both(database, queries, files):
     return [source.open(folder, partial=False) for folder in (database, queries)]
 
 
-@pytest.mark.parametrize("file", ["f.h5", "f.npz", "global.h5", "global.npz", "global.npy"])
+@pytest.mark.parametrize("file", ["f.h5", "global.npz", "global.npy"])
 @pytest.mark.parametrize("prefix", ["", "db/"])
 def test_an_entry_is_of_one_image(tmp_path, file, prefix):
     """Queries do not get the features of database images with equal names, also through a link to the file."""
@@ -104,21 +104,6 @@ def test_folders_share_a_file_with_different_entries_or_images_of_one_path(tmp_p
     same = folder(tmp_path / "link")
     assert read_both(database, same, sides | {same.root: sides[database.root]})
     assert read_both(database, database, sides)
-
-
-def test_a_file_of_a_folder_is_of_one_image(tmp_path):
-    """Whatever it is called from the folder that was given."""
-    database, queries = folder(tmp_path / "database"), folder(tmp_path / "queries")
-    (tmp_path / "features" / "db").mkdir(parents=True)
-    for row, name in enumerate(database.names):
-        parts = {
-            part: np.asarray(getattr(feature(row, count=3), part))
-            for part in ("keypoints", "descriptors", "scores", "image_size")
-        }
-        np.savez(tmp_path / "features" / "db" / f"{name}.npz", **parts)
-    files = {database.root: File(tmp_path / "features" / "db"), queries.root: File(tmp_path / "features")}
-    with pytest.raises(InputError, match=r"0\.png\.npz for .*database/0\.png and for .*queries/0\.png; "):
-        read_both(database, queries, files)
 
 
 def test_pairs_within_the_database_are_not_of_queries(tmp_path):

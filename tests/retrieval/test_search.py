@@ -1,7 +1,5 @@
 """Shortlists, positives and recall."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,11 +7,9 @@ from hypothesis import strategies as st
 
 from mfvpr import frame_positives, radius_positives, recall_at_k, retrieve
 from mfvpr.datasets import Positives
-from mfvpr.retrieval import WhitenedSearch
 from mfvpr.retrieval import search as retrieval
 from mfvpr.retrieval.search import EXACT
-from mfvpr.utils import InputError, recipe_of
-from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils import InputError
 from tests import oracles
 from tests.builders import unit
 from tests.shapes import unchecked_shapes
@@ -68,18 +64,6 @@ def test_the_largest_in_blocks_are_the_largest(columns, kind):
     assert retrieve(queries, database, num_candidates=3).mask.all()
 
 
-@pytest.mark.parametrize(("platform", "dimensions", "parts"), [("cpu", 16, 5), ("gpu", 16, 2), ("gpu", 1000, 5)])
-def test_an_accelerator_takes_as_many_rows_as_fit(monkeypatch, platform, dimensions, parts):
-    searched = []
-    monkeypatch.setattr(retrieval, "ROWS", 4)
-    monkeypatch.setattr(retrieval, "SHARE", 10**3)
-    monkeypatch.setattr(retrieval, "device_of", lambda _: SimpleNamespace(platform=platform))
-    monkeypatch.setattr(retrieval, "free_bytes", lambda _: 4096)
-    monkeypatch.setattr(retrieval, "retrieve", lambda *rows, **more: searched.append(0) or retrieve(*rows, **more))
-    EXACT.shortlist(*np.ones((2, 20, dimensions), np.float32), 3)
-    assert len(searched) == parts
-
-
 @pytest.mark.optimized
 @pytest.mark.parametrize("num_database", [1, 100])
 def test_a_query_has_the_same_bits_alone_and_in_company_whatever_the_memory(num_database, monkeypatch):
@@ -120,26 +104,6 @@ def test_candidates_that_no_part_of_the_database_has_are_minus_1(usable, monkeyp
     assert shortlist.mask.tolist() == [[row >= 0 for row in expected]] * 2
 
 
-@pytest.mark.optimized
-def test_a_whitened_query_has_the_same_bits_alone_and_in_company():
-    rng = np.random.default_rng(1)
-    queries, database = unit(rng.normal(size=(5, 130))), unit(rng.normal(size=(100, 130)))
-    search = WhitenedSearch(20).fit(database)
-    together = search.shortlist(queries, database, 9)
-    for row in range(5):
-        alone = search.shortlist(queries[row : row + 1], database, 9)
-        np.testing.assert_array_equal(alone.scores[0], together.scores[row])
-
-
-def test_a_fitted_whitening_is_kept_and_told_apart():
-    rng = np.random.default_rng(2)
-    here, there = unit(rng.normal(size=(30, 8))), unit(rng.normal(size=(30, 8)))
-    fitted = WhitenedSearch(3).fit(here)
-    assert fitted.fit(there) is fitted
-    recipes = [recipe_of(search) for search in (fitted, WhitenedSearch(3).fit(there), WhitenedSearch(3))]
-    assert len({fingerprint(recipe) for recipe in recipes}) == 3
-
-
 @given(st.lists(st.integers(-1, 9), min_size=1, max_size=8), st.integers(1, 10), st.integers(0, 5))
 def test_frame_positives(queries, num_database, tolerance):
     got = frame_positives(np.array(queries), np.arange(num_database), tolerance=tolerance)
@@ -169,37 +133,6 @@ def test_recall(seed, depth):
     expected = oracles.recall_at_k(order, positives, ks)
     np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
     np.testing.assert_array_equal(recall_at_k(order, Positives.from_matrix(positives), ks), expected)
-
-
-def test_unsigned_frame_numbers_do_not_wrap():
-    got = frame_positives(np.array([5], np.uint8), np.arange(10, dtype=np.uint8), tolerance=2)
-    np.testing.assert_array_equal(np.flatnonzero(got[0]), [3, 4, 5, 6, 7])
-
-
-def test_rankings_of_several_systems_are_refused():
-    with pytest.raises(InputError, match=r"^order: expected database rows \[Q, C\].* got \[1, 2, 2\]"):
-        recall_at_k(np.zeros((1, 2, 2), int), np.eye(2, dtype=bool), [1])
-    with pytest.raises(InputError, match="ks: expected depths from 1, got -1"):
-        recall_at_k(np.zeros((2, 2), int), np.eye(2, dtype=bool), [1, -1])
-
-
-def test_no_database_and_no_queries_recall_nothing():
-    np.testing.assert_array_equal(recall_at_k(np.full((2, 1), -1), np.zeros((2, 0), bool), [1, 5]), [0, 0])
-    np.testing.assert_array_equal(recall_at_k(np.zeros((0, 3), int), np.zeros((0, 4), bool), [1]), [0])
-
-
-@pytest.mark.parametrize(
-    ("queries", "database", "excluded", "words"),
-    [
-        ((0, 4), (3, 4), None, r"got shapes \(0, 4\) and \(3, 4\) \(database\)"),
-        ((3, 4), (0, 4), None, "at least one"),
-        ((4, 3), (4, 5), None, "as many numbers"),
-        ((3, 3), (3, 3), Positives.from_rows([[0], [1]], 3), r"3 queries .*3 database images, got 2 and 3"),
-    ],
-)
-def test_sides_that_do_not_fit_are_refused(queries, database, excluded, words):
-    with unchecked_shapes(), pytest.raises(InputError, match=words):
-        EXACT.shortlist(np.ones(queries, np.float32), np.ones(database, np.float32), 2, excluded=excluded)
 
 
 def test_descriptors_of_different_lengths_and_masks_of_another_shape_are_refused():

@@ -5,7 +5,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -183,10 +182,8 @@ def paint_panel(canvas: Image, projection: Floats, panel: Panel, weather: Weathe
     if not clipped:
         return
     outline = np.array([point[:2] / point[2] for point in clipped])
-    double_area = 0.0
-    for (x0, y0), (x1, y1) in pairwise([*outline.tolist(), outline[0].tolist()]):
-        double_area = double_area + x0 * y1 - y0 * x1
-    if double_area <= 1:  # corners run the wrong way around, or enclose less than half a px
+    (x, y), (next_x, next_y) = outline.T, np.roll(outline, -1, axis=0).T
+    if np.sum(x * next_y - y * next_x) <= 1:  # corners run the wrong way around, or enclose less than half a px
         return
     low = np.maximum(np.floor(outline.min(0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(outline.max(0)).astype(int) + 2, canvas.shape[1::-1])
@@ -230,31 +227,20 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
         defocus += weather.defocus_spread * rng.random()
     if defocus:
         seen = cv2.GaussianBlur(seen, (0, 0), defocus)
+    height, width = seen.shape[:2]
+    fallen = np.zeros((height, width), np.uint8)
     if weather.flakes:
-        seen = fall_snow(seen, int(rng.uniform(0.5, 1.5) * weather.flakes), rng)
-    if weather.streaks:
-        seen = fall_rain(seen, int(rng.uniform(0.5, 1.5) * weather.streaks), rng)
+        count = int(rng.uniform(0.5, 1.5) * weather.flakes)
+        for x, y, radius in rng.uniform((0, 0, width / 1100), (width, height, width / 240), (count, 3)):
+            center, gray = (round(x * 16), round(y * 16)), int(rng.integers(70, 180))
+            cv2.circle(fallen, center, round(radius * 16), gray, -1, cv2.LINE_AA, 4)
+        seen = seen + cv2.GaussianBlur(fallen, (0, 0), 0.8).astype(np.float32)[..., None] / 255 * (245 - seen)
+    if weather.streaks:  # all blown to the same side
+        count, slant = int(rng.uniform(0.5, 1.5) * weather.streaks), rng.uniform(-0.3, 0.3)
+        for x, y, length in rng.uniform((0, 0, width / 60), (width, height, width / 14), (count, 3)):
+            start, end = (round(x * 16), round(y * 16)), (round((x + slant * length) * 16), round((y + length) * 16))
+            cv2.line(fallen, start, end, int(rng.integers(40, 120)), 1, cv2.LINE_AA, 4)
+        share = cv2.GaussianBlur(fallen, (0, 0), 0.6).astype(np.float32)[..., None] / 255
+        seen = seen + share * (seen.mean() + 60 - seen)
     seen += weather.noise * rng.standard_normal(seen.shape, np.float32)
     return np.clip(seen, 0, 255).astype(np.uint8)
-
-
-def fall_snow(image: Floats, count: int, rng: Rng) -> Floats:
-    """The image with `count` flakes of several sizes in front."""
-    height, width = image.shape[:2]
-    flakes = np.zeros((height, width), np.uint8)
-    for x, y, radius in rng.uniform((0, 0, width / 1100), (width, height, width / 240), (count, 3)):
-        center = (round(x * 16), round(y * 16))
-        cv2.circle(flakes, center, round(radius * 16), int(rng.integers(70, 180)), -1, cv2.LINE_AA, 4)
-    share = cv2.GaussianBlur(flakes, (0, 0), 0.8).astype(np.float32)[..., None] / 255
-    return image + share * (245 - image)
-
-
-def fall_rain(image: Floats, count: int, rng: Rng) -> Floats:
-    """The image with `count` streaks of several lengths in front, all blown to the same side."""
-    height, width = image.shape[:2]
-    streaks, slant = np.zeros((height, width), np.uint8), rng.uniform(-0.3, 0.3)
-    for x, y, length in rng.uniform((0, 0, width / 60), (width, height, width / 14), (count, 3)):
-        start, end = (round(x * 16), round(y * 16)), (round((x + slant * length) * 16), round((y + length) * 16))
-        cv2.line(streaks, start, end, int(rng.integers(40, 120)), 1, cv2.LINE_AA, 4)
-    share = cv2.GaussianBlur(streaks, (0, 0), 0.6).astype(np.float32)[..., None] / 255
-    return image + share * (image.mean() + 60 - image)

@@ -11,56 +11,26 @@ import cv2
 import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera, Facade
-from mfvpr.datasets.streets.sheets import (
-    DARK,
-    WEATHERS,
-    Color,
-    Image,
-    Panel,
-    Prop,
-    Rng,
-    Sheet,
-    Texture,
-    Weather,
-    as_array,
-    blotches,
-    draw_glyphs,
-    move,
-    texture,
-    tone,
-    upright,
-)
+from mfvpr.datasets.streets.sheets import WEATHERS, Color, Panel, Prop, Rng, Sheet, Texture, Weather, blotches, tone
 
-WALLS = (
-    (226, 205, 160),
-    (214, 170, 130),
-    (196, 120, 96),
-    (170, 184, 160),
-    (176, 188, 200),
-    (232, 224, 208),
-    (205, 150, 140),
-    (186, 160, 120),
-    (150, 92, 78),
-    (216, 190, 190),
-)
-TRIMS = ((245, 240, 230), (230, 222, 205), (120, 110, 104))
-ACCENTS = ((150, 48, 44), (38, 84, 124), (40, 96, 74), (196, 148, 48), (92, 60, 110), (48, 52, 60), (208, 96, 48))
-ROOFS = ((158, 82, 62), (132, 74, 62), (92, 92, 102), (112, 84, 76))
-CARS = ((186, 44, 40), (40, 72, 130), (228, 228, 226), (60, 64, 70), (150, 156, 160), (64, 104, 84), (214, 178, 70))
-GLASS, WARM = (62, 76, 92), (255, 196, 110)
+
+def colors(text: str) -> tuple[Color, ...]:
+    """Colors from hexadecimal numbers RRGGBB."""
+    return tuple(tuple(bytes.fromhex(word)) for word in text.split())
+
+
+WALLS = colors("e2cda0 d6aa82 c47860 aab8a0 b0bcc8 e8e0d0 cd968c baa078 965c4e d8bebe")
+TRIMS = colors("f5f0e6 e6decd 786e68")
+ACCENTS = colors("96302c 26547c 28604a c49430 5c3c6e 30343c d06030")
+ROOFS = colors("9e523e 844a3e 5c5c66 70544c")
+CARS = colors("ba2c28 284882 e4e4e2 3c4046 969ca0 406854 d6b246")
+GLASS, WARM = colors("3e4c5c ffc46e")
 
 LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
 CLOUDS = {weather: place for place, weather in enumerate(WEATHERS.values())}  # seeds of the clouds of each weather
 # Where cars may be: x, smallest and largest distance ahead of the camera (meters), whether oncoming.
-TRAFFIC = (
-    (LANE, 7, 25, False),
-    (-LANE, 5, 22, True),
-    (-LANE, 25, 50, True),
-    (4.0, 5, 18, False),
-    (4.0, 25, 50, False),
-    (-4.0, 5, 18, True),
-)
+TRAFFIC = ((LANE, 7, 25, 0), (-LANE, 5, 22, 1), (-LANE, 25, 50, 1), (4.0, 5, 18, 0), (4.0, 25, 50, 0), (-4.0, 5, 18, 1))
 
 Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
 
@@ -151,7 +121,7 @@ def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Fac
             for x, y in rng.uniform((0.1, 0.15), (4.9, 1.9), (500, 2)):
                 light = 1.15 - 0.4 * y / 1.9 + rng.uniform(-0.2, 0.2)
                 hedge.ellipse(x, y, 0.17, 0.14, tone((80, 118, 60), light), snow=int(150 * light))
-            props.append(upright(texture(hedge), side * 9.9, z + 0.2, 5.0, 1.9))
+            props.append(Prop.upright(hedge.texture(), side * 9.9, z + 0.2, 5.0, 1.9))
             z += gap
         design = designs[len(facades) % len(designs)]
         prop, facade = build_house(rng, design, side, rng.choice((7.4, 7.9, 8.4, 9.4)), z)
@@ -182,18 +152,18 @@ def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tupl
     near, far = (z, z + width) if side < 0 else (z + width, z)
     step = (0.0, 0.0, far - near)
     inner, middle, outer, top = side * x, side * (x + depth / 2), side * (x + depth), -height - rise
-    facade = Panel(texture(sheet, light, 1.06 if side < 0 else 0.84), (inner, -height, near), step, (0, height, 0))
+    facade = Panel(sheet.texture(light, 1.06 if side < 0 else 0.84), (inner, -height, near), step, (0, height, 0))
     slope = Sheet(width, float(np.hypot(depth / 2, rise)), pick(rng, ROOFS), scale=16)
     shape = slope.day.shape[:2]
-    slope.settle_snow(np.clip(225 + 20 * blotches(rng, shape, 12), 0, 250))
+    slope.effects[..., 3] = np.clip(225 + 20 * blotches(rng, shape, 12), 0, 250)
     tiles = 1 - 0.18 * (np.arange(shape[0]) % 5 == 0)[:, None]
     slope.shade((tiles * (1 + 0.08 * blotches(rng, shape, 4)))[..., None])
-    roof = Panel(texture(slope, sun=1.05), (middle, top, near), step, (-side * depth / 2, rise, 0))
+    roof = Panel(slope.texture(sun=1.05), (middle, top, near), step, (-side * depth / 2, rise, 0))
     end = Sheet(depth, height + rise, tone(wall, 0.86), scale=16)  # the side under the pointed roof
     draw_wall(end, rng)
     for corner in ([(0, 0), (depth / 2, 0), (0, rise)], [(depth, 0), (depth / 2, 0), (depth, rise)]):
         cv2.fillPoly(end.day, [np.rint(np.array(corner) * end.scale).astype(np.int32)], (0, 0, 0, 0))
-    gable = Panel(texture(end), (min(inner, outer), top, z), (depth, 0, 0), (0, height + rise, 0))
+    gable = Panel(end.texture(), (min(inner, outer), top, z), (depth, 0, 0), (0, height + rise, 0))
     return Prop(z + width / 2, (gable, roof, facade)), Facade(inner, z, z + width, height)
 
 
@@ -211,8 +181,18 @@ def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
             draw_window(sheet, rng, float(x), 1.1 + 3.0 * floor, motif, trim, accent)
     top = 0.5 + 3.0 * floors
     sheet.rect(0, top - 0.1, width, 0.18, trim, snow=180)
-    if design.shop:
-        draw_shop(sheet, rng, top, trim, accent)
+    if design.shop:  # a sign, an awning and a display window
+        sheet.rect(0.3, top + 0.2, width - 0.6, 0.75, accent, tone(accent, 0.9))
+        sheet.glyphs(rng, 0.6, top + 0.32, rng.uniform(0.5, 1.0) * (width - 1.2), 0.5, trim)
+        sheet.rect(0.5, top + 1.1, width - 2.2, 2.1, (54, 52, 54), tone(WARM, 0.85))
+        for x in np.arange(0.8, width - 2.4, 0.7):  # goods
+            size = rng.uniform(0.2, 0.6)
+            sheet.rect(x, top + 3.1 - size, 0.45, size, pick(rng, (*ACCENTS, *WALLS)), (150, 110, 60))
+        sheet.rect(width - 1.5, top + 1.1, 1.1, sheet.height - top - 1.1, tone(accent, 0.7))
+        sheet.rect(width - 1.35, top + 1.3, 0.8, 1.2, GLASS, tone(WARM, 0.7))
+        if rng.random() < 0.5:
+            for stripe, x in enumerate(np.arange(0.4, width - 1.8, 0.4)):
+                sheet.rect(x, top + 1.0, 0.4, 0.7, trim if stripe % 2 else accent, snow=150)
     else:
         for x in middles[1:]:
             draw_window(sheet, rng, float(x), top + 1.0, MOTIFS[4], trim, accent)
@@ -252,17 +232,17 @@ def draw_damage(sheet: Sheet, rng: Rng) -> None:
         sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
         for _ in range(4):
             sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
-        draw_glyphs(sheet, rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
+        sheet.glyphs(rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
     if rng.random() < 0.5:
         start = (rng.uniform(0.5, sheet.width - 1.5), sheet.height - 1.4)
-        draw_glyphs(sheet, rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
+        sheet.glyphs(rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
 
 
 def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: Color, accent: Color) -> None:
     """One window with its middle at x and its upper edge at y; one in four is lit at night."""
     w, h = motif.width, motif.height
     left = x - w / 2
-    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else DARK
+    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else (0, 0, 0)
     if motif.ornament == "arch":
         sheet.ellipse(x, y, w / 2 + 0.1, 0.45, trim)
         sheet.ellipse(x, y, w / 2, 0.35, GLASS, glow)
@@ -292,21 +272,6 @@ def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: 
             sheet.ellipse(x, y + h + 0.02, 0.1, 0.1, pick(rng, ((70, 110, 60), (190, 60, 70), (220, 160, 60))))
 
 
-def draw_shop(sheet: Sheet, rng: Rng, top: float, trim: Color, accent: Color) -> None:
-    """A ground floor with a sign, an awning and a display window from `top` to the foot of the sheet."""
-    sheet.rect(0.3, top + 0.2, sheet.width - 0.6, 0.75, accent, tone(accent, 0.9))
-    draw_glyphs(sheet, rng, 0.6, top + 0.32, rng.uniform(0.5, 1.0) * (sheet.width - 1.2), 0.5, trim)
-    sheet.rect(0.5, top + 1.1, sheet.width - 2.2, 2.1, (54, 52, 54), tone(WARM, 0.85))
-    for x in np.arange(0.8, sheet.width - 2.4, 0.7):  # goods
-        size = rng.uniform(0.2, 0.6)
-        sheet.rect(x, top + 3.1 - size, 0.45, size, pick(rng, (*ACCENTS, *WALLS)), (150, 110, 60))
-    sheet.rect(sheet.width - 1.5, top + 1.1, 1.1, sheet.height - top - 1.1, tone(accent, 0.7))
-    sheet.rect(sheet.width - 1.35, top + 1.3, 0.8, 1.2, GLASS, tone(WARM, 0.7))
-    if rng.random() < 0.5:
-        for stripe, x in enumerate(np.arange(0.4, sheet.width - 1.8, 0.4)):
-            sheet.rect(x, top + 1.0, 0.4, 0.7, trim if stripe % 2 else accent, snow=150)
-
-
 def build_tree(rng: Rng, x: float, z: float) -> Prop:
     """A tree in leaf with its trunk at x and z, in meters: trunk, branches and a round crown of many dabs."""
     width, height = rng.uniform(3.0, 4.4), rng.uniform(5.0, 6.6)
@@ -321,34 +286,34 @@ def build_tree(rng: Rng, x: float, z: float) -> Prop:
         light = 1.15 - 0.5 * v / (0.68 * height) + rng.uniform(-0.1, 0.1)
         size = rng.uniform(0.07, 0.2)
         sheet.ellipse(u, v, size, 0.8 * size, tone(leaf, light), snow=int(rng.uniform(120, 220) * min(1.0, light)))
-    return upright(texture(sheet, 0.5 * lamp_light(np.array(z))), x, z, width, height)
+    return Prop.upright(sheet.texture(0.5 * lamp_light(np.array(z))), x, z, width, height)
 
 
 def build_furniture(seed: int, length: float) -> list[Prop]:
     """Lamps, trees and signs along both sidewalks."""
     rng, iron = np.random.default_rng([seed, 2]), (52, 58, 56)
-    sheet = Sheet(1.0, 5.2, None)
-    sheet.rect(0.44, 0.6, 0.12, 4.6, iron)
-    sheet.rect(0.38, 4.3, 0.24, 0.9, iron)
-    sheet.polygon([(0.22, 0.1), (0.78, 0.1), (0.66, 0.75), (0.34, 0.75)], (226, 222, 204), (255, 236, 190))
-    sheet.polygon([(0.15, 0.14), (0.85, 0.14), (0.5, 0.0)], iron, snow=240)
-    lamp = texture(sheet)
-    places = enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING))
-    props = [upright(lamp, 5.4 if index % 2 else -5.4, z, 1.0, 5.2) for index, z in places]
+    lamp = Sheet(1.0, 5.2, None)
+    lamp.rect(0.44, 0.6, 0.12, 4.6, iron)
+    lamp.rect(0.38, 4.3, 0.24, 0.9, iron)
+    lamp.polygon([(0.22, 0.1), (0.78, 0.1), (0.66, 0.75), (0.34, 0.75)], (226, 222, 204), (255, 236, 190))
+    lamp.polygon([(0.15, 0.14), (0.85, 0.14), (0.5, 0.0)], iron, snow=240)
+    light, places = lamp.texture(), enumerate(np.arange(LAMP_SPACING, length, LAMP_SPACING))
+    props = [Prop.upright(light, 5.4 if index % 2 else -5.4, z, 1.0, 5.2) for index, z in places]
     for side in (-1, 1):
         for z in np.arange(6.0, length, 11.0):
             kind = rng.random()
             if kind < 0.35:
                 props.append(build_tree(rng, side * 5.6, z + rng.uniform(-2, 2)))
             elif kind < 0.75:
-                props.append(upright(texture(draw_sign(rng)), side * 4.9, z + rng.uniform(-3, 3), 0.9, 2.9))
+                sign = draw_sign(rng)
+                props.append(Prop.upright(sign.texture(), side * 4.9, z + rng.uniform(-3, 3), 0.9, 2.9))
     return props
 
 
 def draw_sign(rng: Rng) -> Sheet:
-    sheet, red, white = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232)
+    """A traffic sign on its post: a red circle, a red triangle, or a blue square."""
+    sheet, red, white, kind = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232), rng.integers(3)
     sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
-    kind = rng.integers(3)
     if kind == 0:
         sheet.ellipse(0.45, 0.45, 0.42, 0.42, red)
         sheet.ellipse(0.45, 0.45, 0.32, 0.32, white)
@@ -357,7 +322,7 @@ def draw_sign(rng: Rng) -> Sheet:
         sheet.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], white)
     else:
         sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
-    draw_glyphs(sheet, rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else white)
+    sheet.glyphs(rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else white)
     return sheet
 
 
@@ -386,24 +351,24 @@ def build_ground(rng: Rng, z: float) -> Prop:
     sheet.shade((1 + grain + 0.05 * fade * blotches(rng, shape, 30))[..., None])
     x = np.linspace(-sheet.width / 2, sheet.width / 2, shape[1])
     ruts = sum(np.exp(-(((x - rut) / 0.24) ** 4)) for rut in (-2.7, -1.2, 1.2, 2.7))
-    sheet.settle_snow(np.clip(235 - 110 * ruts + 18 * fade * blotches(rng, shape, 10), 0, 250))
+    sheet.effects[..., 3] = np.clip(235 - 110 * ruts + 18 * fade * blotches(rng, shape, 10), 0, 250)
     light = lamp_light(np.linspace(z + 8, z, shape[0]))[:, None] * np.exp(-((np.linspace(-12, 12, shape[1]) / 8) ** 2))
-    return Prop(z + 4, (Panel(texture(sheet, 0.8 * light), (-12, 0, z + 8), (24, 0, 0), (0, 0, -8)),))
+    return Prop(z + 4, (Panel(sheet.texture(0.8 * light), (-12, 0, z + 8), (24, 0, 0), (0, 0, -8)),))
 
 
-def draw_sky(rng: Rng, weather: Weather) -> Image:
+def draw_sky(rng: Rng, weather: Weather) -> np.ndarray:
     """Sky, clouds and a far skyline, directly in the colors of the weather; the horizon is the lower edge."""
     rows, columns = shape = (256, 1024)
     height = np.linspace(1, 0, rows, dtype=np.float32)[:, None, None]
-    zenith, horizon = as_array(weather.zenith), as_array(weather.horizon)
+    zenith, horizon = np.array(weather.zenith, np.float32), np.array(weather.horizon, np.float32)
     sky = np.broadcast_to(horizon + (zenith - horizon) * height**0.6, (rows, columns, 3)).copy()
     cloud = sum(blotches(rng, shape, cell) * cell / 90 for cell in (90.0, 45.0, 20.0))
     cover = np.clip(cloud * 0.7, 0, 1)[..., None] * np.clip(height * 4, 0, 1)
-    sky += cover * 0.7 * (as_array(tone(weather.horizon, 1.15)) - sky)
+    sky += cover * 0.7 * (np.array(tone(weather.horizon, 1.15), np.float32) - sky)
     for layer, gain in ((0.16, 0.92), (0.10, 0.8)):
         bumps = 0.35 * blotches(rng, (1, columns), 60) + 0.1 * blotches(rng, (1, columns), 8)
         hill = np.arange(rows)[:, None] > rows * (1 - layer * (1 + bumps))
-        sky[hill] = as_array(tone(weather.horizon, gain)) * as_array((0.92, 1.0, 0.98))
+        sky[hill] = np.array(tone(weather.horizon, gain), np.float32) * np.array((0.92, 1.0, 0.98), np.float32)
     return np.dstack([np.clip(sky, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8)])
 
 
@@ -414,50 +379,48 @@ def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
         car = cars[int(rng.integers(len(cars)))]
         if rng.random() < 0.7:
             x, z = x + rng.uniform(-0.2, 0.2), camera.z + rng.uniform(nearest, farthest)
-            props.append(move(car[oncoming], x, z))
+            props.append(car[oncoming].move(x, z))
     return props
 
 
 def build_car(seed: int, index: int) -> Car:
     """Car number `index` of the street with this seed; panels that face away are included, but never painted."""
     rng = np.random.default_rng([seed, 4, index])
-    body, color = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
-    right = texture(draw_side(rng, body, color))
-    ends = []
-    for lights, glow in (((160, 30, 30), (255, 50, 40)), ((236, 236, 228), (255, 250, 230))):  # rear, front
-        end = Sheet(body.width, body.hood - 0.2, tone(color, 0.94))  # below the glass, with lights and plate
-        end.rect(0, end.height - 0.22, body.width, 0.22, (48, 48, 52))
-        end.rect(body.width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
-        for x in (0.08, body.width - 0.4):
-            end.rect(x, 0.12, 0.32, 0.18, lights, glow)
-        ends.append(texture(end))
-    shadow, top = Sheet(2.0, 2.0, None), Sheet(1.0, 1.0, tone(color, 1.1))
+    body, paint = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
+    right = draw_side(rng, body, paint).texture()
+    width, length, x = body.width, body.length, -body.width / 2
+    shadow, top = Sheet(2.0, 2.0, None), Sheet(1.0, 1.0, tone(paint, 1.1))
     shadow.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
-    top.settle_snow(235)
-    glass = Sheet(body.width, body.roof - body.hood, color)  # rear window or windshield with its frame
-    glass.rect(0.12, 0.08, body.width - 0.24, min(0.8, glass.height - 0.12), (48, 58, 68))
-    covers = [texture(sheet) for sheet in (shadow, top, glass)]
+    top.effects[..., 3] = 235
+    glass = Sheet(width, body.roof - body.hood, paint)  # rear window or windshield with its frame
+    glass.rect(0.12, 0.08, width - 0.24, min(0.8, glass.height - 0.12), (48, 58, 68))
+    ground, cover, window = shadow.texture(), top.texture(), glass.texture()
 
-    def left(weather: Weather) -> Image:
+    def left(weather: Weather) -> np.ndarray:
         return right(weather)[:, ::-1]
 
-    def assemble(near: tuple[float, float], far: tuple[float, float], end: Texture, sides: tuple[Texture, ...]) -> Prop:
-        width, length, x = body.width, body.length, -body.width / 2
+    views = []
+    for near, far, lights, glow, sides in (  # from behind, and from the front
+        (body.rear, body.front, (160, 30, 30), (255, 50, 40), (left, right)),
+        (body.front, body.rear, (236, 236, 228), (255, 250, 230), (right, left)),
+    ):
+        end = Sheet(width, body.hood - 0.2, tone(paint, 0.94))  # below the glass, with lights and plate
+        end.rect(0, end.height - 0.22, width, 0.22, (48, 48, 52))
+        end.rect(width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
+        for place in (0.08, width - 0.4):
+            end.rect(place, 0.12, 0.32, 0.18, lights, glow)
         roof, across = length - far[1], (width, 0, 0)
-        shadow, top, glass = covers
         panels = (
-            Panel(shadow, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
-            Panel(top, (x, -body.hood, length), across, (0, 0, -length)),
-            Panel(end, (x, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
-            Panel(top, (x, -body.roof, roof), across, (0, 0, near[1] - roof)),
-            Panel(glass, (x, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
+            Panel(ground, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
+            Panel(cover, (x, -body.hood, length), across, (0, 0, -length)),
+            Panel(end.texture(), (x, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
+            Panel(cover, (x, -body.roof, roof), across, (0, 0, near[1] - roof)),
+            Panel(window, (x, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
             Panel(sides[0], (x, -body.roof, length), (0, 0, -length), (0, body.roof, 0)),
             Panel(sides[1], (-x, -body.roof, 0), (0, 0, length), (0, body.roof, 0)),
         )
-        return Prop(length / 2, panels)
-
-    rear, front = ends
-    return assemble(body.rear, body.front, rear, (left, right)), assemble(body.front, body.rear, front, (right, left))
+        views.append(Prop(length / 2, panels))
+    return views[0], views[1]
 
 
 def draw_side(rng: Rng, body: Body, paint: Color) -> Sheet:
@@ -473,7 +436,7 @@ def draw_side(rng: Rng, body: Body, paint: Color) -> Sheet:
         sheet.polygon(inner, (44, 54, 64))
         sheet.rect(length * 0.48, 0.1, 0.08, waist, paint)
     else:
-        draw_glyphs(sheet, rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
+        sheet.glyphs(rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
         sheet.polygon([(brow - 1.0, 0.3), (brow, 0.3), (nose - 0.2, waist), (brow - 1.0, waist)], (44, 54, 64))
     sheet.rect(0, body.roof - 0.4, length, 0.12, tone(paint, 0.6))
     for x in (0.85, length - 0.85):

@@ -14,19 +14,14 @@ from numpy.typing import ArrayLike
 
 Image = UInt8[np.ndarray, "_ _ _"]  # rows, columns, channels
 Floats = Float[np.ndarray, "..."]
-Color = tuple[int, int, int]  # RGB, 0..255
+Color = tuple[int, ...]  # RGB, 0..255
 Rng = np.random.Generator
 DARK = (0, 0, 0)
 
 
-def as_array(color: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
-    return np.array(color, np.float32)
-
-
 def tone(color: Color, gain: float) -> Color:
     """The color, lighter or darker."""
-    red, green, blue = (min(255, int(c * gain)) for c in color)
-    return red, green, blue
+    return tuple(min(255, int(c * gain)) for c in color)
 
 
 @dataclass(frozen=True)
@@ -108,11 +103,9 @@ class Sheet:
         if color is not None:
             self.day[:] = (*color, 255)
 
-    def rect(
-        self, x: float, y: float, width: float, height: float, color: Color, glow: Color = DARK, snow: int = 0
-    ) -> None:
-        """A rectangle with its upper left corner at (x, y)."""
-        x0, y0, x1, y1 = (max(0, round(a * self.scale)) for a in (x, y, x + width, y + height))
+    def rect(self, x: float, y: float, w: float, h: float, color: Color, glow: Color = DARK, snow: int = 0) -> None:
+        """A rectangle of w by h meters with its upper left corner at (x, y)."""
+        x0, y0, x1, y1 = (max(0, round(a * self.scale)) for a in (x, y, x + w, y + h))
         self.day[y0:y1, x0:x1] = (*color, 255)
         self.effects[y0:y1, x0:x1] = (*glow, snow)
 
@@ -139,44 +132,38 @@ class Sheet:
         """Multiply the colors by `gain`, broadcast over rows, columns and channels."""
         self.day[..., :3] = np.clip(self.day[..., :3] * gain, 0, 255)
 
-    def settle_snow(self, amount: ArrayLike) -> None:
-        """Let snow settle on the whole sheet: `amount` is 0..255, broadcast over rows and columns."""
-        self.effects[..., 3] = amount
+    def glyphs(self, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
+        """A word of random glyphs, whose strokes connect points of a small grid."""
+        step = height * 0.85
+        for left in np.arange(x, x + width - 0.6 * step, step):
+            nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)
+            self.line(nodes + (left, y), height * 0.14, color)
 
+    def texture(self, lamp_light: Floats | float = 0.0, sun: float = 1.0) -> Texture:
+        """The texture of the finished sheet, computed when a weather is first used.
 
-def texture(sheet: Sheet, lamp_light: Floats | float = 0.0, sun: float = 1.0) -> Texture:
-    """The texture of a finished sheet, computed when a weather is first used.
+        `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps on the sheet, `sun` the gain
+        of a surface with this orientation to the sun.
+        """
+        light = np.asarray(lamp_light, np.float32)
 
-    `lamp_light` (0..1, broadcast over rows and columns) is the light of street lamps on the sheet, `sun` the gain of
-    a surface with this orientation to the sun.
-    """
-    light = np.asarray(lamp_light, np.float32)
+        @cache
+        def seen_in(weather: Weather) -> Image:
+            lamps = np.broadcast_to(light, self.day.shape[:2])[..., None]
+            color = self.day[..., :3].astype(np.float32)
+            glow, cover = self.effects[..., :3].astype(np.float32), self.effects[..., 3:].astype(np.float32) / 255
+            ambient = np.multiply(weather.ambient, 1 + weather.sun * (sun - 1), dtype=np.float32)
+            seen = np.maximum(color * (ambient + lamps * np.array(weather.lamp, np.float32)), weather.glow * glow)
+            seen += weather.snow * cover * (np.array(tone(weather.horizon, 1.15), np.float32) - seen)
+            return np.dstack([np.clip(seen, 0, 255).astype(np.uint8), self.day[..., 3]])
 
-    @cache
-    def seen_in(weather: Weather) -> Image:
-        lamps = np.broadcast_to(light, sheet.day.shape[:2])[..., None]
-        color = sheet.day[..., :3].astype(np.float32)
-        glow, cover = sheet.effects[..., :3].astype(np.float32), sheet.effects[..., 3:].astype(np.float32) / 255
-        ambient = np.multiply(weather.ambient, 1 + weather.sun * (sun - 1), dtype=np.float32)
-        seen = np.maximum(color * (ambient + lamps * as_array(weather.lamp)), weather.glow * glow)
-        seen += weather.snow * cover * (as_array(tone(weather.horizon, 1.15)) - seen)
-        return np.dstack([np.clip(seen, 0, 255).astype(np.uint8), sheet.day[..., 3]])
-
-    return seen_in
+        return seen_in
 
 
 def blotches(rng: Rng, shape: tuple[int, int], cell: float) -> Floats:
     """Smooth noise with a standard deviation of about 1 and spots `cell` px wide."""
     rows, columns = (max(2, round(n / cell)) for n in shape)
     return cv2.resize(rng.standard_normal((rows, columns), np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def draw_glyphs(sheet: Sheet, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
-    """Draw a word of random glyphs, whose strokes connect points of a small grid."""
-    step = height * 0.85
-    for left in np.arange(x, x + width - 0.6 * step, step):
-        nodes = rng.integers(0, (3, 4), (5, 2)) / (2, 3) * (0.6 * step, height)
-        sheet.line(nodes + (left, y), height * 0.14, color)
 
 
 @dataclass(frozen=True)
@@ -196,13 +183,12 @@ class Prop:
     z: float
     panels: tuple[Panel, ...]
 
+    @classmethod
+    def upright(cls, texture: Texture, x: float, z: float, width: float, height: float) -> "Prop":
+        """A panel that stands on the ground across the street, with its middle at x; all in meters."""
+        return cls(z, (Panel(texture, (x - width / 2, -height, z), (width, 0, 0), (0, height, 0)),))
 
-def upright(texture: Texture, x: float, z: float, width: float, height: float) -> Prop:
-    """A panel that stands on the ground across the street, with its middle at x; all in meters."""
-    return Prop(z, (Panel(texture, (x - width / 2, -height, z), (width, 0, 0), (0, height, 0)),))
-
-
-def move(prop: Prop, x: float, z: float) -> Prop:
-    """The prop, moved along the ground by x and z meters."""
-    panels = (replace(p, corner=(p.corner[0] + x, p.corner[1], p.corner[2] + z)) for p in prop.panels)
-    return Prop(prop.z + z, tuple(panels))
+    def move(self, x: float, z: float) -> "Prop":
+        """The prop, moved along the ground by x and z meters."""
+        panels = (replace(p, corner=(p.corner[0] + x, p.corner[1], p.corner[2] + z)) for p in self.panels)
+        return Prop(self.z + z, tuple(panels))

@@ -85,12 +85,32 @@ const look = {
   margin: { l: 56, r: 12, t: 12, b: 48 }, font: { family: "system-ui, sans-serif", size: 13 },
   legend: { orientation: "h", yanchor: "bottom", y: 1.02, x: 0 }, hoverlabel: { namelength: -1 },
 };
-const axis = ({ title, ...rest }) => (
-  { fixedrange: true, automargin: true, zeroline: false, ...rest, title: { ...title, font: { size: 13 } } }
+const scales = {
+  linear: {}, percent: { range: [-1, 101] }, share: { range: [0, 102] },
+  log: { type: "log", tickvals: [...Array(6).keys()].flatMap((power) => [1, 2, 5].map((step) => step * 10 ** power)) },
+};
+const axis = (text, rest) => (
+  { fixedrange: true, automargin: true, zeroline: false, ...rest, title: { text, font: { size: 13 } } }
 );
-const drawn = Object.entries(charts).map(([name, { data, layout }]) => {
-  const axes = { xaxis: axis(layout.xaxis), yaxis: axis(layout.yaxis) };
-  return Plotly.newPlot(`chart-${name}`, data, { ...look, ...layout, ...axes }, options);
+
+function line(trace) {
+  return { type: "scatter", mode: "lines", hovertemplate: "%{x:.4g}: %{y:.1f} %", ...trace };
+}
+
+function bar(trace) {
+  const whiskers = { type: "data", symmetric: false, thickness: 1.2, width: 3, ...trace.error_x };
+  return { type: "bar", orientation: "h", hovertemplate: "%{y}: %{x:.1f} %", ...trace, error_x: whiskers };
+}
+
+const drawn = Object.entries(charts).map(([name, { kind, scale, axes, data }]) => {
+  const isBars = kind === "bars";
+  const bars = isBars ? data.reduce((sum, { y }) => sum + y.length, 0) : 0;
+  const layout = {
+    ...look, height: Math.max(380, 100 + 16 * bars), showlegend: data.length > 1,
+    xaxis: axis(axes[0], scales[scale]),
+    yaxis: axis(axes[1], isBars ? { type: "category", autorange: "reversed" } : { range: [-2, 102] }),
+  };
+  return Plotly.newPlot(`chart-${name}`, data.map(isBars ? bar : line), layout, options);
 });
 Promise.all(drawn).then(() => {
   paint();

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from mfvpr.core.batch import WEIGHTINGS, by_capacity, score_settings
+from mfvpr.core.batch import MATCH_AXES, by_capacity, score_settings
 from mfvpr.core.scorer import check_host, static_names, whole_numbers, with_parameters, with_static_functions
 from mfvpr.core.types import Shortlist
 from mfvpr.core.weights import ChosenWeight
@@ -279,7 +279,7 @@ def group_by_program(
         chosen = with_static_functions(chosen)
         # Split the members into products `[G, W]` of settings and weightings.
         names = [name for name in settings[members[0]] if name not in dict(choices)]
-        inner, outer = ([name for name in names if (name in WEIGHTINGS) == is_inner] for is_inner in (True, False))
+        inner, outer = ([name for name in names if (name in MATCH_AXES) == is_inner] for is_inner in (True, False))
         lines = _group(members, lambda row: _items(settings[row], outer)).values()  # noqa: B023
         products = _group(lines, lambda line: tuple(_items(settings[row], inner) for row in line))  # noqa: B023
         for rows in map(np.array, products.values()):

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from mfvpr.baselines.learned_weight import NAMED_WEIGHTS, named_weight
+from mfvpr.baselines.learned_weight import WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.core.batch import WEIGHTINGS, refuse_own_names
+from mfvpr.core.batch import MATCH_AXES, refuse_own_names
 from mfvpr.core.scorer import (
     Scorer,
     check_bounds,
@@ -66,7 +66,7 @@ class Axes:
 
     def __post_init__(self) -> None:
         scorer = self.scorer
-        refuse_own_names(scorer, self.values, reserved=(*WEIGHTINGS, FUSION))
+        refuse_own_names(scorer, self.values, reserved=(*MATCH_AXES, FUSION))
         known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}
@@ -117,7 +117,7 @@ class Axes:
         value = attrgetter(name)(self.scorer)
         if name == "weight":
             words = [word for word, weight in WEIGHTS.items() if weight == value]
-            words += [word for word, weight in NAMED_WEIGHTS.items() if weight is value]
+            words += [word for word in WORDS if named_weight(word) is value]
             return words[0] if words else value
         return None if name in self.parameters and value == self.parameters[name].none else _plain(value)
 

@@ -78,7 +78,7 @@ CASES = [
     (mfvpr.MatchCount(), {"max_distance": [0.5, 1.0, 1.5]}),
     (mfvpr.RapidSpatialScore(), {"reach": ["image_size", "largest_shift"], "per_feature": [True], "c": [None, 1.0]}),
     (mfvpr.VisualPhrases(), {"length": [1, 3], "cell_size": [9.0, 30.0], "align": ["zero_center", "zero_edge"]}),
-    (mfvpr.LostScore(), {"form": ["weighted", "described"], "mirrored": [False, True], "max_distance": [0.8, 2.0]}),
+    (mfvpr.LostScore(), {"form": ["weighted", "unweighted"], "mirrored": [False, True], "max_distance": [0.8, 2.0]}),
     (Wrapped(), {"inner.sigma": [9.0, 22.5], "inner.bin_size": [14.0, 16.0], "inner.align": ["min_edge", "zero_edge"]}),
     *((scorer, {"max_distance": [0.8, 3.0], "c": [None, 0.0]}) for scorer in FOREIGN),
     (mfvpr.HistogramOfShifts(), [
